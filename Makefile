@@ -12,6 +12,7 @@ demo: $(VENV)/ready
 	rm -rf demo
 	$(BIN)/rigd run chirp --profile sim --fast --output demo
 	$(BIN)/analyze demo/*.mcap --report demo/report
+	@echo "The operator's page on the simulated rig: $(BIN)/rigd serve --profile sim --web --output demo"
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"

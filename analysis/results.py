@@ -7,7 +7,7 @@ needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.Campa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from analysis.identify import (
         Headline,
         OrderVerdict,
+        Quantity,
         RecordAnalysis,
         RecordFit,
         Selection,
@@ -124,6 +125,29 @@ class WholeRecord:
     def withheld(self) -> frozenset[str]:
         """Orders of that fit whose numbers carry a flag."""
         return frozenset(_ORDERS & self.headline.flags.keys())
+
+    @property
+    def combined(self) -> dict[str, Quantity]:
+        """The headline's parameters that a scale acts on whose uncertainty the file states.
+
+        With standard uncertainties and intervals that include it.
+        """
+        from analysis.identify import scales_absorbed, with_scales
+
+        if not scales_absorbed(self.fit):
+            return {}
+        return with_scales(self.headline.parameters, self.record.uncertainty)
+
+    def headline_json(self) -> dict[str, Any]:
+        """Write the headline as the JSON document has it."""
+        from analysis.identify import headline_json
+
+        file, findings = str(self.record.path), self.verdict.findings
+        return {
+            **headline_json(file, self.headline, self.orders, findings),
+            "scale_uncertainty": dict(self.record.uncertainty),
+            "combined": {name: each.as_json() for name, each in self.combined.items()},
+        }
 
     @property
     def unsupported(self) -> frozenset[str]:

@@ -1,7 +1,8 @@
-"""Printable text: what comes from outside, made fit for a terminal and for a message."""
+"""Printable text: what comes from outside, and counts, made fit for a terminal."""
 
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 UNPRINTABLE: Final = "?"
 """Replacement of a character that cannot be printed."""
@@ -44,3 +45,31 @@ def grouped(count: int) -> str:
     136 000 1200
     """
     return f"{count:,}".replace(",", " ") if count >= _FROM else str(count)
+
+
+def counts_text(counts: Mapping[str, Any]) -> str:
+    """Say how many samples of a session were recorded, and what became of the others.
+
+    Parameters
+    ----------
+    counts
+        ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
+        ``stale_wrenches``, as numbers or as texts; of the last three only what occurred is told.
+
+    Examples
+    --------
+    >>> from rigd.printable import counts_text
+    >>> print(counts_text({"recorded": 11_998, "scheduled": 12_000, "missed": 2, "late": 5}))
+    11 998 of 12 000 samples, 2 missed, 5 late
+    """
+    rare = ("lost", "stale_angles", "stale_wrenches")
+    told = [
+        f"{grouped(int(counts['recorded']))} of {grouped(int(counts['scheduled']))} samples",
+        *(f"{grouped(int(counts[name]))} {name}" for name in ("missed", "late")),
+        *(
+            f"{grouped(int(counts[name]))} {name.replace('_', ' ')}"
+            for name in rare
+            if int(counts.get(name) or 0)
+        ),
+    ]
+    return ", ".join(told)

@@ -25,7 +25,7 @@ from rigd.runtime import use_one_thread
 
 pytest_plugins = [
     "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "shipped_profile",
-    "standstill", "synthetic_sessions",
+    "standstill", "synthetic_sessions", "web_daemon",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
@@ -96,22 +96,28 @@ PATIENT = {
 BRIEF = {"session.tare_s": "0.5", "session.return_s": "0.3"}
 
 
-@pytest.fixture
-def write_profile(tmp_path):
-    """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
+@pytest.fixture(scope="session")
+def write_profile_in():
+    """Write a shipped profile into a folder, as `write_profile` does."""
 
-    One that is `patient` bears that the machine stands still.
-    """
-
-    def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
+    def write(folder, name, values=None, *, patient=False) -> Path:
         base = HW_PROFILES / f"{name}.toml"
         sections = tomllib.loads(base.read_text("utf-8"))
         borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
         texts = BRIEF | (borne if patient else {}) | (values or {})
         other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
-        return testing.write_profile(tmp_path, other, base=str(base))
+        return testing.write_profile(folder, other, base=str(base))
 
     return write
+
+
+@pytest.fixture
+def write_profile(tmp_path, write_profile_in):
+    """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
+
+    One that is `patient` bears that the machine stands still.
+    """
+    return partial(write_profile_in, tmp_path)
 
 
 @pytest.fixture
@@ -121,6 +127,27 @@ def runtime_folder(monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
+
+
+BRIEF_LOOK = """
+import json, pathlib, sys
+
+session = pathlib.Path(sys.argv[1])
+look = {"file": session.name, "text": [f"Quick look at {session.stem}", "  mode 1"]}
+session.with_suffix(".look.json").write_text(json.dumps(look))
+"""
+
+
+@pytest.fixture
+def brief_looks(tmp_path_factory, monkeypatch):
+    """Have quick looks made, by a program that takes no time; returns its file, to be changed."""
+    folder = tmp_path_factory.mktemp("brief") / "analysis"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "quick_look.py").write_text(BRIEF_LOOK)
+    monkeypatch.setenv("PYTHONPATH", str(folder.parent))
+    monkeypatch.delenv("RIGD_NO_LOOK")
+    return folder / "quick_look.py"
 
 
 @pytest.fixture

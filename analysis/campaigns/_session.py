@@ -193,7 +193,6 @@ def _session_result(
     result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
 ) -> SessionResult:
     """Keep of a record's result what a campaign needs."""
-    from analysis.identify import headline_json
     from analysis.suited import record_band_hz, welch_settings
 
     record, whole, welch = result.record, result.whole, result.welch
@@ -214,9 +213,7 @@ def _session_result(
         else _estimates(whole, task.structures, measured, delay_s),
         verdict=None if whole is None else whole.verdict,
         warnings=warnings,
-        headline=None
-        if whole is None
-        else headline_json(str(record.path), whole.headline, whole.orders, whole.verdict.findings),
+        headline=None if whole is None else whole.headline_json(),
         settings=welch_settings(record, task.settings, task.band_hz),
         record_band_hz=record_band_hz(record, task.band_hz),
     )

@@ -212,7 +212,7 @@ class RecordAnalysis:
     def fit_percent(self, fit: RecordFit) -> float:
         """Fit of one of the models to the measured torque in the band (`nrmse_percent`).
 
-        Of the torque, hum is taken out, and at its lines nothing is compared; a decay that began
+        Hum is no part of that torque, and at its lines nothing is compared; a decay that began
         before the record counts as explained, as initial conditions do.
 
         Parameters

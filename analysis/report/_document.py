@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
-from analysis.identify import ResponseGrid, headline_json, scales_absorbed, with_scales
+from analysis.identify import ResponseGrid
 from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
 from analysis.report._bands import loss_factors, response_band, supported_band_hz
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import DampingSize, Quantity, RecordFit
+    from analysis.identify import DampingSize, RecordFit
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._bands import LossFactor
@@ -85,23 +85,6 @@ def _indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> Inde
     return asdict(fit_indices(omega, measured.response[known], model[known]))
 
 
-def combined_parameters(whole: WholeRecord) -> dict[str, Quantity]:
-    """Widen the parameters' intervals by the scales' uncertainty.
-
-    Parameters
-    ----------
-    whole : WholeRecord
-
-    Returns
-    -------
-    dict of str to Quantity
-        Those that a scale acts on whose uncertainty the file states.
-    """
-    if not scales_absorbed(whole.fit):
-        return {}
-    return with_scales(whole.headline.parameters, whole.record.uncertainty)
-
-
 def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
     """Fit of a Welch fit's model to the response that it was fitted to (`nrmse_percent`).
 
@@ -154,14 +137,8 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
         (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
         for _, fit in names
     ]
-    file = str(whole.record.path)
-    verdict = whole.verdict
     return {
-        "headline": {
-            **headline_json(file, whole.headline, whole.orders, verdict.findings),
-            "scale_uncertainty": dict(whole.record.uncertainty),
-            "combined": {n: each.as_json() for n, each in combined_parameters(whole).items()},
-        },
+        "headline": whole.headline_json(),
         "fits": [
             {
                 **name,

@@ -96,7 +96,10 @@ def _elastic(structure: Structure) -> Formula | None:
 
 
 def _inertial(structure: Structure) -> Formula:
-    inertia = _over(_name("ρ", r"\rho"), _EI) + _power(_S, _TWO)
+    ratio = _over(_name("ρ", r"\rho"), _EI)
+    # As large as if it stood alone: it is in a fraction itself.
+    large = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
+    inertia = Formula(large, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
     if not structure.external:
         return inertia
     return _joined(inertia, _PLUS, _term(_GAMMA, _LAMBDA, integer="lambda" not in structure.free))
@@ -177,7 +180,7 @@ def definitions(whole: WholeRecord) -> str:
     whole : WholeRecord
     """
     parts = [
-        "On the left coupling torque over motor angle, as transforms of Laplace",
+        "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]

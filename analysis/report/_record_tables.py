@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
-from analysis.report._document import combined_parameters, response_fit_percent
+from analysis.report._document import response_fit_percent
 from analysis.report._scales import scale_notes
 from analysis.report._table import (
     ABSENT,
@@ -83,7 +83,7 @@ def parameters_table(whole: WholeRecord) -> Table:
     beside the statistical ones.
     """
     told = whole.headline
-    combined = combined_parameters(whole)
+    combined = whole.combined
     including_scales = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),

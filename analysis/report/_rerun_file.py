@@ -529,7 +529,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     rigd.session.SessionError
         If the session file cannot be read any more.
     """
-    from rigd.view import draw_session, recorded_blueprint
+    from rigd.view import draw_session
 
     whole, welch, tabs = result.whole, result.welch, []
     if whole is not None:
@@ -543,7 +543,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
-            draw_session(stream, session, timings, layout=recorded_blueprint(tabs))
+            draw_session(stream, session, timings, front=tabs)
             if whole is not None:
                 draw_record(whole, torque, as_text(record_tables(whole)), stream)
             if welch is not None:

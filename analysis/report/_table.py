@@ -160,15 +160,20 @@ class Table:
 
     @property
     def shown_columns(self) -> tuple[Column, ...]:
-        """The columns that have a heading."""
-        return tuple(column for column in self.columns if column.heading)
+        """The columns that have a heading, but those without an entry in any row."""
+        filled = {key for row in self.rows for key, entry in row.items() if entry != ""}
+        return tuple(
+            column
+            for column in self.columns
+            if column.heading and (column.key in filled or not self.rows)
+        )
 
     @property
     def shown_rows(self) -> tuple[tuple[Cell, ...], ...]:
-        """Cells of the columns that have a heading."""
+        """Cells of these columns."""
+        columns = self.shown_columns
         return tuple(
-            tuple(column.shown(row.get(column.key, "")) for column in self.shown_columns)
-            for row in self.rows
+            tuple(column.shown(row.get(column.key, "")) for column in columns) for row in self.rows
         )
 
 
@@ -282,18 +287,13 @@ def _latex_piece(piece: re.Match[str]) -> str:
 def latex_table(table: Table) -> str:
     r"""Write a table as LaTeX's ``table``, with the rules of the package booktabs.
 
-    A column without an entry is left out; notes stand under the table.
+    Notes stand under it.
 
     Parameters
     ----------
     table : Table
     """
-    filled = [
-        place
-        for place, _column in enumerate(table.shown_columns)
-        if any(row[place].text for row in table.shown_rows)
-    ]
-    columns = [table.shown_columns[place] for place in filled]
+    columns = table.shown_columns
     alignment = "".join("r" if column.numeric else "l" for column in columns)
     lines = [
         r"\begin{table}",
@@ -305,7 +305,7 @@ def latex_table(table: Table) -> str:
         f"    {' & '.join(latex_text(column.heading) for column in columns)} \\\\",
         r"    \midrule",
         *(
-            f"    {' & '.join(latex_text(row[place].text) for place in filled)} \\\\"
+            f"    {' & '.join(latex_text(cell.text) for cell in row)} \\\\"
             for row in table.shown_rows
         ),
         r"    \bottomrule",

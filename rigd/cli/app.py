@@ -6,7 +6,7 @@ import io
 import os
 import signal
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -40,10 +40,33 @@ def before_a_command(
     """Take the options that stand before a command; they have done their work by then."""
 
 
+_SECTIONS: Final = {
+    "Sessions": ("run", "serve", "start", "status", "stop"),
+    "Rig": ("check", "tare", "zero", "reset", "live"),
+    "Session files": ("list", "info", "replay", "recover"),
+    "Set-up": ("profiles", "specimens", "identify", "bench"),
+    "Simulated devices": ("simulate", "inject"),
+}
+"""Commands by what they are for, as the help lists them."""
+_OTHERS: Final = "Other commands"
+
+
 class RigdGroup(TyperGroup):
     """All commands: what an error says, and its exit code, are told here for each of them."""
 
     # Typer's click is its own in some versions and the package of that name in others.
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the list of commands, in sections."""
+        listed = {name for names in _SECTIONS.values() for name in names}
+        others = tuple(name for name in self.list_commands(ctx) if name not in listed)
+        for title, names in {**_SECTIONS, _OTHERS: others}.items():
+            known = [name for name in names if name in self.commands]
+            if known:
+                width = formatter.width - 6 - max(map(len, known))
+                rows = [(name, self.commands[name].get_short_help_str(width)) for name in known]
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
         with errors_told():

@@ -136,8 +136,8 @@ def status(
             fail("--watch and --json do not go together; ask for one.", EXIT_WRONG_USE)
         if not sys.stdout.isatty():
             fail(
-                "--watch goes on in place on a terminal, and there is none; ask for the status "
-                "again and again, or watch the daemon's socket.",
+                "--watch needs a terminal; without one, run rigd status repeatedly, or watch the "
+                "daemon's socket.",
                 EXIT_WRONG_USE,
             )
         _watch(profile)
@@ -211,8 +211,8 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
         return
     for axis, mean in told["mean"].items():
         name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
-        typer.echo(f"{name}: {mean:.4g} {unit}, scatter {told['std'][axis]:.2g} {unit}")
-    typer.echo(f"coupling torque: scatter {told['torque_std_nm']:.2g} N·m")
+        typer.echo(f"{name}: mean {mean:.3f} {unit}, s.d. {told['std'][axis]:.3f} {unit}")
+    typer.echo(f"coupling torque: s.d. {told['torque_std_nm']:.3f} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:

@@ -10,17 +10,34 @@ from rigd.cli.options import EXIT_FAILED, AsJson, progress
 
 
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", readable=False, help="A session file.")],
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", readable=False, help="Session files.")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Show the contents of a session file.
+    """Show the contents of session files.
 
     Example: rigd info sessions/20261120-101500-chirp.mcap
     """
-    from rigd.session import describe
+    from rigd.session import SessionError, describe
 
-    found = describe(path)
-    typer.echo(json.dumps(found.as_dict()) if as_json else "\n".join(found.lines()))
+    documents: list[dict[str, Any]] = []
+    failed = False
+    for number, path in enumerate(paths):
+        try:
+            found = describe(path)
+        except SessionError as error:
+            failed = True
+            typer.echo(f"Error: {error}", err=True)
+            documents.append({"path": str(path), "error": str(error)})
+        else:
+            documents.append(found.as_dict())
+            if not as_json:
+                typer.echo(("\n" if number else "") + "\n".join(found.lines()))
+    if as_json and not (failed and len(paths) == 1):
+        typer.echo(json.dumps(documents[0] if len(paths) == 1 else {"files": documents}))
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
 
 
 def recover(

@@ -159,7 +159,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
                     for text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode, row.modes)),
-                "" if row.report is None else printable(row.report.parent.name),
+                "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
         ],
@@ -204,7 +204,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "beyond both intervals."
+        "beyond both intervals, ? is flagged in its report or quick look."
     )
 
 
@@ -234,17 +234,19 @@ def _interval(point: "TrendPoint", low: float, high: float) -> str:
 
 
 def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
-    value = scale * quantity["value"]
+    value, mark = scale * quantity["value"], " ?" if quantity["flag"] else ""
     if quantity["interval_95"] is None:
-        return f"{value:.4g}"
-    half = scale * (quantity["interval_95"][1] - quantity["interval_95"][0]) / 2
+        return f"{value:.4g}{mark}"
+    low, high = quantity["interval_95"]
+    half = scale * (high - low) / 2
     if not half > 0:
-        return f"{value:.6g}"
+        return f"{value:.6g}{mark}"
     places = min(decimals(half), 9)
-    return f"{value:.{places}f} ± {half:.{places}f}"
+    return f"{value:.{places}f} ± {half:.{places}f}{mark}"
 
 
 def _relative(change: "Change | None", first: float) -> str:
     if change is None or first == 0:
         return ""
-    return f"{100 * change.difference / first:+.2f} %{' *' if change.beyond_intervals else ''}"
+    percent = 100 * change.difference / first
+    return f"{percent:+.2g} %{' *' if change.beyond_intervals else ''}"

@@ -60,7 +60,7 @@ StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the 
 StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends (Hz).")]
 Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation (s).")]
 Rest = Annotated[float, typer.Option("--rest", help="Rest before the excitation (s).")]
-RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after it (s).")]
+RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after the excitation (s).")]
 Taper = Annotated[float, typer.Option("--taper", help="Fade-in and fade-out time (s).")]
 
 

@@ -129,7 +129,7 @@ def start_sessions(
                 typer.echo(json.dumps({"series": told["series"]}))
             else:
                 _tell_plan(told["plan"], err=False)
-                typer.echo("It is running; rigd status shows how far it is, rigd stop ends it.")
+                typer.echo("Running; rigd status shows the progress, rigd stop ends the session.")
             return
         _tell_plan(told["plan"], err=as_json)
         # A daemon of before an update makes none.

@@ -111,9 +111,11 @@ class PageProcess:
                 env=os.environ | SINGLE_THREADED,
             )
         self._process = process
+        if self._closing.is_set():
+            process.kill()
         assert process.stdin is not None
         assert process.stdout is not None
-        with process.stdout:
+        with process:
             try:
                 process.stdin.write(json.dumps(self._job).encode() + b"\n")
                 process.stdin.flush()
@@ -169,7 +171,7 @@ def _job(profile: Profile, folder: Path, socket: Path) -> dict[str, Any]:
         "description": profile.description,
         "rate_hz": rig.rate_hz,
         "limits": asdict(profile.limits),
-        "required_meta": [],
+        "required_meta": list(profile.metadata.required),
         "beam": asdict(rig.beam),
         "damping": asdict(rig.damping),
         "tool_inertia_kg_m2": rig.sensor.tool_inertia_kg_m2,

@@ -148,7 +148,7 @@ class ServedSeries:
             "excitation": self.request.excitation,
             "session": self.session,
             "repeat": self.request.repeat,
-            "notes": dict(self.request.notes),
+            "notes": self.request.notes.model_dump(exclude_defaults=True),
             "plan": None if self.planned is None else self.planned.plan_document(),
             "path": None if self.path is None else str(self.path),
             "running": self.running,
@@ -447,11 +447,13 @@ class Service:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are being made; try again in a moment.")
-        try:
-            profile = with_specimen(self._profile, request.notes.specimen)
-        except RigdError as error:
-            raise CommandError(str(error), wrong_use=error.wrong_use) from None
-        job = aside.PredictionJob(profile, request.excitation, request.parameters, request.force)
+        job = aside.PredictionJob(
+            self._profile,
+            request.excitation,
+            request.parameters,
+            request.force,
+            request.notes.specimen,
+        )
         self._predictions += 1
         try:
             async with self._predicting:
@@ -462,7 +464,7 @@ class Service:
     async def _check_rig(self) -> Document:
         if self.state in (State.RUNNING, State.STOPPING):
             raise CommandError(
-                "check is for a rig on which no session runs: wait for the session to end, or end "
+                "check needs a rig without a running session: wait for the session to end, or end "
                 "it with rigd stop."
             )
         self._refuse_if_busy()
@@ -718,7 +720,9 @@ class _Told:
 
     def begins(self, number: int, path: Path) -> None:
         if not self._listens():
-            raise RigError("The daemon hears nobody: no further session is begun.")
+            raise RigError(
+                "The daemon does not respond to requests: no further session is started."
+            )
         self._series.session, self._series.path = number, path
 
     def shown(self, where: str) -> None:

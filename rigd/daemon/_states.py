@@ -136,7 +136,7 @@ class StateMachine:
             return ""
         why = f" ({self.reason.rstrip('.')})" if self.state is State.FAULT else ""
         return (
-            f"{command} is for a rig that is {_ADJECTIVES[wanted]}, and this one is "
+            f"{command} needs a rig that is {_ADJECTIVES[wanted]}; this one is "
             f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."
         )
 

@@ -38,9 +38,12 @@ class PredictionJob:
     """Its options."""
     force: bool
     """Let torques be clipped."""
+    specimen: str
+    """Name of the specimen; empty: the profile's."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
+        from rigd.profile import with_specimen
         from rigd.runner import (
             excitation_for,
             largest_amplitude,
@@ -48,11 +51,12 @@ class PredictionJob:
             predict_session,
         )
 
-        excitation = excitation_for(self.profile, self.excitation, self.parameters)
-        plan = predict_session(self.profile, excitation, force=self.force)
+        profile = with_specimen(self.profile, self.specimen)
+        excitation = excitation_for(profile, self.excitation, self.parameters)
+        plan = predict_session(profile, excitation, force=self.force)
         return {
-            "plan": plan_document(self.profile, excitation, plan),
-            "largest_amplitude_rad": largest_amplitude(self.profile, excitation, force=self.force),
+            "plan": plan_document(profile, excitation, plan),
+            "largest_amplitude_rad": largest_amplitude(profile, excitation, force=self.force),
         }
 
 

@@ -36,7 +36,7 @@ class SimulatorAddress:
     serial_port: str = ""
     """Pseudo-terminal of the serial sensor; empty where it has none."""
     lock_step: bool = False
-    """It moves on by one period a SYNC instead of by the clock."""
+    """It advances one period per SYNC instead of by the clock."""
     rig: Mapping[str, object] = field(default_factory=dict)
     """What it simulates: the rig's parameters by dotted key, as `described` gives them."""
 

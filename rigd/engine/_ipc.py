@@ -306,7 +306,7 @@ class Pulse:
         Parameters
         ----------
         beat
-            Count that the process adds to while it is at work.
+            Count that the process adds to while it is running.
         now_s
             Time of a monotonic clock.
         """

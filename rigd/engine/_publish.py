@@ -37,7 +37,7 @@ class Display:
         self._before: tuple[int, tuple[int, ...]] | None = None
 
     def show(self, cycle: Cycle, now_ns: int) -> None:
-        """Show that the control process is at work, and what it reads.
+        """Publish the control process's heartbeat and readings.
 
         Parameters
         ----------

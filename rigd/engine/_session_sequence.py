@@ -187,7 +187,7 @@ class SessionSequence:
             )
         if rest.torque_spread_nm > settings.rest_torque_nm:
             return (
-                f"The beam is not at rest: the coupling torque scatters by "
+                f"The beam is not at rest: the coupling torque varies by "
                 f"{rest.torque_spread_nm:.2g} N·m, more than session.rest_torque_nm = "
                 f"{settings.rest_torque_nm:g} N·m."
             )
@@ -417,7 +417,7 @@ class SessionSequence:
         return None
 
     def _look(self) -> SessionEnd | None:
-        """Show that this process is at work and what it reads; see whether the others are."""
+        """Give this process's heartbeat and readings; see whether the others give theirs."""
         self._show()
         violation = self._cycle.look(
             self._metronome.due_ns,

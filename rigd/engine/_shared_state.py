@@ -144,7 +144,7 @@ class SharedState:
         return self._words[word : word + 1]
 
     def beat(self, word: Word) -> None:
-        """Show that the process that this word belongs to is at work."""
+        """Give the heartbeat of the process that this word belongs to."""
         self._words[word] += 1
 
     def close(self) -> None:

@@ -170,7 +170,7 @@ class TickScheduler:
     def wait(self) -> int:
         """Wait for the next tick and return how many were missed before it.
 
-        Whoever wakes a period or more after the deadline has missed that tick: the current tick is
+        A wake-up one period or more late counts as missed ticks: the current tick is
         then the last one whose deadline has passed.
         """
         tick = self.tick + 1

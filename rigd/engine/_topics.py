@@ -105,7 +105,7 @@ class Channels:
             self.board[Word.STOP] = Stop.OPERATOR
 
     def clear(self) -> None:
-        """Forget what the last session left; only while no recorder is at work."""
+        """Forget what the last session left; only while no recorder is running."""
         for ring in self.rings:
             ring.discard()
 

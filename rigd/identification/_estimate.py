@@ -381,8 +381,9 @@ def estimate_motor(
         found = fit(stacks, timing, hold_scale=True)
     if found is None:
         raise EstimateError(
-            "The motor's data cannot be told from the record: the fit does not settle. Look at "
-            "actuation.delay_s of the profile, from which the search begins, and at the record."
+            "The motor's data are not identifiable from the record: the fit does not converge. "
+            "Look at actuation.delay_s of the profile, from which the search begins, and at the "
+            "record."
         )
     values, stds = found.values, found.stds
     inertia = float(values[INERTIA])

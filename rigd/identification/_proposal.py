@@ -243,9 +243,9 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
     scale = estimate.torque_scale
     if scale.std is None:
         notes = [
-            "The torque constant cannot be told: the coupling torque is too small, or follows the "
-            "shaft like a rigid inertia (no antenna mounted?). The torque is taken as the drive "
-            "states it, and inertia and friction count in that."
+            "The torque constant is not identifiable: the coupling torque is too small, or follows "
+            "the shaft like a rigid inertia (no antenna mounted?). The torque is taken as the "
+            "drive states it, and inertia and friction count in that."
         ]
     else:
         value, deviation = _rounded(scale.value, scale.std)

@@ -24,6 +24,7 @@ INDEX_NAME: Final = "library.sqlite"
 
 _APPLICATION: Final = 0x72696764  # "rigd"
 _VERSION: Final = 1
+"""Greater whenever the table, or what a row is made of, is another: older indexes are made anew."""
 _HEADER: Final = b"SQLite format 3\0"
 _APPLICATION_PLACE: Final = slice(68, 72)
 _PATIENCE_S: Final = 2.0

@@ -18,7 +18,7 @@ REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
 PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
-_MOST_JSON_BYTES: Final = 32 << 20
+_MOST_JSON_BYTES: Final = 8 << 20
 _MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_META: Final = 100
@@ -203,10 +203,10 @@ def _list(document: object, key: str) -> list[object]:
 
 
 def usable_modes(modes: list[object]) -> tuple[Mode, ...]:
-    """Return what of a list is a mode: frequency above 0 and damping ratio, finite numbers."""
+    """Return the modes of a list that the record shows, if their numbers are finite."""
     found = []
     for mode in modes[:_MOST_MODES]:
-        if isinstance(mode, dict):
+        if isinstance(mode, dict) and mode.get("shown") is not False:
             frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
             if frequency is not None and frequency["value"] > 0 and damping is not None:
                 found.append({"frequency_hz": frequency, "damping_ratio": damping})

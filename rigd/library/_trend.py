@@ -21,7 +21,8 @@ class Change:
     difference: float
     """Later less earlier, in the unit of the quantity."""
     beyond_intervals: bool | None
-    """Whether it is beyond what both 95 % intervals allow; None if one of them is not known."""
+    """Whether it is beyond what both 95 % intervals allow; None if that cannot be told: an interval
+    is not known, or a quantity is flagged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ def change_between(before: Quantity, after: Quantity) -> Change:
     True
     """
     difference = after["value"] - before["value"]
-    if before.get("interval_95") is None or after.get("interval_95") is None:
+    if any(each.get("interval_95") is None or each.get("flag") for each in (before, after)):
         return Change(difference, None)
     low, high = (before, after) if difference >= 0 else (after, before)
     allowed = hypot(low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from rigd.engine import (
@@ -16,7 +17,7 @@ from rigd.engine import (
     read_events,
 )
 from rigd.session import decode_samples, decode_timings
-from rigd.view import Note, Scene, Subject
+from rigd.view import LastResponse, Note, Scene, Subject
 
 if TYPE_CHECKING:
     from rigd.view import Drawing
@@ -57,11 +58,14 @@ class LiveSession:
     begins
         How many records had been written to each ring before it, in the order of
         :data:`rigd.engine.TOPICS`.
+    folder
+        Folder of its file, where the sessions before it are; None: it is not known.
     """
 
     subject: Subject
     recording_id: str
     begins: tuple[int, ...]
+    folder: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +131,8 @@ class Intake:
     seen
         Samples that another publisher showed before this one took over, counted as `begins` is:
         those that are still there are read again, for the scene is made of them.
+    last
+        Response of the last session of the same specimen.
 
     Attributes
     ----------
@@ -138,8 +144,14 @@ class Intake:
         Duration of the samples that were read last.
     """
 
-    def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:
-        self.picture = Scene(session.subject)
+    def __init__(
+        self,
+        session: LiveSession,
+        channels: Channels,
+        seen: int = 0,
+        last: LastResponse | None = None,
+    ) -> None:
+        self.picture = Scene(session.subject, last=last)
         self.t_ns = 0
         self.took_s = 0.0
         self._rate_hz = session.subject.rate_hz

@@ -7,19 +7,49 @@ what could be shown. The process ends when its standard input does, and takes th
 """
 
 import collections
+import json
 import os
 import signal
 import time
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rigd.engine import SAMPLE, TOPICS, Channels, Failed, Parent, Word, attach_channels
+import numpy as np
+
+from rigd.engine import (
+    SAMPLE,
+    TOPICS,
+    Channels,
+    Failed,
+    Parent,
+    Phase,
+    Pulse,
+    Stop,
+    Word,
+    attach_channels,
+)
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown
 from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
-from rigd.view import Health, outcome_note, settle_sdk
+from rigd.view import (
+    RETURNING,
+    RUNNING,
+    STOPPING,
+    SUPERVISOR_LOST,
+    SUPERVISOR_LOST_TORQUE_OFF,
+    SUPERVISOR_SILENT,
+    Health,
+    LastResponse,
+    Note,
+    State,
+    ended,
+    outcome_note,
+    preparing,
+    settle_sdk,
+)
 
 if TYPE_CHECKING:
     from rigd.live._ring_reader import LiveJob
@@ -35,6 +65,8 @@ _WAITING_S: Final = 10.0
 _STUCK_S: Final = 20
 _PARTING_S: Final = 0.3
 """Time that the last messages take to the viewers."""
+_ORPHANED_S: Final = 4.0
+"""How long a session whose supervisor is gone is shown: it ends within a fraction of that."""
 
 
 def main() -> None:
@@ -70,6 +102,7 @@ class _Publisher:
         self._outlet = outlet
         self._feed = Feed(outlet)
         self._shown: _Shown | None = None
+        self._last: LastResponse | None = None
         self._told: int | None = None
 
     def serve(self) -> None:
@@ -86,12 +119,13 @@ class _Publisher:
                     self._begin(message)
                 case LiveEnd():
                     self._finish(message)
-        self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
+        self._outlive()
 
     def linger(self, linger_s: float) -> None:
         """Leave viewers the time to show the last of it, and to look at it."""
-        end = time.monotonic() + max(linger_s, _PARTING_S if self._feed.connections else 0.0)
-        while self._parent.alive() and time.monotonic() < end:
+        parted = time.monotonic() + (_PARTING_S if self._feed.connections else 0.0)
+        end = max(parted, time.monotonic() + linger_s)
+        while time.monotonic() < (end if self._parent.alive() else parted):
             _arm_watchdog()
             self._step()
             time.sleep(_PERIOD_S)
@@ -107,7 +141,9 @@ class _Publisher:
 
     def _begin(self, session: LiveSession) -> None:
         self._finish(LiveEnd(session.begins))
-        self._shown = _Shown(session, self._channels)
+        if self._shown is not None:
+            self._last = self._shown.intake.picture.last_response or self._last
+        self._shown = _Shown(session, self._channels, last_response(session, self._last))
         self._outlet.begin_session()
         self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
         self._step()
@@ -117,6 +153,19 @@ class _Publisher:
         if self._shown is not None and not self._shown.over:
             self._shown.finish(end)
             self._step()
+
+    def _outlive(self) -> None:
+        """Show a session whose supervisor is gone until its torque is off."""
+        shown, board = self._shown, self._channels.board
+        if shown is None or shown.over:
+            return
+        shown.lost = True
+        end = time.monotonic() + _ORPHANED_S
+        while board[Word.PHASE] != Phase.OFF and time.monotonic() < end:
+            _arm_watchdog()
+            self._step()
+            time.sleep(_PERIOD_S)
+        self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
 
     def _step(self) -> None:
         """Show what has come; count what cannot be shown."""
@@ -139,15 +188,17 @@ class _Publisher:
 class _Shown:
     """The session that is shown, or was last."""
 
-    def __init__(self, session: LiveSession, channels: Channels) -> None:
+    def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
         board = self._board = channels.board
         begin, seen = session.begins[TOPICS.index(SAMPLE)], board[Word.LIVE_SEEN]
         # A session that another publisher has shown up to there keeps its count.
         self._dropped_before = board[Word.LIVE_DROPPED] if seen > begin else 0
-        self.intake = Intake(session, channels, seen)
+        self.intake = Intake(session, channels, seen, last)
         self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
         self.over = False
+        self.lost = False  # its supervisor
         self._vitals = Vitals(channels)
+        self._states = StateWatch(channels)
         self._unsent = 0
 
     @property
@@ -166,6 +217,8 @@ class _Shown:
         if self._vitals.due(now_s):
             health = self._vitals.look(now_s, self.dropped)
             drawings += self.intake.picture.health(self.intake.t_ns, health)
+        state = SUPERVISOR_LOST if self.lost else self._states.look(now_s)
+        drawings += self.intake.picture.state(self.intake.t_ns, state)
         self.backlog.owe(harvest.notes)
         self.backlog.put(drawings, harvest.samples)
         self._tell()
@@ -181,11 +234,16 @@ class _Shown:
         """Take the rest of it, and what can only be known at its end."""
         self.intake.end(end.ends)
         self.gather()
-        picture = self.intake.picture
-        if end.outcome:
-            note = outcome_note(self.intake.t_ns, end.outcome, end.reason)
-            self.backlog.owe(picture.events([note]))
-        self.backlog.owe(picture.finish())
+        picture, t_ns = self.intake.picture, self.intake.t_ns
+        state = ended(end.outcome, end.reason)
+        if self.lost:
+            off = self._board[Word.PHASE] == Phase.OFF
+            state = SUPERVISOR_LOST_TORQUE_OFF if off else SUPERVISOR_LOST
+            self.backlog.owe(picture.events([Note(t_ns, "error", state.reason)]))
+        elif end.outcome:
+            self.backlog.owe(picture.events([outcome_note(t_ns, end.outcome, end.reason)]))
+        # Behind all that waits, which says that the session goes on; nothing comes after it.
+        self.backlog.put([*picture.finish(), *picture.state(t_ns, state)], 0)
         self.over = True
 
     def send(self, feed: Feed, *, connected: bool) -> None:
@@ -275,7 +333,100 @@ class Backlog:
         return drawings, samples
 
 
-# Health of a session
+# Response of the last session
+
+_MOST_LOOKS: Final = 50
+"""Quick looks among which one of the specimen is searched, from the newest on."""
+
+
+def last_response(session: "LiveSession", own: LastResponse | None) -> LastResponse | None:
+    """Return the response of the last session of the same specimen.
+
+    That is of the newest quick look beside the session's file, or what this view itself has
+    computed where that is of a later session.
+
+    Parameters
+    ----------
+    session
+        Session that is about to be shown.
+    own
+        Response of the session that was shown last.
+    """
+    specimen = session.subject.specimen
+    if own is not None and own.specimen != specimen:
+        own = None
+    if session.folder is None:
+        return own
+    looks = sorted(session.folder.glob("*.look.json"), reverse=True)
+    for path in looks[:_MOST_LOOKS]:
+        name = path.name.partition(".")[0]
+        if own is not None and name < own.session:
+            break
+        if name != session.subject.name and (found := _of_look(path, name, specimen)) is not None:
+            return found
+    return own
+
+
+def _of_look(path: Path, name: str, specimen: str) -> LastResponse | None:
+    """Return the response of a quick look; None if it has none, or is of another specimen."""
+    try:
+        look = json.loads(path.read_text("utf-8"))
+        if (look["specimen"] or "") != specimen:
+            return None
+        frequency_hz, magnitude, phase_rad = (
+            np.array(look["response"][key], np.float64)
+            for key in ("frequency_hz", "magnitude", "phase_rad")
+        )
+        response = magnitude * np.exp(1j * phase_rad)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if frequency_hz.ndim != 1 or response.shape != frequency_hz.shape:
+        return None
+    return LastResponse(name, specimen, frequency_hz, response)
+
+
+# State and health of a session
+
+_SILENT_S: Final = 0.6
+"""Time without a heartbeat of the supervisor from which on the view says so."""
+_TORQUE_PHASES: Final = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
+
+
+class StateWatch:
+    """Tells by the board in which state a session is.
+
+    Parameters
+    ----------
+    channels
+        The memory of the rig's processes.
+    """
+
+    def __init__(self, channels: Channels) -> None:
+        self._board = channels.board
+        self._supervisor = Pulse()
+
+    def look(self, now_s: float) -> State:
+        """Return the state; to be called several times a second.
+
+        Parameters
+        ----------
+        now_s
+            Time of a monotonic clock.
+        """
+        board = self._board
+        phase = Phase(board[Word.PHASE])
+        still_s = self._supervisor.look(board[Word.SUPERVISOR_BEAT], now_s)
+        if phase in _TORQUE_PHASES and still_s > _SILENT_S:
+            return SUPERVISOR_SILENT
+        if board[Word.STOP] != Stop.NO:
+            return STOPPING
+        if phase is Phase.RUNNING:
+            return RUNNING
+        # Until tick 0 the phase may be that of the session before.
+        if board[Word.GO] and phase is not Phase.READY:
+            return RETURNING
+        return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
+
 
 LOOK_S: Final = 0.25
 """Time from one look to the next."""

@@ -75,7 +75,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     if peak >= rated and continuous > peak:
         yield (
             f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
-            f"{peak:g} N·m; what a motor bears for ever is at most its peak."
+            f"{peak:g} N·m; continuous torque must not exceed peak torque."
         )
     asked = values["limits.torque_command_nm"]
     if asked < peak:

@@ -108,7 +108,7 @@ class RigSection:
     """Settings of the rig as a whole."""
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
-    """Slower loops look too seldom at who else is at work."""
+    """Slower loops check the other processes too seldom."""
 
 
 SECTIONS: dict[str, type] = {
@@ -203,6 +203,8 @@ class Specimen:
     """Its beam."""
     damping: Damping | None
     """Its nominal damping; None: that of the profile."""
+    uncertainty: ScaleUncertainty
+    """How well its length and density are known; the torque's scale is the rig's."""
     note: str
     """Whatever else is to be known of it."""
 

@@ -9,11 +9,13 @@ from rigd.devices import WhatMoves, reality
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
 from rigd.profile._places import specimen_files
-from rigd.profile._schema import SECTIONS, Profile, Specimen, fields_of
+from rigd.profile._schema import SECTIONS, Profile, ScaleUncertainty, Specimen, fields_of
 from rigd.units import suffix_of, unit_of
 
 _BEAM: Final = "beam"
 _DAMPING: Final = "beam.damping"
+_UNCERTAINTY: Final = "uncertainty"
+_OF_THE_RIG: Final = "uncertainty.torque_scale_percent"
 _NOTE: Final = "note"
 _MOST_BYTES: Final = 16_384
 """Longest file: it goes with each session through a pipe to the recorder."""
@@ -22,7 +24,8 @@ _MOST_BYTES: Final = 16_384
 def load_specimen(path: Path) -> Specimen:
     """Read and validate the file of a specimen.
 
-    It has the section ``[beam]`` of a profile and may have ``[beam.damping]`` and a text ``note``.
+    It has the section ``[beam]`` of a profile and may have ``[beam.damping]``, of ``[uncertainty]``
+    what concerns the beam, and a text ``note``.
 
     Parameters
     ----------
@@ -47,13 +50,15 @@ def load_specimen(path: Path) -> Specimen:
     note = values.pop(_NOTE, "")
     if not isinstance(note, str):
         problems.append(f"{_NOTE} = {note!r} must be text in quotes.")
-    for key in [key for key in values if not key.startswith(f"{_BEAM}.")]:
+    own = (f"{_BEAM}.", f"{_UNCERTAINTY}.")
+    for key in [key for key in values if not key.startswith(own) or key == _OF_THE_RIG]:
         del values[key]
         problems.append(
-            f"{key} does not belong to a specimen, which has [beam], [beam.damping] and note; "
-            "remove it."
+            f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
+            "[uncertainty] length_percent and density_percent, and note; remove it."
         )
-    sections = {_BEAM} | {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}
+    sections = {_BEAM, _UNCERTAINTY}
+    sections |= {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}
     values = validate(values, problems, frozenset({"", *SECTIONS} - sections))
     if not problems:
         problems.extend(diagnostics.first_mode(values))
@@ -63,7 +68,8 @@ def load_specimen(path: Path) -> Specimen:
     damping = None
     if _DAMPING in sections:
         damping = Damping(**{field: values[key] for key, field in fields_of(_DAMPING)})
-    return Specimen(path.stem, path, text, beam, damping, note)
+    uncertainty = ScaleUncertainty(**{field: values[key] for key, field in fields_of(_UNCERTAINTY)})
+    return Specimen(path.stem, path, text, beam, damping, uncertainty, note)
 
 
 def with_specimen(profile: Profile, name: str) -> Profile:
@@ -91,8 +97,14 @@ def with_specimen(profile: Profile, name: str) -> Profile:
         return profile
     specimen = load_specimen(path)
     rig = replace(profile.rig, beam=specimen.beam, damping=specimen.damping or profile.rig.damping)
-    words = _in_words(profile, specimen)
-    return replace(profile, rig=rig, specimen=specimen, specimen_in_words=words)
+    scale_percent = profile.uncertainty.torque_scale_percent
+    return replace(
+        profile,
+        rig=rig,
+        uncertainty=replace(specimen.uncertainty, torque_scale_percent=scale_percent),
+        specimen=specimen,
+        specimen_in_words=_in_words(profile, specimen),
+    )
 
 
 def _in_words(profile: Profile, specimen: Specimen) -> str:

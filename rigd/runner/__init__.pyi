@@ -1,5 +1,4 @@
 from ._console import ProgressLine as ProgressLine
-from ._console import counts_text as counts_text
 from ._console import plan_lines as plan_lines
 from ._console import result_line as result_line
 from ._foreground import SeriesFailedError as SeriesFailedError

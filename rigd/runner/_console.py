@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rigd.engine import Phase
-from rigd.printable import BAR_STYLES, grouped
+from rigd.printable import BAR_STYLES, counts_text
 
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
@@ -28,12 +28,12 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     limits = plan.get("limits", {})
 
     def peak(name: str, unit: str) -> str:
-        limit = f" of {limits[name]:g}" if name in limits else ""
-        return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
+        limit = f" (limit {limits[name]:g})" if name in limits else ""
+        return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
 
-    what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
+    what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
     sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
-    yield f"{what}{sweep}{plan['record_s']:g} s of record."
+    yield f"{what}{sweep}record of {plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
@@ -60,29 +60,6 @@ def result_line(session: Mapping[str, Any]) -> str:
     if session["path"] is None:
         return f"{outcome}: no record.{reason}"
     return f"{outcome}: {counts_text(session)}.{reason}"
-
-
-def counts_text(counts: Mapping[str, Any]) -> str:
-    """Say how many samples of a session were recorded, and what became of the others.
-
-    Parameters
-    ----------
-    counts
-        Counts as of `result_line`. Of what is rare, only what occurred is told.
-    """
-    rare = {
-        "lost": counts["lost"],
-        "stale angles": counts["stale_angles"],
-        "stale wrenches": counts["stale_wrenches"],
-    }
-    return ", ".join(
-        (
-            f"{grouped(counts['recorded'])} of {grouped(counts['scheduled'])} samples",
-            f"{counts['missed']} missed",
-            f"{counts['late']} late",
-            *(f"{count} {name}" for name, count in rare.items() if count),
-        )
-    )
 
 
 class ProgressLine:

@@ -196,9 +196,7 @@ class _Operator:
         self._tell(result_line(result.as_dict()))
         if result.path is not None:
             if result.live_dropped:
-                self._tell(
-                    f"The live view missed {result.live_dropped} samples; the file has them."
-                )
+                self._tell(f"The viewer dropped {result.live_dropped} samples; the file has them.")
             self._tell(str(result.path))
 
     def _close(self) -> None:

@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
 from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runtime import StopRequest
-from rigd.view import Subject
+from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of
 
 _PATIENCE_S = 10.0
 """It takes its time to start: a session waits so long for it."""
@@ -29,6 +30,8 @@ class LiveView:
         Processes with a publisher, their memory laid out.
     rig
         The profile's name.
+    fast
+        The sessions are not run in real time.
 
     Attributes
     ----------
@@ -36,7 +39,8 @@ class LiveView:
         Address of the view, as far as it is known.
     """
 
-    def __init__(self, crew: ProcessGroup, rig: str) -> None:
+    def __init__(self, crew: ProcessGroup, rig: str, *, fast: bool = False) -> None:
+        self._fast = fast
         self.address: LiveAddress | None = None
         self._crew = crew
         self._job = LiveJob(rig, crew.channels.specs)
@@ -67,7 +71,9 @@ class LiveView:
             self._start()
         self._await(lambda: self._heard, _PATIENCE_S, stop)
         begins = tuple(ring.written for ring in self._crew.channels.rings)
-        self._session = LiveSession(subject_of(order), str(uuid.uuid4()), begins)
+        self._session = LiveSession(
+            subject_of(order, fast=self._fast), str(uuid.uuid4()), begins, order.path.parent
+        )
         self._shown = False
         self._send(self._session)
         # So that it is there from the first sample on; a session does not depend on it.
@@ -79,7 +85,7 @@ class LiveView:
         return f"Live view: {self.address.viewer_url}"
 
     def look(self) -> None:
-        """See whether it is at work; if it died or hangs, start it again."""
+        """See whether it is running; if it died or hangs, start it again."""
         if not self._lost:
             self._listen(0.0)
         if not self._lost:
@@ -171,17 +177,60 @@ class LiveView:
         self._untold.append(Event(0, level, message))
 
 
-def subject_of(order: Order) -> Subject:
-    """Return what the live view needs to know of a session."""
-    rig = order.profile.rig
+def subject_of(order: Order, *, fast: bool = False) -> Subject:
+    """Return what the live view needs to know of a session.
+
+    Parameters
+    ----------
+    order
+        Session that is run.
+    fast
+        It is not run in real time.
+    """
+    rig, excitation = order.profile.rig, order.excitation
+    absent: set[str] = set()
+    if rig.devices.drive == rig.devices.sensor == "sim":
+        absent |= OF_A_BUS
+    if fast:
+        absent |= OF_REAL_TIME
     return Subject(
         name=order.path.stem,
         rate_hz=rig.rate_hz,
-        ticks=order.excitation.reference_rad.size,
-        sweep=order.excitation.segments["sweep"],
+        ticks=excitation.reference_rad.size,
+        sweep=excitation.segments["sweep"],
         beam=rig.beam,
         damping=rig.damping,
         tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
         angle_delay_s=rig.encoder.delay_s,
         torque_delay_s=rig.sensor.delay_s,
+        excitation=excitation.kind,
+        sweep_hz=band_of(excitation.kind, excitation.parameters),
+        specimen=dict(order.notes).get("specimen", ""),
+        limits=gauge_limits(order.profile),
+        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
+        absent=frozenset(absent),
     )
+
+
+def gauge_limits(profile: Profile) -> dict[str, float]:
+    """Return the limits of the gauges by their names, and that of missed ticks in percent.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    """
+    limits, motor, sensor = profile.limits, profile.rig.motor, profile.rig.sensor
+    axes = ("fx", "fy", "fz", "tx", "ty", "tz")
+    return {
+        "angle": limits.angle_rad,
+        "velocity": limits.velocity_rad_s,
+        "tracking_error": limits.tracking_error_rad,
+        # What is asked for beyond it is clipped.
+        "torque_command": motor.peak_torque_nm,
+        "i2t": motor.continuous_torque_nm,
+        "missed": limits.missed_percent,
+    } | {
+        axis: limits.sensor_range_percent / 100.0 * end
+        for axis, end in zip(axes, sensor.range, strict=True)
+    }

@@ -253,6 +253,8 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
         },
         "refused": plan.refused or None,
         "tip_in_words": plan.tip_in_words,
+        "beam": asdict(profile.rig.beam),
+        "damping": asdict(profile.rig.damping),
         "specimen_in_words": profile.specimen_in_words,
         "warnings": list(plan.warnings),
     }
@@ -328,18 +330,16 @@ def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
         return ""
     share = tip.deflection_m / beam.length_m
     motion = (
-        f"Predicted tip motion: {tip.deflection_m:.3g} m from the line of the root "
-        f"({100 * share:.2g} % of the length), {tip.speed_m_s:.3g} m/s through the air, slope "
-        f"{tip.slope_rad:.2g} rad."
+        f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * share:.2g} % of the length), "
+        f"tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
     )
     if not tip.slope_rad > SMALL_SLOPE_RAD:
         return motion
     lower = math.floor(100 * SMALL_SLOPE_RAD / tip.slope_rad) / 100
     within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
     return (
-        f"{motion} Slopes beyond {SMALL_SLOPE_RAD:g} rad are not small: the linear model leaves "
-        f"out up to {100 * tip.slope_rad**2 / 3:.2g} % of what bends and moves, and air drag may "
-        f"limit the motion{within}."
+        f"{motion} At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error "
+        f"up to {100 * tip.slope_rad**2 / 3:.2g} %), and air drag may limit the motion{within}."
     )
 
 

@@ -177,7 +177,11 @@ class QuickLooks:
         self._left_s, self._looked_s = _LONGEST_S, time.monotonic()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _PROGRAM, str(self._session), "--parent", str(os.getpid())],
+                # -P: a folder named analysis where the operator works is another one.
+                [
+                    *(sys.executable, "-P", "-m", _PROGRAM),
+                    *(str(self._session), "--parent", str(os.getpid())),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

@@ -378,7 +378,8 @@ def software_commit() -> dict[str, str]:
     checkout = Path(__file__).resolve().parents[2]
     if not (checkout / ".git").exists():
         return {}
-    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
+    command = ["git", "--no-optional-locks", "-C", str(checkout), "describe"]
+    command += ["--always", "--dirty", "--abbrev=12"]
     try:
         found = subprocess.run(
             command, capture_output=True, text=True, timeout=_GIT_PATIENCE_S, check=True

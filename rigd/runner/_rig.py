@@ -135,7 +135,7 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         if LIVE in crew:
-            self._view = LiveView(crew, self._profile.name)
+            self._view = LiveView(crew, self._profile.name, fast=self._fast)
         self.connected = True
         self.zero_lost |= self._zero_set
         self._zero_set = False
@@ -184,6 +184,7 @@ class Rig:
             return result
         except SessionFailedError as error:
             error.hardware = not self.simulated
+            outcome, reason = "fault", str(error)
             raise
         finally:
             if self._view is not None:

@@ -1,7 +1,7 @@
 """One session in the processes of a rig, watched from its start to its file.
 
 It moves nothing itself. It has the file opened before the drive is enabled, lets tick 0 happen when
-the recorder is ready, shows the progress, passes a stop on, sees that every process is at work, and
+the recorder is ready, shows the progress, passes a stop on, sees that every process is running, and
 has the file closed with the outcome.
 """
 

@@ -99,15 +99,18 @@ class Violation:
         """Return one or two sentences for the operator."""
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
-        left = "is below its limit of" if self.below else "exceeds its limit of"
-        how = left
-        if self.warning is not None:
-            side = "below" if self.below else "above"
-            how = f"is {side} its warning level of {self.warning:.4g} {self.unit}; its limit is"
-        where = f" ({self.key})" if self.key else ""
         remedy = f" {self.remedy}" if self.remedy else ""
+        if self.warning is not None:
+            where = f", {self.key}" if self.key else ""
+            return (
+                f"{self.channel[0].upper()}{self.channel[1:]} {self.value:.4g} {self.unit} "
+                f"{'below' if self.below else 'above'} warning level {self.warning:.4g} "
+                f"{self.unit} (limit {self.limit:.4g}{where}).{remedy}"
+            )
+        how = "is below" if self.below else "exceeds"
+        where = f" ({self.key})" if self.key else ""
         return (
-            f"The {self.channel} of {self.value:.4g} {self.unit} {how} "
+            f"The {self.channel} of {self.value:.4g} {self.unit} {how} its limit of "
             f"{self.limit:.4g} {self.unit}{where}.{remedy}"
         )
 

@@ -1,7 +1,8 @@
 """Summary of a session file, for people and for programs."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from os import PathLike
@@ -10,9 +11,10 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from rigd.printable import printable
+from rigd.printable import counts_text, grouped, printable
 from rigd.session._format import SessionError, Status
 from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
+from rigd.units import suffix_of, unit_of
 
 LOOK_SUFFIX: Final = ".look.json"
 """Ending of the file of a quick look, in place of the session file's."""
@@ -23,6 +25,15 @@ _AROUND: Final = 120
 _LONGEST_KEY: Final = 200
 _LONGEST_TEXT: Final = 10_000
 _WIDEST_KEY: Final = 40
+_COUNTS: Final = frozenset(
+    {"scheduled", "recorded", "missed", "late", "lost", "stale_angles", "stale_wrenches"}
+)
+_UTC: Final = "_utc_ns"
+_START: Final = f"start{_UTC}"
+_DIGITS: Final = 6
+_MEASURED_DIGITS: Final = 3
+"""What the noise of half a second leaves of a tare."""
+_LONGEST_NUMBERS: Final = 200
 _LONGEST_COUNT: Final = 12
 """Digits of a number of ticks: of thirty years at 1 kHz."""
 
@@ -93,24 +104,27 @@ class SessionInfo:
         }
 
     def lines(self) -> list[str]:
-        """Return it as lines of text."""
+        """Return it as lines of text, numbers rounded, times local as well."""
         rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
-            ("started", self.start_utc),
-            ("outcome", "unknown" if self.outcome is None else _outcome(self.outcome)),
+            ("started", _clock(datetime.fromisoformat(self.start_utc))),
+            *_outcome(self.outcome or {}),
             *(("recovered", f"{k}: {v}") for k, v in _recovery(self.outcome or {}).items()),
             (
                 "samples",
-                f"{self.samples} at {self.rate_hz:g} Hz, {self.duration_s:.3f} s, "
-                f"{self.missing_ticks} ticks missing",
+                f"{grouped(self.samples)} at {self.rate_hz:g} Hz, {self.duration_s:g} s, "
+                f"{grouped(self.missing_ticks)} ticks missing",
             ),
-            *(("flagged", f"{name}: {n} samples") for name, n in self.status_counts.items()),
+            *(
+                ("flagged", f"{name}: {grouped(n)} samples")
+                for name, n in self.status_counts.items()
+            ),
             *(
                 ("segment", f"{name}: {first} to {end} ({(end - first) / self.rate_hz:g} s)")
                 for name, (first, end) in self.segments.items()
             ),
             *(("attached", f"{name} ({size} bytes)") for name, size in self.attachments.items()),
-            *((key, value) for key, value in self.metadata.items()),
+            *(_rounded(key, value) for key, value in self.metadata.items() if key != _START),
             *(
                 (f"{event.t_ns / 1e9:.3f} s", f"{event.level}: {event.message} [{event.name}]")
                 for event in self.events
@@ -277,15 +291,49 @@ def _status_counts(session: Session) -> dict[str, int]:
 
 
 def _iso(utc_ns: int) -> str:
-    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
-    return moment.isoformat(timespec="microseconds")
+    return _utc(utc_ns).isoformat(timespec="microseconds")
 
 
-def _outcome(outcome: dict[str, str]) -> str:
-    first = outcome.get("outcome", "unknown")
-    told_apart = ("outcome", *(_RECOVERED + key for key in _recovery(outcome)))
-    others = ", ".join(f"{k} {v}" for k, v in outcome.items() if k not in told_apart and v)
-    return f"{first} ({others})" if others else first
+def _utc(utc_ns: int) -> datetime:
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+
+
+def _outcome(outcome: dict[str, str]) -> Iterator[tuple[str, str]]:
+    told = {"outcome", "reason", *(_RECOVERED + key for key in _recovery(outcome))}
+    text = outcome.get("outcome", "unknown").capitalize()
+    with suppress(KeyError, ValueError):  # of another program, or of a recovery
+        text += f": {counts_text(outcome)}"
+        told |= _COUNTS
+    reason = outcome.get("reason")
+    yield "outcome", f"{text}. {reason}" if reason else text
+    yield from (_rounded(key, value) for key, value in outcome.items() if key not in told and value)
+
+
+def _rounded(key: str, value: str) -> tuple[str, str]:
+    """Return a key and its value for people, a number to the digits that are read, with its unit.
+
+    JSON has the key as it is, and all of the digits.
+    """
+    if len(value) > _LONGEST_NUMBERS:
+        return key, value
+    with suppress(ValueError, OverflowError):
+        if key.endswith(_UTC):
+            return key.removesuffix(_UTC), _clock(_utc(int(value)))
+        digits = _MEASURED_DIGITS if key.startswith("tare_") else _DIGITS
+        shown = [
+            f"{float(each):.{digits}g}" if "." in each else f"{int(each)}"
+            for each in value.split(",")
+        ]
+        name = key.removesuffix(suffix_of(key)).replace("_", " ")
+        return name, f"{', '.join(shown)} {unit_of(key)}".rstrip()
+    return key.replace("_", " "), value
+
+
+def _clock(moment: datetime) -> str:
+    """Return a time in UTC and where this computer is."""
+    utc = f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+    local = moment.astimezone()
+    return f"{utc} ({local:%Y-%m-%d %H:%M:%S %Z})" if local.utcoffset() else utc
 
 
 def _recovery(outcome: dict[str, str]) -> dict[str, str]:

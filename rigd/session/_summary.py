@@ -24,7 +24,7 @@ from rigd.session._schema import SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
 
 _CHECKSUM_SIZE: Final = 4
-_BEGINNING_BYTES: Final = 1 << 20
+_BEGINNING_BYTES: Final = 1 << 18
 """Length of the beginning that is read of a file without its end."""
 _MOST_SUMMARY_BYTES: Final = 16 << 20
 _MOST_METADATA_BYTES: Final = 1 << 20
@@ -141,7 +141,9 @@ def _led_to(file: BinaryIO, summary: bytes) -> McapContents | None:
             statistics = parsed(Statistics.read, record, "")
         elif opcode == Opcode.METADATA_INDEX:
             indexes.append(parsed(MetadataIndex.read, record, ""))
-    if statistics is None or not len(indexes) == statistics.metadata_count <= _MOST_RECORDS:
+            if len(indexes) > _MOST_RECORDS:
+                return None
+    if statistics is None or len(indexes) != statistics.metadata_count:
         return None
     contents.message_counts |= statistics.channel_message_counts
     for index in indexes:

@@ -30,7 +30,7 @@ _RIGHT = 24.0
 _TITLE_RISE = 27.0
 """Height of the middle of titles and legend above the frame, in points."""
 
-_LABEL_DROP = 12.0
+LABEL_DROP = 12.0
 """How far Rerun puts the middle of a label under its point, in points."""
 _CHARACTER = 6.7
 """Mean width of a character of a label, in points."""
@@ -230,7 +230,7 @@ class Chart:
         import rerun as rr
 
         left, top, right, bottom = self.frame
-        middle = [(left + right) / 2, (top + bottom) / 2 - _LABEL_DROP]
+        middle = [(left + right) / 2, (top + bottom) / 2 - LABEL_DROP]
         stream.log(
             f"{self.entity}/note",
             rr.Points2D(
@@ -301,7 +301,7 @@ class Chart:
         stream.log(
             f"{self.entity}/labels",
             rr.Points2D(
-                [[x, y - _LABEL_DROP] for _, x, y in labels],
+                [[x, y - LABEL_DROP] for _, x, y in labels],
                 labels=[text for text, _, _ in labels],
                 colors=[GREY] * (len(labels) - len(self.legend))
                 + [key.color for key in self.legend],

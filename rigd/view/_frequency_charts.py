@@ -1,7 +1,7 @@
 """Charts over frequency: the growing frequency response with the nominal model, a spectrogram."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -11,7 +11,7 @@ from rigd.beam import Damping, transfer
 from rigd.session import Status
 from rigd.spectral import RunningEstimate, RunningResponse
 from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
-from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE, TIMELINE
+from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -85,7 +85,7 @@ MAGNITUDE: Final = "/frequency_response/magnitude"
 PHASE: Final = "/frequency_response/phase"
 COHERENCE: Final = "/frequency_response/coherence"
 SIZES: Final = {
-    OVERVIEW_MAGNITUDE: (690.0, 340.0),
+    OVERVIEW_MAGNITUDE: (690.0, 285.0),
     MAGNITUDE: (1280.0, 374.0),
     PHASE: (640.0, 274.0),
     COHERENCE: (640.0, 274.0),
@@ -93,14 +93,23 @@ SIZES: Final = {
 """Width and height of the canvases, in points."""
 
 MEASURED_KEY: Final = Key("measured", SKY_BLUE)
+UNCERTAIN_KEY: Final = Key("low coherence", GREY)
+"""Key of the measured response where its coherence is below `LOW_COHERENCE`."""
 MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
+LAST_KEY: Final = Key("last session", PURPLE)
+"""Key of the response of the last session of the same specimen."""
 COHERENCE_KEY: Final = Key("coherence", GREEN)
 NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
 """Key of the bands that the reference has not excited, as far as the estimate has used it."""
 
+LOW_COHERENCE: Final = 0.8
+"""Coherence below which a response is drawn grey: there the random error of its magnitude is more
+than 0.35/√n, with n averages (J. S. Bendat and A. G. Piersol, Random Data, 4th ed., Table 9.6)."""
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 
+_NARROW: Final = 700.0
+"""Width up to which a chart has no room for a legend of five entries, in points."""
 _SHADES: Final = ("not_estimated_below", "not_estimated_above")
 _GROUPS: Final = 200
 """Groups of points along the axis, two kept per group: enough for the pixels of a view."""
@@ -121,11 +130,32 @@ _DEEPEST_DB: Final = 140.0
 """Largest range of an axis below the highest magnitude."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LastResponse:
+    """Response of an earlier session.
+
+    Attributes
+    ----------
+    session, specimen
+        Names of that session and of its specimen.
+    frequency_hz
+        Shape (n,), increasing.
+    response
+        Torque over angle in N·m/rad, complex, shape (n,); NaN where it was not estimated.
+    """
+
+    session: str
+    specimen: str
+    frequency_hz: Real
+    response: Complex
+
+
 @dataclass(frozen=True, slots=True)
 class _Graph:
     chart: Chart
     key: Key
     values: Callable[["FrequencyResponse"], Real]
+    of_response: Callable[[Complex], Real] | None = None
 
 
 class ResponseCharts:
@@ -135,23 +165,26 @@ class ResponseCharts:
     ----------
     subject
         The session.
+    last
+        Response of the last session, drawn beneath this one's.
     """
 
-    def __init__(self, subject: "Subject") -> None:
+    def __init__(self, subject: "Subject", last: LastResponse | None = None) -> None:
         frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
         model = _measured_model(subject, frequency_hz, subject.damping or _FAINT)
         model_db = magnitude_db(model)
         magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         known = subject.damping is not None
-        of_model = (MODEL_KEY,) if known else ()
+        beside = ((MODEL_KEY,) if known else ()) + ((LAST_KEY,) if last else ())
+        keys = (MEASURED_KEY, UNCERTAIN_KEY, *beside)
+        # The title of the view says what it is.
+        short = replace(magnitude, title="dB re 1 N·m/rad")
         self._graphs = (
             *(
-                _Graph(
-                    _chart(entity, magnitude, MEASURED_KEY, *of_model), MEASURED_KEY, _magnitude_db
-                )
-                for entity in (OVERVIEW_MAGNITUDE, MAGNITUDE)
+                _Graph(_chart(entity, axis, *keys), MEASURED_KEY, _magnitude_db, magnitude_db)
+                for entity, axis in ((OVERVIEW_MAGNITUDE, short), (MAGNITUDE, magnitude))
             ),
-            _Graph(_chart(PHASE, PHASE_AXIS, MEASURED_KEY, *of_model), MEASURED_KEY, _phase_deg),
+            _Graph(_chart(PHASE, PHASE_AXIS, *keys), MEASURED_KEY, _phase_deg, phase_deg),
             _Graph(_chart(COHERENCE, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence),
         )
         self._delays_s = {
@@ -169,9 +202,12 @@ class ResponseCharts:
             if known
             else {}
         )
+        self._lasts = {} if last is None else _curves_of(last, self._graphs)
         self._thinning: Thinning | None = None
         self._t_ns = 0
+        self._known: tuple[Real, Complex] | None = None
         self._curves: dict[str, Sequence[Real]] = {}
+        self._uncertain: dict[str, Sequence[Real]] = {}
         self._excited_hz = (LAST_HZ, LAST_HZ)
         self._note = NO_COHERENCE_YET
 
@@ -189,6 +225,15 @@ class ResponseCharts:
                 graph.chart.draw_curve(
                     stream, "model", self._models[graph.chart.entity], MODEL_KEY, static=True
                 )
+            if graph.chart.entity in self._lasts:
+                graph.chart.draw_curve(
+                    stream,
+                    "last",
+                    self._lasts[graph.chart.entity],
+                    LAST_KEY,
+                    static=True,
+                    order=1,
+                )
 
     def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
         """Take what is known of the response at a time of the session."""
@@ -198,12 +243,19 @@ class ResponseCharts:
             self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
         excited = estimate.excited
         self._t_ns = t_ns
-        self._curves = {
-            graph.chart.entity: self._thinning.strips(
-                np.where(excited, graph.values(response), np.nan)
-            )
-            for graph in self._graphs
-        }
+        self._known = grid, np.where(excited, response.response, np.nan)
+        trusted = excited
+        if response.coherence is not None:
+            trusted = excited & (response.coherence >= LOW_COHERENCE)
+        strips = self._thinning.strips
+        self._curves, self._uncertain = {}, {}
+        for graph in self._graphs:
+            values, entity = graph.values(response), graph.chart.entity
+            # Of the coherence itself all is certain.
+            sure = trusted if graph.of_response else excited
+            self._curves[entity] = strips(np.where(sure, values, np.nan))
+            if graph.of_response:
+                self._uncertain[entity] = strips(np.where(excited, values, np.nan))
         ends = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
         self._excited_hz = float(ends[0]), float(ends[1])
         missing = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
@@ -214,11 +266,38 @@ class ResponseCharts:
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
         for graph in self._graphs:
             chart = graph.chart
-            chart.draw_curve(stream, "measured", self._curves.get(chart.entity, ()), graph.key)
+            if graph.of_response:
+                # Beneath the whole curve, so that no gap is left where it changes its colour.
+                below = self._uncertain.get(chart.entity, ())
+                chart.draw_curve(stream, "uncertain", below, UNCERTAIN_KEY)
+            curve = self._curves.get(chart.entity, ())
+            chart.draw_curve(stream, "measured", curve, graph.key, order=1)
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
             for name, first_hz, last_hz in zip(_SHADES, ends_hz[::2], ends_hz[1::2], strict=True):
                 chart.move_shade(stream, name, first_hz, last_hz)
         self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
+
+    def as_last(self, subject: "Subject") -> LastResponse | None:
+        """Return what was last taken as the response of an earlier session; None without any.
+
+        Parameters
+        ----------
+        subject
+            The session of these charts.
+        """
+        if self._known is None:
+            return None
+        return LastResponse(subject.name, subject.specimen, *self._known)
+
+
+def _curves_of(last: LastResponse, graphs: "Sequence[_Graph]") -> dict[str, Sequence[Real]]:
+    """Return the curves of a response by the entities of the charts that show it."""
+    thinning = Thinning.logarithmic(last.frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
+    return {
+        graph.chart.entity: thinning.strips(graph.of_response(last.response))
+        for graph in graphs
+        if graph.of_response
+    }
 
 
 def magnitude_db(response: Complex) -> Real:
@@ -302,7 +381,10 @@ def response_chart(
 
 
 def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
-    return response_chart(entity, SIZES[entity], (FIRST_HZ, LAST_HZ), y, *keys, NOT_ESTIMATED_KEY)
+    size = SIZES[entity]
+    if LAST_KEY not in keys or size[0] > _NARROW:  # there is room for one more
+        keys = (*keys, NOT_ESTIMATED_KEY)
+    return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)
 
 
 # Spectrogram

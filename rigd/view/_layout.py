@@ -5,12 +5,13 @@ Rerun's plots have no axis titles: the unit stands in the title of the view and 
 Rerun makes an axis as long as its values need, and labels multiples of a power of ten where they
 are far enough apart to be read. So ±0.06 would have a single label, 0. Where it comes to this, the
 next multiple is put among the values, invisibly, which makes the axis a little longer (`Scale`). In
-time it is put where an extreme value is, and leaves the plot with it.
+time it is put where an extreme value is, and leaves the plot with it. In the same way an axis is
+kept at least as long as its plot asks for.
 """
 
 import collections
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.view import _antenna as antenna
+from rigd.view import _banner
 from rigd.view import _plots as plots
 from rigd.view._frequency_charts import (
     COHERENCE,
@@ -30,7 +32,7 @@ from rigd.view._frequency_charts import (
 )
 from rigd.view._frequency_charts import SIZE as SPECTROGRAM_SIZE
 from rigd.view._plots import TIMELINE, Plot, Source, Values, send_columns
-from rigd.view._session_info import EVENTS, SUMMARY
+from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -75,13 +77,14 @@ class TimeView:
         return f"{self.plot.component}_ticks_{self.window_s:g}_s"
 
 
+_BESIDE_BANNER: Final = 228.0
 _THREE_ROWS: Final = 189.0
 _FOUR_ROWS: Final = 131.0
 """Heights of the plots of a tab."""
 
 OVERVIEW: Final = tuple(
-    TimeView(plots.SIGNALS, plot, WINDOW_S, _THREE_ROWS)
-    for plot in (plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR)
+    TimeView(plots.SIGNALS, plot, WINDOW_S, _BESIDE_BANNER)
+    for plot in (plots.ANGLE, plots.COUPLING_TORQUE)
 )
 SIGNALS: Final = tuple(
     TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROWS)
@@ -99,13 +102,23 @@ HEALTH: Final = (
     TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROWS),
     *(TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROWS) for plot in plots.HEALTH.plots),
 )
+_TWO_COLUMNS: Final = 4
+"""Fewest plots of the tab Health that stand in two columns."""
 TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
 
 TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
 
 
-def blueprint(active_tab: str = TABS[0]) -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample, with one of its tabs in front."""
+def blueprint(active_tab: str = TABS[0], *, absent: Collection[str] = ()) -> "rrb.Blueprint":
+    """Return the layout, which follows the newest sample, with one of its tabs in front.
+
+    Parameters
+    ----------
+    active_tab
+        The tab in front.
+    absent
+        Components of plots that are left out, for nothing of theirs comes.
+    """
     import rerun.blueprint as rrb
 
     contents = (
@@ -113,7 +126,7 @@ def blueprint(active_tab: str = TABS[0]) -> "rrb.Blueprint":
         _signals(),
         _frequency_response(),
         _spectrogram(),
-        _health(),
+        _health(absent),
         _events(),
     )
     for tab, name in zip(contents, TABS, strict=True):
@@ -129,20 +142,23 @@ def blueprint(active_tab: str = TABS[0]) -> "rrb.Blueprint":
 def _overview() -> "rrb.Container":
     import rerun.blueprint as rrb
 
-    return rrb.Horizontal(
-        rrb.Vertical(*map(_plot, OVERVIEW)),
-        rrb.Vertical(
-            chart_view(
-                "Frequency response, torque over angle",
-                OVERVIEW_MAGNITUDE,
-                SIZES[OVERVIEW_MAGNITUDE],
+    state, values = _banner.views()
+    return rrb.Vertical(
+        rrb.Horizontal(state, values, column_shares=[6, 7]),
+        rrb.Horizontal(
+            rrb.Vertical(*map(_plot, OVERVIEW)),
+            rrb.Vertical(
+                chart_view(
+                    "Frequency response: magnitude of torque over angle",
+                    OVERVIEW_MAGNITUDE,
+                    SIZES[OVERVIEW_MAGNITUDE],
+                ),
+                rrb.Horizontal(antenna.view(), _recent_events()),
+                row_shares=[6, 5],
             ),
-            rrb.Horizontal(
-                antenna.view(),
-                _log(),
-            ),
+            column_shares=[6, 7],
         ),
-        column_shares=[6, 7],
+        row_shares=[2, 7],
     )
 
 
@@ -168,11 +184,12 @@ def _spectrogram() -> "rrb.Container":
     )
 
 
-def _health() -> "rrb.Container":
+def _health(absent: Collection[str]) -> "rrb.Container":
     import rerun.blueprint as rrb
 
+    shown = [view for view in HEALTH if view.plot.component not in absent]
     return rrb.Horizontal(
-        rrb.Grid(*map(_plot, HEALTH), grid_columns=2),
+        rrb.Grid(*map(_plot, shown), grid_columns=1 if len(shown) < _TWO_COLUMNS else 2),
         _summary(),
         column_shares=[7, 2],
     )
@@ -273,7 +290,14 @@ def chart_page(
 def _summary() -> "rrb.TextDocumentView":
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(name="State", origin=SUMMARY)
+    return rrb.TextDocumentView(name="Health", origin=SUMMARY)
+
+
+def _recent_events() -> "rrb.TextDocumentView":
+    """Return the newest events as a document: its lines are wrapped, those of a log are cut."""
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS)
 
 
 def _log() -> "rrb.TextLogView":
@@ -297,6 +321,8 @@ MARGINS: Final = 1.1
 
 _STEP_NS: Final = 100_000_000
 """Interval of time of which the extremes are looked at."""
+_MOST_SPANS: Final = 1e9
+"""Values beyond so many of the shortest axis are another program's; they are shown as they are."""
 _ABSURDLY_SMALL, _ABSURDLY_LARGE = 1e-300, 1e300
 _Mark = tuple[int, float]
 """Time since the start of the session in ns, and a value."""
@@ -374,7 +400,7 @@ class _Axis:
             return []
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
-        below, above = missing_ticks(-minus_low, high, self.view.height)
+        below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
         # When either extreme leaves, it is seen anew what is missing.
         earlier_ns = min(low_ns, high_ns)
         added = []
@@ -409,8 +435,10 @@ class _Greatest:
         return self._marks[0]
 
 
-def missing_ticks(low: float, high: float, height: float) -> tuple[float | None, float | None]:
-    """Return what an axis must hold besides its values for two labels to be seen beside it.
+def missing_ticks(
+    low: float, high: float, height: float, least_span: float = 0.0
+) -> tuple[float | None, float | None]:
+    """Return what an axis must hold besides its values to be long enough and have two labels.
 
     Parameters
     ----------
@@ -418,12 +446,34 @@ def missing_ticks(low: float, high: float, height: float) -> tuple[float | None,
         Extremes of the values.
     height
         Height of the plot, in points.
+    least_span
+        Shortest length of the axis.
 
     Returns
     -------
     below, above
-        Values that are labelled if the axis holds them; None where none is needed.
+        Values that the axis has to hold; None where none is needed.
     """
+    if 0.0 <= high - low < least_span and max(-low, high) < _MOST_SPANS * least_span:
+        # In steps, so that a little noise does not move the axis.
+        step = least_span / 2
+        first, last = math.floor(low / step), math.ceil(high / step)
+        if last - first < 2:
+            first, last = (
+                (first - 1, last + 1)
+                if first == last
+                else (
+                    (first - 1, last)
+                    if low - first * step < last * step - high
+                    else (first, last + 1)
+                )
+            )
+        ends = first * step, last * step
+        ticks = missing_ticks(*ends, height)
+        below, above = (
+            end if tick is None else tick for end, tick in zip(ends, ticks, strict=True)
+        )
+        return below if below < low else None, above if above > high else None
     spacing = MARGINS * (high - low) / height * LEAST_SPACING
     # Rerun shows a single value with one unit to either side, and absurd ones as it can.
     if not _ABSURDLY_SMALL < spacing < _ABSURDLY_LARGE:

@@ -26,6 +26,8 @@ SKY_BLUE: Color = (86, 180, 233)
 GREEN: Color = (0, 158, 115)
 VERMILION: Color = (213, 94, 0)
 PURPLE: Color = (204, 121, 167)
+RED: Color = (229, 57, 53)
+"""For alarms and nothing else."""
 GREY: Color = (130, 130, 130)
 """For frames, grids and tick labels, and for a curve of minor interest."""
 
@@ -80,12 +82,16 @@ class Plot:
         Curves from the lowest to the topmost.
     span
         The ends of the axis, where they are the same for every session.
+    least_span
+        Shortest axis, in the unit of the curves: noise and single steps are not drawn as large as
+        the signal.
     """
 
     component: str
     title: str
     curves: tuple[Curve, ...]
     span: tuple[float, float] | None = None
+    least_span: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +167,7 @@ ANGLE = Plot(
         Curve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
         Curve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
     ),
+    least_span=4.0,
 )
 TRACKING_ERROR = Plot(
     "tracking_error_mrad",
@@ -172,19 +179,24 @@ TRACKING_ERROR = Plot(
             lambda r: 1e3 * (r["angle_reference_rad"] - r["angle_rad"]),
         ),
     ),
+    least_span=2.0,
 )
 COUPLING_TORQUE = Plot(
     "coupling_torque_nm",
     "Coupling torque, tared (N·m)",
     (Curve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
+    least_span=0.1,
 )
 TORQUE_COMMAND = Plot(
     "torque_command_nm",
     "Torque command, after limits (N·m)",
     (Curve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
+    least_span=0.1,
 )
-FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"))
-TORQUES = Plot("torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"))
+FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), least_span=1.0)
+TORQUES = Plot(
+    "torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"), least_span=0.1
+)
 LOOP = Plot(
     "loop_us",
     "Lateness and work time of the loop (µs)",
@@ -192,6 +204,7 @@ LOOP = Plot(
         Curve("wake-up after schedule (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
         Curve("work of the tick (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
     ),
+    least_span=100.0,
 )
 SIGNALS = Source(
     "/signals",
@@ -206,6 +219,7 @@ AGES = Plot(
         Curve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
         Curve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
     ),
+    least_span=1.0,
 )
 READINGS = Source("/readings", (AGES,))
 """Plots drawn from timings."""
@@ -218,6 +232,7 @@ FAULTY_TICKS = Plot(
         Curve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
         Curve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
     ),
+    least_span=10.0,
 )
 BACKLOG = Plot(
     "backlog_samples",
@@ -226,6 +241,7 @@ BACKLOG = Plot(
         Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
         Curve("dropped by the view (samples)", GREY, lambda r: r["view_dropped"]),
     ),
+    least_span=100.0,
 )
 BUS_LOAD = Plot(
     "bus_load_percent",
@@ -237,6 +253,7 @@ BUS_ERRORS = Plot(
     "bus_errors",
     "Bus errors since the devices were connected (count)",
     (Curve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
+    least_span=10.0,
 )
 SENSOR_STATUS = Plot(
     "sensor_status",
@@ -247,6 +264,11 @@ DISK = Plot(
     "disk_free_gb",
     "Free on the disk (GB)",
     (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
+    least_span=1.0,
 )
+OF_A_BUS: Final = frozenset(plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS))
+"""Components of the plots of which there is nothing without a bus."""
+OF_REAL_TIME: Final = frozenset(plot.component for plot in (LOOP, AGES))
+"""Components of the plots of which there is nothing under the virtual clock."""
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
 """Plots drawn from health records."""

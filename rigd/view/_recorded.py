@@ -1,7 +1,9 @@
 """Recorded sessions as Rerun shows them."""
 
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -10,10 +12,11 @@ import numpy.typing as npt
 from rigd.beam import Beam, Damping
 from rigd.session import Session, SessionError, Status
 from rigd.units import unit_of
+from rigd.view._banner import ended
 from rigd.view._layout import blueprint
-from rigd.view._plots import TIMELINE
+from rigd.view._plots import AGES, FAULTY_TICKS, HEALTH, OF_REAL_TIME, TIMELINE
 from rigd.view._scene import Scene
-from rigd.view._session_info import Health, Note, Subject, outcome_note
+from rigd.view._session_info import Health, Note, Subject, band_of, outcome_note
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -31,11 +34,18 @@ _DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
 """Attachments that tell the nominal damping; the first that does counts."""
 
 
-def subject_of_session(session: Session) -> Subject:
+def subject_of_session(session: Session, timings: Records | None = None) -> Subject:
     """Return what the views need to know of a recorded session.
 
     A stopped session is shown as it was planned, as it was live. Without segments all of
     the record is the sweep.
+
+    Parameters
+    ----------
+    session
+        The session.
+    timings
+        The readings' ages (n,) of ``TIMING_DTYPE``, if there are any.
 
     Raises
     ------
@@ -71,7 +81,48 @@ def subject_of_session(session: Session) -> Subject:
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
+        excitation=session.metadata.get("excitation", ""),
+        sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
+        specimen=session.metadata.get("specimen", ""),
+        limits=_stated_limits(attached[-1]),
+        absent=_absent(session, timings),
+        recorded=True,
     )
+
+
+_LIMITS: Final = {
+    "angle": ("limits", "angle_rad"),
+    "velocity": ("limits", "velocity_rad_s"),
+    "tracking_error": ("limits", "tracking_error_rad"),
+    "torque_command": ("motor", "peak_torque_nm"),
+    "i2t": ("motor", "continuous_torque_nm"),
+    "missed": ("limits", "missed_percent"),
+}
+"""Where a profile states the limits of the gauges."""
+
+
+def _stated_limits(profile: bytes) -> dict[str, float]:
+    """Return the limits that a profile states and that can be used; it may be of any version."""
+    try:
+        table = tomllib.loads(profile.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return {}
+    limits = {}
+    for name, (section, key) in _LIMITS.items():
+        with suppress(KeyError, TypeError, ValueError):
+            if (limit := float(table[section][key]["value"])) > 0.0:
+                limits[name] = limit
+    return limits
+
+
+def _absent(session: Session, timings: Records | None) -> frozenset[str]:
+    """Return the plots of which a file has nothing, by component."""
+    absent = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
+    if timings is None or len(timings) == 0:
+        absent.add(AGES.component)
+    if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
+        absent |= OF_REAL_TIME
+    return frozenset(absent)
 
 
 def nominal_damping(profile: bytes) -> Damping | None:
@@ -96,7 +147,7 @@ def draw_session(
     session: Session,
     timings: Records,
     *,
-    layout: "rrb.Blueprint | None" = None,
+    front: "Sequence[rrb.Container]" = (),
     on_progress: Callable[[float], None] = lambda _share: None,
 ) -> None:
     """Draw a recorded session as it was drawn live, so that every chart grows with its time.
@@ -109,8 +160,8 @@ def draw_session(
         Session to draw.
     timings
         The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
-    layout
-        Layout of the window; by default what `recorded_blueprint` returns.
+    front
+        Tabs that stand before those of the live view.
     on_progress
         Told the share that is drawn, from time to time.
 
@@ -119,8 +170,11 @@ def draw_session(
     SessionError
         As `subject_of_session` does.
     """
-    subject = subject_of_session(session)
-    picture = Scene(subject, lambda: layout or recorded_blueprint())
+    subject = subject_of_session(session, timings)
+    picture = Scene(subject, lambda: recorded_blueprint(front, subject.absent))
+    outcome = session.outcome or {}
+    state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
+    picture.state(0, replace(state, over=False))
     # The time at which it is drawn is not to be shown.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
@@ -150,17 +204,21 @@ def draw_session(
         draw(stream)
 
 
-def recorded_blueprint(front: "Sequence[rrb.Container]" = ()) -> "rrb.Blueprint":
+def recorded_blueprint(
+    front: "Sequence[rrb.Container]" = (), absent: Collection[str] = ()
+) -> "rrb.Blueprint":
     """Return the layout of the live view, which here is played from the start.
 
     Parameters
     ----------
     front
         Tabs that stand before those of the live view.
+    absent
+        Components of plots that are left out.
     """
     import rerun.blueprint as rrb
 
-    live = blueprint()
+    live = blueprint(absent=absent)
     return rrb.Blueprint(
         rrb.Tabs(*front, *live.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),

@@ -9,8 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.spectral import RunningSpectrogram
+from rigd.view import _banner
 from rigd.view._antenna import Antenna
-from rigd.view._frequency_charts import LAST_HZ, ResponseCharts, SpectrogramChart, SweepResponse
+from rigd.view._banner import State, preparing
+from rigd.view._frequency_charts import (
+    LAST_HZ,
+    LastResponse,
+    ResponseCharts,
+    SpectrogramChart,
+    SweepResponse,
+)
+from rigd.view._gauges import Gauge, Gauges
 from rigd.view._layout import TIME_VIEWS, Scale, blueprint
 from rigd.view._plots import HEALTH, READINGS, SIGNALS, Source, send_columns
 from rigd.view._session_info import (
@@ -19,6 +28,7 @@ from rigd.view._session_info import (
     Subject,
     health_record,
     send_note,
+    send_recent,
     send_summary,
 )
 
@@ -54,15 +64,22 @@ class Scene:
         The session.
     layout
         Returns the layout of the window; by default that of the live view.
+    last
+        Response of the last session of the same specimen, which is drawn beside this one's.
     """
 
-    def __init__(self, subject: Subject, layout: "Callable[[], rrb.Blueprint]" = blueprint) -> None:
+    def __init__(
+        self,
+        subject: Subject,
+        layout: "Callable[[], rrb.Blueprint] | None" = None,
+        last: LastResponse | None = None,
+    ) -> None:
         self._subject = subject
-        self._layout = layout
+        self._layout = layout or partial(blueprint, absent=subject.absent)
         last_hz = min(LAST_HZ, subject.rate_hz / 2)
         self._antenna = Antenna(subject)
         self._response = SweepResponse(subject, last_hz)
-        self.response_charts = ResponseCharts(subject)
+        self.response_charts = ResponseCharts(subject, last)
         self._response_is_final = False
         self._spectrogram = RunningSpectrogram(subject.rate_hz, step_s=_STEP_S, last_hz=last_hz)
         self._spectrogram_chart = SpectrogramChart(subject, self._spectrogram.frequency_hz, _STEP_S)
@@ -72,7 +89,16 @@ class Scene:
         self._samples = _Gathering(subject.rate_hz)
         self._timings = _Gathering(subject.rate_hz)
         self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
+        self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
+        self._peaks: dict[str, Gauge] = {}
+        self._peaks_shown = False
+        self._state, self._health, self._health_ns = preparing(), Health(), 0
         self._t_ns = 0
+
+    @property
+    def last_response(self) -> LastResponse | None:
+        """Response of this session as far as it is known, for the next one of the specimen."""
+        return self.response_charts.as_last(self._subject)
 
     def frame(self) -> list[Drawing]:
         """Return what each new connection needs first: name, layout, axes, and what is known."""
@@ -87,6 +113,8 @@ class Scene:
             self._spectrogram_chart.draw,
             *self._antenna.frame(),
             *(partial(send_note, note=note) for note in self._notes),
+            self._recent(self._t_ns),
+            *self._banner(),
         ]
 
     def samples(self, samples: Records) -> list[Drawing]:
@@ -99,8 +127,28 @@ class Scene:
 
     def events(self, events: Sequence[Note]) -> list[Drawing]:
         """Take what happened."""
+        if not events:
+            return []
         self._notes.extend(events)
-        return [partial(send_note, note=note) for note in events]
+        return [
+            *(partial(send_note, note=note) for note in events),
+            self._recent(max(self._t_ns, events[-1].t_ns)),
+        ]
+
+    def state(self, t_ns: int, state: State) -> list[Drawing]:
+        """Take the state of the session; nothing is drawn as long as it stays the same.
+
+        Parameters
+        ----------
+        t_ns
+            Time since the session's start.
+        state
+            The state.
+        """
+        if state == self._state:
+            return []
+        self._state, self._health_ns = state, max(self._health_ns, t_ns)
+        return self._banner()
 
     def health(self, t_ns: int, health: Health) -> list[Drawing]:
         """Take a reading of the health, a few times a second.
@@ -112,10 +160,14 @@ class Scene:
         health
             What was read.
         """
-        return [
+        self._health, self._health_ns = health, t_ns
+        drawings: list[Drawing] = [
             *self._plot(HEALTH, health_record(t_ns, health)),
             partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),
+            *self._banner(),
         ]
+        self._peaks_shown = True
+        return drawings
 
     def finish(self) -> list[Drawing]:
         """Return what can only be drawn when everything has come: the final frequency response."""
@@ -129,12 +181,39 @@ class Scene:
         if samples is None:
             return []
         self._t_ns = int(samples["t_ns"][-1])
+        self._take_peaks(samples)
         self._response.feed(samples)
         self._columns += self._spectrogram.feed(samples["tick"], samples["coupling_torque_nm"])
         drawings = [*self._plot(SIGNALS, samples), *self._antenna.samples(samples)]
         if self._charts_due(self._t_ns):
             drawings += self._charts()
         return drawings
+
+    def _take_peaks(self, samples: Records) -> None:
+        """Keep the peaks since the values were drawn last."""
+        peaks = self._gauges.take(samples)
+        if not self._peaks_shown:
+            peaks = {name: _larger(gauge, self._peaks.get(name)) for name, gauge in peaks.items()}
+        self._peaks, self._peaks_shown = peaks, False
+
+    def _banner(self) -> list[Drawing]:
+        """Draw the state, and the values beside their limits."""
+        subject, t_ns, health = self._subject, self._health_ns, self._health
+        missed = _banner.missed_gauge(subject, t_ns, health)
+        return [
+            partial(
+                _banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
+            ),
+            partial(
+                _banner.send_values,
+                state=self._state,
+                t_ns=t_ns,
+                gauges={**self._peaks, "missed": missed},
+            ),
+        ]
+
+    def _recent(self, t_ns: int) -> Drawing:
+        return partial(send_recent, t_ns=t_ns, notes=tuple(self._notes))
 
     def _draw_timings(self, timings: Records | None) -> list[Drawing]:
         return [] if timings is None else self._plot(READINGS, timings)
@@ -158,6 +237,12 @@ class Scene:
             self._columns = []
             drawings.append(self._spectrogram_chart.draw)
         return drawings
+
+
+def _larger(gauge: Gauge, other: Gauge | None) -> Gauge:
+    if other is None or other.value is None:
+        return gauge
+    return other if gauge.value is None or other.value > gauge.value else gauge
 
 
 class _Periodically:

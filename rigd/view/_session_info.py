@@ -1,6 +1,8 @@
 """Session information for the viewer: the session's data, its log lines, its health, a summary."""
 
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -14,9 +16,14 @@ if TYPE_CHECKING:
 
 
 EVENTS: Final = "/events"
-
-
+RECENT_EVENTS: Final = "/recent_events"
 SUMMARY: Final = "/summary"
+
+_LOG_WIDTH: Final = 150
+"""Characters of a line of the log: longer ones, which the viewer would cut, go on in the next."""
+_MOST_RECENT: Final = 20
+"""Events in the document of the newest."""
+_SYMBOLS: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +49,21 @@ class Subject:
         Inertia between the torque sensor and the beam, about the motor's axis.
     angle_delay_s, torque_delay_s
         Age of either value at its time stamp; positive: the value is older.
+    excitation
+        What is run, in a few words; empty if that is not known.
+    sweep_hz
+        Frequencies at the two ends of a linear sweep; None: it is none.
+    specimen
+        Name of the specimen as the operator gave it.
+    limits
+        Limits by the names of the gauges (`rigd.view.Gauges`), and ``missed`` in percent of all
+        ticks; what is absent has none.
+    thermal_time_constant_s
+        Time over which the motor's rms torque is taken.
+    absent
+        Components of plots of which nothing comes, such as the load of a bus that is not there.
+    recorded
+        The session is played from a file.
     """
 
     name: str
@@ -53,6 +75,43 @@ class Subject:
     tool_inertia_kg_m2: float = 0.0
     angle_delay_s: float = 0.0
     torque_delay_s: float = 0.0
+    excitation: str = ""
+    sweep_hz: tuple[float, float] | None = None
+    specimen: str = ""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    thermal_time_constant_s: float = 10.0
+    absent: frozenset[str] = frozenset()
+    recorded: bool = False
+
+    def frequency_hz(self, tick: int) -> float | None:
+        """Return the present frequency of the sweep; None before, after, or without one.
+
+        Parameters
+        ----------
+        tick
+            Tick of the record.
+        """
+        first, end = self.sweep
+        if self.sweep_hz is None or not first <= tick < end:
+            return None
+        start_hz, stop_hz = self.sweep_hz
+        return start_hz + (stop_hz - start_hz) * (tick - first) / (end - first)
+
+
+def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
+    """Return the frequencies at the ends of a linear sweep; None where the excitation is none.
+
+    Parameters
+    ----------
+    kind, parameters
+        Excitation and its parameters, numbers or as a session file has them.
+    """
+    if kind != "chirp":
+        return None
+    try:
+        return float(parameters["start_hz"]), float(parameters["stop_hz"])
+    except (KeyError, ValueError):
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +191,7 @@ class Health:
     rate_hz: float | None = None
 
 
-HEALTH_DTYPE: Final = np.dtype(
-    [("t_ns", "<i8")] + [(field.name, "<f8") for field in fields(Health)]
-)
+HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each in fields(Health)])
 """A reading as a record; NaN is what is not known."""
 
 
@@ -160,7 +217,38 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
 
     # To the millisecond: more is hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
-    stream.log(EVENTS, rr.TextLog(note.message, level=_RERUN_LEVELS.get(note.level, "INFO")))
+    text = "\n".join(
+        line for part in note.message.splitlines() for line in wrap(part, _LOG_WIDTH) or [""]
+    )
+    stream.log(EVENTS, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
+
+
+def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
+    """Show the newest of the events (notes in order of time) as a document.
+
+    Its lines are wrapped, whatever the width of the view.
+    """
+    import rerun as rr
+
+    stream.set_time(TIMELINE, duration=1e-9 * t_ns)
+    lines = []
+    for note in reversed(notes[-_MOST_RECENT:]):
+        time_s = max(0.0, 1e-9 * note.t_ns)  # the first one may come a tick early
+        symbol = _SYMBOLS.get(note.level, "")
+        lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
+    stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
+
+
+def plain(text: str) -> str:
+    """Return a text as Markdown that shows it as it is.
+
+    Parameters
+    ----------
+    text
+        Whatever an operator wrote or a process said.
+    """
+    escaped = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
+    return escaped.replace("\n", "  \n")
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
@@ -173,7 +261,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("late ticks", _number(health.late_ticks), not health.late_ticks),
         ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
         ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
-        ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
+        ("dropped by the viewer", _number(health.view_dropped, "{:.0f} samples"), True),
         ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
         ("bus errors", _number(health.bus_errors), not health.bus_errors),
         ("sensor status", _status(health.sensor_status), not health.sensor_status),

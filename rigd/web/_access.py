@@ -9,7 +9,6 @@ cross-origin permission of any kind.
 import asyncio
 import hmac
 import json
-import math
 import time
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -31,7 +30,7 @@ _READ_S: Final = 5.0
 """Time for the body of a request."""
 _SILENT_S: Final = 10.0
 """Time for the first request of a connection."""
-_LOOK_S: Final = 1.0
+_LOOK_S: Final = 0.5
 _MOST_CONNECTIONS: Final = 96
 
 _POLICY: Final = "; ".join(
@@ -96,9 +95,11 @@ class Access:
     def may_act(self, request: web.Request) -> bool:
         """Whether a request has the token."""
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
-        return scheme == "Bearer" and hmac.compare_digest(given.encode(), self._token)
+        return scheme == "Bearer" and hmac.compare_digest(
+            given.encode(errors="surrogateescape"), self._token
+        )
 
-    def may_command(self, request: web.Request, command: object, parameters: object) -> bool:
+    def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
         """Whether a command of the control socket may be passed on.
 
         Parameters
@@ -192,38 +193,37 @@ class Connections:
 
     Attributes
     ----------
-    serve
-        Makes the protocol of a connection that is served.
+    serving
+        Makes the protocols of connections, and knows those there are; set before there are any.
     """
 
-    serve: "Callable[[], RequestHandler]"
+    serving: web.Server
 
     def __init__(self) -> None:
-        self._begun: dict[RequestHandler, float] = {}
-        """Served connections, and until when each has to make a request."""
+        self._silent: dict[RequestHandler, float] = {}
+        """Connections without a request so far, and until when each has to make one."""
 
-    def begin(self) -> None:
-        """Look after them, from now on."""
-        now_s = time.monotonic()
-        for protocol, end_s in list(self._begun.items()):
-            if protocol.transport is None and end_s - now_s < _SILENT_S - _LOOK_S:
-                del self._begun[protocol]
-            elif protocol.transport is not None and end_s < now_s:
+    def look_after(self) -> None:
+        """Close those that say nothing, from now on."""
+        now_s, open_now = time.monotonic(), set(self.serving.connections)
+        self._silent = {each: end_s for each, end_s in self._silent.items() if each in open_now}
+        for protocol, end_s in self._silent.items():
+            if end_s < now_s and protocol.transport is not None:
                 protocol.transport.abort()
-        asyncio.get_running_loop().call_later(_LOOK_S, self.begin)
+        asyncio.get_running_loop().call_later(_LOOK_S, self.look_after)
 
     def welcome(self) -> asyncio.Protocol:
         """Make the protocol of a new connection, or turn it away."""
-        if len(self._begun) >= _MOST_CONNECTIONS:
+        if len(self.serving.connections) >= _MOST_CONNECTIONS:
             return _TurnedAway()
-        protocol = self.serve()
-        self._begun[protocol] = time.monotonic() + _SILENT_S
+        protocol = self.serving()
+        self._silent[protocol] = time.monotonic() + _SILENT_S
         return protocol
 
     @web.middleware
     async def heard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Take note that a connection has made a request."""
-        self._begun[request.protocol] = math.inf
+        self._silent.pop(request.protocol, None)
         return await handler(request)
 
 

@@ -20,6 +20,7 @@ Document = dict[str, Any]
 
 MOST_JOBS: Final = 16
 """Jobs that may wait."""
+_PROGRAM: Final = (sys.executable, "-m", "analysis")
 _LOOK_S: Final = 0.2
 _MOST_SAID: Final = 4096
 _LOWEST_PRIORITY: Final = 19
@@ -127,7 +128,7 @@ class Jobs:
 
     async def _perform(self, job: Job) -> None:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "analysis", *job.arguments),
+            *(*_PROGRAM, *job.arguments),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -148,7 +149,7 @@ class Jobs:
         finally:
             if process.returncode is None:
                 _signal(process.pid, signal.SIGKILL)
-            ending.cancel()
+                await asyncio.wait((ending,))
         if process.returncode != 0:
             words = said.decode(errors="replace").strip()[-_MOST_SAID:]
             last = words.splitlines()[-1] if words else f"exit code {process.returncode}"

@@ -248,6 +248,7 @@ class Library:
         with suppress(OSError, ValueError):
             path = self._folder / name
             plain = Path(name).name == name and not name.startswith(".") and name.isprintable()
+            path.lstat()  # or there is none, or its name is too long
             if plain and path.resolve().parent == self._folder.resolve():
                 return path
         raise web.HTTPNotFound(reason="There is no such session.")

@@ -18,8 +18,9 @@ from aiohttp import web
 from rigd.beam import Beam, Damping
 from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
+from rigd.profile import specimen_files
 from rigd.runtime import ignore
-from rigd.units import unit_of
+from rigd.units import UNITS, unit_of
 from rigd.view import Subject
 from rigd.web._access import Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
@@ -37,8 +38,7 @@ _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
 _GAUGES_S: Final = 0.095
 _RESPONSE_S: Final = 1.0
-_GRACE_S: Final = 1.0
-_NICENESS: Final = 5
+_GRACE_S: Final = 0.3
 _AT_WORK: Final = ("running", "stopping")
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
@@ -50,19 +50,23 @@ class PageServer:
     ----------
     job
         What the daemon tells of the rig: see `rigd.daemon._page`.
+
+    Attributes
+    ----------
+    pages
+        The pages that are open.
     """
 
     def __init__(self, job: Document) -> None:
         self._job = job
-        self._beam, self._damping = Beam(**job["beam"]), Damping(**job["damping"])
         self._socket = Path(job["socket"])
         self._access = Access(job["token"])
-        self._pages = Pages()
-        self._jobs = Jobs(Path(job["folder"]), self._pages.send)
+        self.pages = Pages()
+        self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
         self._link = DaemonLink(self._socket, self._take, self._lose)
         self._excitations = dict(_excitations())
-        self._nominal = nominal_document(self._beam, self._damping, job["tool_inertia_kg_m2"])
+        self._nominal = self._nominal_of(job)
         self._specimens: list[str] = []
         self._status: Document | None = None
         self._lost: Document | None = None
@@ -126,19 +130,20 @@ class PageServer:
             "excitations": self._excitations,
             "specimens": self._specimens,
             "required_meta": self._job["required_meta"],
+            "units": dict(UNITS),
         }
         known = (
             *(hello, self._lost, self._status, self._gauges, self._strips.last()),
             *(self._nominal, self._last, self._shown),
         )
-        return await self._pages.follow(request, filter(None, known))
+        return await self.pages.follow(request, filter(None, known))
 
     async def _command(self, request: web.Request) -> web.Response:
         """Pass a request on to the daemon."""
         given = await object_of(request)
-        if given.get("command") not in _COMMANDS:
+        command = given.get("command")
+        if not isinstance(command, str) or command not in _COMMANDS:
             return refused(400, f"command: there are {', '.join(sorted(_COMMANDS))}.")
-        command = given["command"]
         if not self._access.may_command(request, command, given.get("parameters")):
             return refused(403, "The token is missing or wrong: open the address of rigd status.")
         try:
@@ -169,10 +174,10 @@ class PageServer:
         elif event == "signals":
             self._take_signals(message)
         elif event == "message":
-            self._pages.note(message["level"], message["text"])
+            self.pages.note(message["level"], message["text"])
         else:
             del message["event"]
-            self._pages.send({"type": event, **message})
+            self.pages.send({"type": event, **message})
             if event != "progress":
                 self._link.ask_for_status()
             if event == "session":
@@ -186,11 +191,12 @@ class PageServer:
         if session is not None and session != self._session:
             self._begin(session, series)
         self._session = session
-        self._pages.send(self._status)
+        self.pages.send(self._status)
 
     def _begin(self, path: str, series: Document) -> None:
         """Make ready for the response of a session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
+        self._nominal = self._nominal_of(plan)
         first, end = plan["segments"]["sweep"]
         self._shown = self._last = None
         self._response = None
@@ -201,21 +207,26 @@ class PageServer:
                     rate_hz,
                     round(plan["record_s"] * rate_hz),
                     (first, end),
-                    self._beam,
-                    self._damping,
+                    Beam(**plan["beam"]),
+                    Damping(**plan["damping"]),
                     self._job["tool_inertia_kg_m2"],
                     self._job["angle_delay_s"],
                     self._job["torque_delay_s"],
                 )
             )
-        self._pages.send(self._nominal)
+        self.pages.send(self._nominal)
         specimen = str(series["notes"].get("specimen", ""))
         self._begin_finding(self._find_last(specimen, Path(path).stem))
+
+    def _nominal_of(self, specimen: Document) -> Document:
+        """Return the nominal model of the beam that a job or a plan names."""
+        beam, damping = Beam(**specimen["beam"]), Damping(**specimen["damping"])
+        return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
 
     def _take_signals(self, event: Document) -> None:
         if event["count"]:
             block = Block.of_event(event)
-            self._pages.send(self._strips.feed(block))
+            self.pages.send(self._strips.feed(block))
             if self._response is not None:
                 self._response.feed(block)
         now_s = time.monotonic()
@@ -226,23 +237,23 @@ class PageServer:
                 **event["gauges"],
                 "frequency_hz": event["frequency_hz"],
             }
-            self._pages.send(self._gauges)
+            self.pages.send(self._gauges)
 
     def _lose(self, reason: str) -> None:
         """Tell the pages that the daemon is not heard."""
         if self._lost is None or self._lost["reason"] != reason:
             self._lost = {"type": "lost", "reason": reason}
-            self._pages.send(self._lost)
+            self.pages.send(self._lost)
         self._status = None
 
     async def _estimate(self) -> None:
         """Tell the response of the session that runs, now and then."""
         while True:
             await asyncio.sleep(_RESPONSE_S)
-            if self._response is not None and self._pages:
+            if self._response is not None and self.pages:
                 shown = self._response.document()
                 self._shown = shown or self._shown
-                self._pages.send(shown)
+                self.pages.send(shown)
 
     def _begin_finding(self, finding: Awaitable[None]) -> None:
         """Look something up in the library, without waiting for it."""
@@ -252,12 +263,13 @@ class PageServer:
 
     async def _find_specimens(self) -> None:
         with suppress(OSError, ValueError):
-            self._specimens = await self._library.specimens()
+            used = await self._library.specimens()
+            self._specimens = list(dict.fromkeys([*used, *specimen_files()]))
 
     async def _find_last(self, specimen: str, but: str) -> None:
         with suppress(OSError, ValueError):
             self._last = await self._library.last_response(specimen, but)
-            self._pages.send(self._last)
+            self.pages.send(self._last)
 
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
@@ -299,30 +311,19 @@ def run_page() -> None:
     Standard output gets one line: the port, or why there is no page.
     """
     ignore()
-    os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
         asyncio.run(_run(job))
 
 
 async def _run(job: Document) -> None:
-    server, connections = PageServer(job), Connections()
-    application = server.application()
-    application.middlewares.append(connections.heard)
-    runner = web.AppRunner(
-        application,
-        access_log=None,
-        handle_signals=False,
-        auto_decompress=False,
-        keepalive_timeout=_KEEP_ALIVE_S,
-        lingering_time=_LINGERING_S,
-    )
-    await runner.setup()
-    assert runner.server is not None
-    connections.serve = runner.server
-    listening = await _listen(connections, job)
-    if listening is None:
+    try:
+        server, _, listening = await open_page(job)
+    except OSError as error:
+        told = {"error": f"port {job['port']} cannot be had: {error.strerror}"}
+        print(json.dumps(told), flush=True)  # noqa: T201 - the daemon reads it
         return
+    print(json.dumps({"port": port_of(listening)}), flush=True)  # noqa: T201
     running = asyncio.create_task(server.run())
     gone = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
     await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -335,19 +336,51 @@ async def _run(job: Document) -> None:
     os._exit(0)  # whoever still reads would be waited for
 
 
-async def _listen(connections: Connections, job: Document) -> asyncio.Server | None:
-    """Listen on the port of the job, or another one if that may be; tell which."""
+async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.Server]:
+    """Listen on the port of a job, or on another one if that may be.
+
+    Parameters
+    ----------
+    job
+        As of :class:`PageServer`, with ``port`` and ``any_port``.
+
+    Returns
+    -------
+    tuple
+        Server, to be run; what answers for it; its listening socket.
+
+    Raises
+    ------
+    OSError
+        If the port cannot be had.
+    """
+    server, connections = PageServer(job), Connections()
+    application = server.application()
+    application.middlewares.append(connections.heard)
+    runner = web.AppRunner(
+        application,
+        access_log=None,
+        handle_signals=False,
+        auto_decompress=False,
+        keepalive_timeout=_KEEP_ALIVE_S,
+        lingering_time=_LINGERING_S,
+        shutdown_timeout=_GRACE_S,
+    )
+    await runner.setup()
+    assert runner.server is not None
+    connections.serving = runner.server
     loop = asyncio.get_running_loop()
-    ports = (job["port"], 0) if job["any_port"] else (job["port"],)
-    for port in ports:
-        try:
-            listening = await loop.create_server(connections.welcome, _LOOPBACK, port, backlog=32)
-        except OSError as error:
-            told = {"error": f"port {port} cannot be had: {error.strerror}"}
-        else:
-            connections.begin()
-            told = {"port": listening.sockets[0].getsockname()[1]}
-            print(json.dumps(told), flush=True)  # noqa: T201 - the daemon reads it
-            return listening
-    print(json.dumps(told), flush=True)  # noqa: T201
-    return None
+    try:
+        listening = await loop.create_server(connections.welcome, _LOOPBACK, job["port"])
+    except OSError:
+        if not job["any_port"]:
+            raise
+        listening = await loop.create_server(connections.welcome, _LOOPBACK, 0)
+    connections.look_after()
+    return server, runner, listening
+
+
+def port_of(listening: asyncio.Server) -> int:
+    """Return the port on which a server listens."""
+    port: int = listening.sockets[0].getsockname()[1]
+    return port

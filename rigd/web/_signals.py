@@ -95,7 +95,7 @@ class Strips:
         # Without those functions' warning of points of which nothing is known.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
         columns = np.round(
-            (least[0], greatest[0], bins[1, :, ticks // 2], least[2], greatest[2]), _DIGITS
+            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
         )
         points = [tuple(_known(column)) for column in columns.T]
         first, self._next = self._next, self._next + count
@@ -109,7 +109,10 @@ class Strips:
 
 
 def _strip(first: int, points: list[tuple[float | None, ...]]) -> Document:
-    names = ("angle_min", "angle_max", "reference", "torque_min", "torque_max")
+    names = (
+        *("angle_min", "angle_max", "reference_min", "reference_max"),
+        *("torque_min", "torque_max"),
+    )
     columns = zip(*points, strict=True)
     return {
         "type": "strip",
@@ -140,6 +143,7 @@ class SessionResponse:
         self._sweep = SweepResponse(subject, LAST_HZ)
         self._thinning: Thinning | None = None
         self._fresh = False
+        self._reached_hz = 0.0
 
     def feed(self, block: Block) -> None:
         """Take a block; what is not known of it is left out."""
@@ -159,6 +163,10 @@ class SessionResponse:
         self._fresh = False
         if estimate is None or not estimate.excited.any():
             return None
+        reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
+        if estimate.final and reached_hz < self._reached_hz:
+            return None  # the last whole segment ends before the sweep does
+        self._reached_hz = reached_hz
         response = estimate.response.without_delays(
             input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
         )
@@ -173,7 +181,7 @@ class SessionResponse:
         return _curve(grid[kept], shown[kept]) | {
             "type": "response",
             "coherence": coherence,
-            "reached_hz": round(float(grid[estimate.excited][-1]), 3),
+            "reached_hz": round(reached_hz, 3),
         }
 
 

@@ -426,7 +426,7 @@ class Scene:
         if self.mode == "daemon":
             if self.supervisor.poll() is not None:
                 self.supervisor = self._serve()
-            wait_for(lambda: self.state in ("ready", "fault"), _STARTED_S, "daemon that is at work")
+            wait_for(lambda: self.state in ("ready", "fault"), _STARTED_S, "running daemon")
             if self.state == "fault":
                 steps += self._reset()
         for _ in range(3):

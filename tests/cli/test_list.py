@@ -40,7 +40,7 @@ def test_the_newest_come_first_with_their_modes_and_problems(listed):
     ]  # fmt: skip
     assert [cell.strip() for cell in told[2].split("  ") if cell.strip()][1:] == [
         "second.mcap", "antenna 3", "chirp", "stopped", "2.57 Hz 0.905 %, 16.3 Hz 0.5 %",
-        "second.report",
+        "report",
     ]  # fmt: skip
     assert "text.mcap" in told[4]
     assert told[5].startswith("text.mcap: ")
@@ -52,9 +52,9 @@ def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
     told = listed(".", "--specimen", "antenna 3", "--trend").stdout.splitlines()
     first, second = told[1:3]
     assert first.startswith("2023-11-15 07:13  2.6000 ± 0.0020 ")
-    assert "-1.15 % *" in second
+    assert "-1.2 % *" in second
     assert "-0.55 % " in second
-    assert "-0.55 % *" not in second
+    assert second.count("*") == 1
     assert first.index("●") > second.index("●")
     assert told[4].startswith("mode 2")
     assert "*" not in "".join(told[4:7])

@@ -31,7 +31,7 @@ from rigd.session._format import (
     pack_timing_into,
 )
 from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
-from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
+from rigd.view._plots import AGES, GREEN, GREY, HEALTH, LOOP, ORANGE, SKY_BLUE
 from rigd.view._recorded import nominal_damping, subject_of_session
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -167,7 +167,8 @@ def test_the_last_frequency_response_is_that_of_analyze(paper):
     session, found, _ = paper
     chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE)
     left, top, right, bottom = chart.frame
-    *_, (_, strips) = rows(found[f"{MAGNITUDE}/measured"], "LineStrips2D:strips")
+    # All of it, coherent or not.
+    *_, (_, strips) = rows(found[f"{MAGNITUDE}/uncertain"], "LineStrips2D:strips")
     points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
     share = (points[:, 0] - left) / (right - left)
     frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** share
@@ -216,7 +217,12 @@ def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(paper):
     assert parts["TimePanelBlueprint:play_state"] == [[PlayState.Playing.value]]
     assert parts["TimePanelBlueprint:timeline"] == [["session_time"]]
     titles = {title for row in parts["ViewBlueprint:display_name"] for title in row or ()}
-    assert {"Motor angle (mrad)", "Frequency response, torque over angle", "State"} <= titles
+    assert {"Motor angle (mrad)", "Phase of torque over angle", "State"} <= titles
+    # Of the processes a file knows nothing, nor of real time if there was none.
+    assert not titles & {plot.title for plot in (*HEALTH.plots[1:], LOOP, AGES)}
+    texts = [text for _, (text,) in rows(found["/state"], "TextDocument:text")]
+    assert all(text.startswith("# Recorded: COMPLETE") for text in texts)
+    assert "now **" in texts[len(texts) // 2]
     (recording,) = reader.recordings()
     assert recording.application_id == "rigd"
     starts_ns = [
@@ -525,8 +531,8 @@ def test_a_server_that_dies_is_told(served, tmp_path):
 COLORS = {
     "Motor angle (mrad)": [ORANGE, SKY_BLUE],
     "Coupling torque, tared (N·m)": [GREEN],
-    "Tracking error, reference − measured (mrad)": [VERMILION],
-    "Frequency response, torque over angle": [SKY_BLUE, ORANGE, GREY],
+    "Values and limits": [SKY_BLUE, GREEN],  # it was complete, and near no limit
+    "Frequency response: magnitude of torque over angle": [SKY_BLUE, ORANGE, GREY],
 }
 """Views of the first tab → what is to be seen in them."""
 

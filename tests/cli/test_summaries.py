@@ -1,6 +1,7 @@
 """Lists of commands: no summary is cut to fit its line of 80 characters."""
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import analysis.cli.app
@@ -18,7 +19,19 @@ import rigd.cli.app
 def test_no_summary_is_cut(app, arguments):
     told = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=80)
 
-    _, commands = told.stdout.split("Commands:\n")
-    summaries = [line.split(maxsplit=1)[1] for line in commands.splitlines() if line.strip()]
+    _, commands = told.stdout.split("--help ", 1)
+    lines = commands.splitlines()[1:]
+    summaries = [line.split(maxsplit=1)[1] for line in lines if line.startswith("  ")]
+    assert summaries
     assert all(summary.endswith(".") for summary in summaries)
     assert not [summary for summary in summaries if summary.endswith("...")]
+
+
+def test_every_command_of_rigd_stands_in_one_section():
+    told = CliRunner().invoke(rigd.cli.app.app, ["--help"], terminal_width=80).stdout
+
+    names = [line.split()[0] for line in told.splitlines() if line.startswith("  ")]
+    commands = typer.main.get_command(rigd.cli.app.app).commands
+    assert {*commands} <= {*names}
+    assert all(names.count(name) == 1 for name in commands)
+    assert "Other commands" not in told

@@ -143,7 +143,7 @@ def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
     )
     options = ("--amplitude", "1e-6", "--stop-hz", "1", "--duration", "5", "--ring-down", "0")
     told = rigd_here("run", "chirp", "--fast", *options).stdout
-    angle, speed, torque = map(float, re.findall(r"(?:angle|speed|torque) (\S+) of", told))
+    angle, speed, torque = map(float, re.findall(r"(?:angle|speed|torque) (\S+) \S+ \(limit", told))
     assert 0.9e-6 < angle < 1.1e-6
     assert 1e-6 < speed < 1e-5
     assert torque > 0.0

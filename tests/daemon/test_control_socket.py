@@ -1,6 +1,7 @@
 """The daemon's socket: who may use it, and clients that harm nobody whatever they do."""
 
 import asyncio
+import base64
 import contextlib
 import grp
 import json
@@ -10,6 +11,7 @@ import socket
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rigd.daemon import _address as address
@@ -370,3 +372,40 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
         with pytest.raises(AddressError, match="rigd serve --profile three"):
             find("three")
         assert isinstance(find("one"), Path)
+
+
+def test_signals_go_to_those_who_asked_for_them(served):
+    async def scenario(served):
+        telling = asyncio.create_task(served.operated.service.tell_signals())
+        plain, watcher = await served.connect(), await served.connect()
+        await plain.ask({"command": "watch"})
+        await watcher.ask({"command": "watch", "signals": True})
+        await served.connect()
+        event = await watcher.next()
+        assert (event["event"], event["count"]) == ("signals", 0)
+        await plain.ask(LONG | {"repeat": 1, "parameters": LONG["parameters"]})
+        events = []
+        while not events or events[-1]["event"] != "series":
+            events.append(await watcher.next())
+        blocks = [event for event in events if event["event"] == "signals" and event["count"]]
+        decoded = {
+            name: np.concatenate(
+                [np.frombuffer(base64.b64decode(block[name]), "<f4") for block in blocks]
+            )
+            for name in ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
+        }
+        assert {name: values.size for name, values in decoded.items()} == dict.fromkeys(
+            decoded, 2000
+        )
+        assert all(block["gauges"]["angle"]["unit"] == "rad" for block in blocks)
+        assert all(len(json.dumps(event)) < 65_536 for event in events)
+        seen = []
+        while not seen or seen[-1]["event"] != "series":
+            seen.append(await plain.next())
+        assert all(event["event"] != "signals" for event in seen)
+        await watcher.close()
+        await plain.ask({"command": "status"})
+        assert served.operated.service._signal_watchers == set()
+        telling.cancel()
+
+    served.run(scenario)

@@ -193,8 +193,7 @@ def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
     assert not socket_path("sim").exists()
 
 
-def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, tmp_path, monkeypatch):
-    monkeypatch.delenv("RIGD_NO_LOOK")
+def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, brief_looks):
     daemon = serve("--fast")
     assert request("status")["daemon"]["quick_looks"] is True
     code, out, err = ask("start", "chirp", *SHORT, "--repeat", "2", "--json")

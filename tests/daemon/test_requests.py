@@ -19,7 +19,7 @@ def parse(document):
     return parse_request(json.dumps(document).encode())
 
 
-@pytest.mark.parametrize("command", ["status", "watch", "stop", "tare", "zero", "reset"])
+@pytest.mark.parametrize("command", ["status", "watch", "stop", "tare", "zero", "reset", "check"])
 def test_plain_commands(command):
     request = parse({"command": command, "id": 7})
     assert (request.command, request.id) == (command, 7)
@@ -34,6 +34,21 @@ def test_a_start_has_the_parameters_of_its_excitation():
         {"command": "start", "excitation": "file", "parameters": {"path": "/data/reference.csv"}}
     )
     assert request.parameters == {"path": Path("/data/reference.csv")}
+
+
+def test_a_prediction_is_asked_for_as_a_start_is():
+    request = parse(START | {"command": "predict", "parameters": {"stop_hz": 20}, "force": True})
+    assert (request.parameters, request.force) == ({"stop_hz": 20.0}, True)
+    assert not request.controlling
+    with pytest.raises(RequestError, match="wobble"):
+        parse(START | {"command": "predict", "parameters": {"wobble": 1}})
+
+
+def test_who_watches_asks_for_signals_or_not():
+    assert not parse({"command": "watch"}).signals
+    assert parse({"command": "watch", "signals": True}).signals
+    with pytest.raises(RequestError, match="signals"):
+        parse({"command": "watch", "signals": 1})
 
 
 @pytest.mark.parametrize(

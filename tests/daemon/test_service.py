@@ -453,7 +453,7 @@ def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, 
     operated.ask("start", **SHORT, repeat=2)
     assert board(operated)[Word.SUPERVISOR_BEAT] == beats[0]
     assert len(operated.last["sessions"]) == 1
-    assert "hears nobody" in operated.last["reason"]
+    assert "does not respond" in operated.last["reason"]
 
 
 def board(operated):

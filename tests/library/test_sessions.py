@@ -33,9 +33,10 @@ def test_what_file_look_and_report_say_stands_in_the_row(
 
 
 def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_look, tmp_path):
-    write_look(record_briefly("first"), mode(2.5))
+    modes = [mode(2.5) | {"shown": True}, mode(16.3) | {"shown": False}]
+    write_look(record_briefly("first"), *modes)
     (row,) = list_sessions(tmp_path)
-    assert row.modes[0]["frequency_hz"]["value"] == 2.5
+    assert [each["frequency_hz"]["value"] for each in row.modes] == [2.5]
     assert row.report is None
 
 

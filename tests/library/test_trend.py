@@ -19,6 +19,7 @@ def row(day, *modes):
         (quantity(2.60, 0.03), quantity(2.635, 0.02), False),
         (quantity(2.64, 0.02), quantity(2.60, 0.03), True),
         (quantity(2.60, 0.03), {"value": 9.0, "interval_95": None}, None),
+        (quantity(2.60, 0.03, flag="doubtful"), quantity(9.0, 0.03), None),
         # The halves that face each other count: 0.01 and 0.01, not 0.09 and 0.01.
         ({"value": 1.0, "interval_95": [0.91, 1.01]}, quantity(1.05, 0.01), True),
         ({"value": 1.0, "interval_95": [0.99, 1.09]}, quantity(1.05, 0.01), False),

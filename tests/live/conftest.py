@@ -58,6 +58,7 @@ class Producer(threading.Thread):
         write_event(self.channels.events, Event(0, "info", "Record starts"))
         start = time.monotonic()
         while not self._halt.wait(0.005):
+            self.channels.board.beat(Word.SUPERVISOR_BEAT)
             while self.tick < (time.monotonic() - start) * self.speed * RATE_HZ:
                 self._write()
                 for ring in self.channels.rings:  # what the recorder does
@@ -147,10 +148,10 @@ class Publisher:
         self.send(LiveSession(subject, f"recording of {name}", begins))
         self._hear(LiveShown)
 
-    def finish(self) -> None:
+    def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:
         """Tell it that the session is over."""
         ends = tuple(ring.written for ring in self.producer.channels.rings)
-        self.send(LiveEnd(ends, "stopped", "The test is over."))
+        self.send(LiveEnd(ends, outcome, reason))
 
     def send(self, message: object) -> None:
         send_message(self.process.stdin, message)
@@ -248,6 +249,21 @@ class Columns:
         time_ns = [batch.column("session_time").cast("int64").to_numpy() for batch in batches]
         values = [np.array(batch.column(component).to_pylist()) for batch in batches]
         return np.concatenate(time_ns), np.concatenate(values)
+
+    def sent(self, entity: str, component: str) -> tuple[list[float], list]:
+        """Return when each value was sent, in s since 1970, and the values, in that order."""
+        rows = [
+            row
+            for batch in self._batches[entity]
+            if component in batch.schema.names
+            for row in zip(
+                batch.column("log_time").cast("int64").to_pylist(),
+                batch.column(component).to_pylist(),
+                strict=True,
+            )
+        ]
+        rows.sort(key=lambda row: row[0])
+        return [1e-9 * time_ns for time_ns, _ in rows], [values for _, values in rows]
 
 
 class Saver:

@@ -1,6 +1,7 @@
 """The live view of a rig from the supervisor's side: begun once, found, replaced, given up."""
 
 import os
+import resource
 import signal
 import threading
 import time
@@ -17,6 +18,7 @@ from rigd.profile import load_profile
 from rigd.runner import _live_view as live_view
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
+from rigd.runner._session import SessionFailedError
 from rigd.runtime._signals import StopRequest
 from rigd.session import read_session
 
@@ -124,6 +126,30 @@ def test_how_a_session_ended_is_shown(rig, run, save):
     outcomes = [lines[-1].tolist() for lines in logs]
     assert [f"Outcome: {result.outcome}. {result.reason}"] in outcomes
     assert result.outcome == "stopped"
+    assert "# STOPPED\n\nStopped by the operator." in [
+        "\n".join(columns.sent("/state", "TextDocument:text")[1][-1][0].split("\n")[:3])
+        for columns in saver.recordings().values()
+    ]
+
+
+def test_a_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
+    run("before", 0.5)
+    saver = save(rig.status().live_view)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # The recorder alone writes a file, and is started with the session.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))
+    try:
+        with pytest.raises(SessionFailedError, match="cannot be written"):
+            run("full", 60.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert eventually(saver.has_all)
+    rig.disconnect()
+    said = [
+        columns.sent("/state", "TextDocument:text")[1][-1][0]
+        for columns in saver.recordings().values()
+    ]
+    assert [text for text in said if text.startswith("# FAULT") and "cannot be written" in text]
 
 
 def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run):
@@ -150,7 +176,7 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
     def kill(progress) -> None:
         nonlocal given_up_at
         for process in rig.status().processes:
-            if process.name == "live" and process.state == "at work":
+            if process.name == "live" and process.state == "running":
                 killed.add(process.pid)
                 os.kill(process.pid, signal.SIGKILL)
         if rig.status().live_view is None:

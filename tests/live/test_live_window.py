@@ -48,10 +48,12 @@ def colors_of(*wanted: plots.Plot) -> dict[str, list]:
 
 COLORS = {
     "Overview": {
-        **colors_of(plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR),
-        "Frequency response, torque over angle": [SKY_BLUE, ORANGE, GREY],
+        "State": [],
+        "Values and limits": [GREEN],
+        **colors_of(plots.ANGLE, plots.COUPLING_TORQUE),
+        "Frequency response: magnitude of torque over angle": [SKY_BLUE, ORANGE, GREY],
         ANTENNA: [SKY_BLUE, ORANGE],
-        "Events": [],
+        "Events, newest first": [],
     },
     "Signals": colors_of(
         plots.ANGLE,
@@ -70,8 +72,8 @@ COLORS = {
     "Health": {
         **colors_of(plots.LOOP, plots.DISK),
         # Of counts that are all 0 only the topmost is seen; of a simulated rig there is no bus.
-        **{plot.title: [] for plot in (*plots.HEALTH.plots[:-1], plots.AGES)},
-        "State": [],
+        **{plot.title: [] for plot in (plots.FAULTY_TICKS, plots.BACKLOG, plots.AGES)},
+        "Health": [],
     },
     "Events": {"Events": []},
 }

@@ -9,6 +9,7 @@ from pathlib import Path
 from aiohttp import web
 
 import rigd
+from rigd.units import UNITS
 
 STATIC = Path(rigd.__file__).parent / "web" / "static"
 TOKEN = "right-to-act"
@@ -34,7 +35,8 @@ EXCITATIONS = {
 def hello(**members):
     return {
         "type": "hello", "profile": "sim", "limits": {}, "daemon": {}, "excitations": EXCITATIONS,
-        "specimens": ["antenna 3", "antenna 4"], "required_meta": [], **members,
+        "specimens": ["antenna 3", "antenna 4"], "required_meta": [],
+        "units": dict(UNITS), **members,
     }  # fmt: skip
 
 
@@ -79,8 +81,8 @@ def gauges(share=0.4, frequency_hz=12.3):
     limits = {
         "angle": (0.5, "rad"), "velocity": (10.0, "rad/s"), "tracking_error": (0.05, "rad"),
         "torque_command": (60.0, "N·m"), "i2t": (0.5, "N·m"),
-        **{axis: (20.0, "N") for axis in ("fx", "fy", "fz")},
-        **{axis: (1.0, "N·m") for axis in ("tx", "ty", "tz")},
+        **dict.fromkeys(("fx", "fy", "fz"), (20.0, "N")),
+        **dict.fromkeys(("tx", "ty", "tz"), (1.0, "N·m")),
     }  # fmt: skip
     shares = [share * (0.35 + 0.65 * math.cos(k) ** 2) for k in range(len(limits))]
     shares[0] = share
@@ -103,7 +105,7 @@ def strip(t0_s, bins, amplitude_rad=0.025):
     return {
         "type": "strip", "t0_s": t0_s, "dt_s": 0.05,
         "angle_min": [min(f) for f in fine], "angle_max": [max(f) for f in fine],
-        "reference": [f[5] for f in fine],
+        "reference_min": [min(f) for f in fine], "reference_max": [max(f) for f in fine],
         "torque_min": [s - 0.04 for s in swing], "torque_max": [s + 0.04 for s in swing],
     }  # fmt: skip
 

@@ -1,9 +1,12 @@
 """Specimens in files of their own: found by name, validated as profiles are, mounted on a rig."""
 
+import re
+
 import pytest
 
 from rigd.beam import Beam, Damping
 from rigd.profile import ProfileError, load_profile, load_specimen, specimen_files, with_specimen
+from rigd.testing import write_profile
 
 BEAM = """
 note = "steel"
@@ -63,6 +66,20 @@ def test_its_beam_takes_the_place_of_the_profiles(write):
     assert "nominal damping of its own" in mounted.specimen_in_words
 
 
+def test_how_well_its_beam_is_known_is_its_own(write, tmp_path):
+    path = write_profile(tmp_path)
+    stated = "torque_scale_percent = 2.0, length_percent = 0.3, density_percent = 4.0"
+    numbers = re.sub(r"= ([\d.]+),?", r'= { value = \1, source = "measured" }\n', stated)
+    path.write_text(f"{path.read_text()}\n[uncertainty]\n{numbers}\n")
+    profile = load_profile(path)
+    assert profile.uncertainty.stated == {
+        "torque_scale_percent": 2.0, "length_percent": 0.3, "density_percent": 4.0
+    }  # fmt: skip
+    write(BEAM + '[uncertainty]\nlength_percent = { value = 0.1, source = "measured" }\n')
+    stated = with_specimen(profile, "antenna 4").uncertainty.stated
+    assert stated == {"torque_scale_percent": 2.0, "length_percent": 0.1}
+
+
 def test_the_same_beam_is_said_to_be_the_same(write):
     write(BEAM.replace("0.95", "0.98").replace("0.0903", "0.090275"))
     words = with_specimen(load_profile("sim"), "antenna 4").specimen_in_words
@@ -99,6 +116,9 @@ def test_the_working_folder_comes_before_the_users_own(write, tmp_path, monkeypa
         ("0.0903", "903.0", "outside 0.1 to 100 Hz; check their units"),
         ('"steel"', "7", "note = 7 must be text"),
         ("note", "notes", "notes does not belong to a specimen"),
+        ("[beam]",
+         "[uncertainty]\ntorque_scale_percent = { value = 1.0, source = 'paper' }\n[beam]",
+         "uncertainty.torque_scale_percent does not belong"),
         ("[beam]", "[motor]\ncoulomb_nm = 1.0\n[beam]", "motor.coulomb_nm does not belong"),
         ("[beam]", "[beam.damping]\nzeta = { value = 0.1, source = 'paper' }\n[beam]",
          "beam.damping.alpha is missing"),

@@ -372,15 +372,17 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 
 
 @pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
-def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, files):
-    fixed = []
+def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
+    fixed, formats = [], []
 
     def run(_files, routes, *_):
         fixed.append(routes.fixed)
+        formats.append(routes.figures)
         return 0
 
     def campaign(*_, **options):
         fixed.append(options["fixed"])
+        formats.append(options["formats"])
         return 0
 
     monkeypatch.setattr("analysis.cli.app.session_command", run)
@@ -388,6 +390,13 @@ def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, fil
     result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
     assert result.exit_code == 0, result.output
     assert fixed == [("delay_s", "tool_inertia_kg_m2")]
+    assert formats == [("png", "svg")]
+    result = CliRunner().invoke(app, [*files, "--figures", "pdf, png"])
+    assert formats[1:] == [("png", "pdf")], result.output
+    for wrong in ("tiff", ","):
+        result = CliRunner().invoke(app, [*files, "--figures", wrong])
+        assert result.exit_code == 2
+        assert "choose from png, svg, pdf" in result.output
     result = CliRunner().invoke(app, [*files, "--fix", "inertia"])
     assert result.exit_code == 2
     assert "there is no inertia; choose from density_over_stiffness" in result.output

@@ -4,6 +4,8 @@ import base64
 import csv
 import json
 import re
+import shutil
+import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -122,6 +124,20 @@ def test_it_is_readable_without_sight_and_on_paper(source, read_page):
     assert all(a.get("scope") in ("row", "col") for tag, a in read_page.attributes if tag == "th")
     assert "@media print" in source
     assert "prefers-color-scheme: dark" in source
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no browser to print with")
+def test_on_paper_no_page_is_half_empty(report, tmp_path):
+    """All of it fits on six pages; with a break before every part it takes nine."""
+    printed = tmp_path / "report.pdf"
+    subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer",
+         f"--user-data-dir={tmp_path / 'profile'}", f"--print-to-pdf={printed}",
+         (report / "report.html").as_uri()],
+        check=True, capture_output=True, timeout=60,
+    )  # fmt: skip
+    pages = len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes()))
+    assert 4 <= pages <= 6
 
 
 def test_figures_of_the_page_are_the_files_and_their_text_is_text(report, read_page):

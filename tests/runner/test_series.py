@@ -158,13 +158,13 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
 def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
     document = json.loads(json.dumps(make_series().plan_document()))
     first, peaks, *_ = plan_lines(document)
-    assert first == "hold on sim: 1.2 s of record."
-    assert " of 0.9 N·m." in peaks
+    assert first == "hold on sim, record of 1.2 s."
+    assert " N·m (limit 0.9)." in peaks
     for name in ("excitation", "profile", "limits", "tip_in_words"):  # of before an update
         del document[name]
     first, peaks = plan_lines(document)
-    assert first == "1.2 s of record."
-    assert " of " not in peaks
+    assert first == "record of 1.2 s."
+    assert "limit" not in peaks
 
 
 @pytest.mark.parametrize(

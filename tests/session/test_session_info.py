@@ -1,6 +1,7 @@
 """Summary of a session file."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -50,8 +51,8 @@ def test_the_lines_tell_people_and_carry_no_control_characters(gappy):
     assert all(line.isprintable() for line in lines)
     text = "\n".join(lines)
     for part in (
-        "stopped (reason angle limit)",
-        "70 at 1000 Hz, 0.100 s, 30 ticks missing",
+        "Stopped. angle limit",
+        "70 at 1000 Hz, 0.1 s, 30 ticks missing",
         "late: 2 samples",
         "sweep: 10 to 900 (0.89 s)",
         "1.500 s",
@@ -72,3 +73,50 @@ def test_a_rate_that_is_not_positive_is_refused(kit, tmp_path, rate):
     path = kit.write_foreign(tmp_path / "a.mcap", [], metadata={"rate_hz": rate})
     with pytest.raises(SessionError, match=r"a\.mcap.*rate_hz .*must be greater than 0 Hz"):
         describe(path)
+
+
+def test_numbers_are_rounded_and_times_local(kit, tmp_path, monkeypatch):
+    writer = SessionWriter(tmp_path / "a.mcap")
+    metadata = {
+        "tare_mean_fx_n": "0.40008999999999867", "beam_length_m": "0.98", "series": "1 of 2",
+        "sensor_projection": "0.0,0.0,-1.0", "simulation_seed": "3",
+    }  # fmt: skip
+    writer.begin(kit.START_UTC_NS, kit.METADATA | metadata, kit.SEGMENTS, {})
+    writer.write_samples(kit.packed(kit.make_samples(1000)))
+    counts = dict.fromkeys(("missed", "late", "lost", "stale_angles", "stale_wrenches"), "0")
+    end = {"end_utc_ns": str(kit.START_UTC_NS), "tare_drift_nm": "-6.112500000000909e-05"}
+    path = writer.close(
+        {"outcome": "complete", "reason": "", "scheduled": "1000", "recorded": "1000"}
+        | counts
+        | end
+    )
+    try:
+        monkeypatch.setenv("TZ", "Europe/Berlin")
+        time.tzset()
+        rows = dict(line.split("  ", 1) for line in describe(path).lines())
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    rows = {key: value.strip() for key, value in rows.items()}
+    assert rows["started"] == "2023-11-14 22:13:20 UTC (2023-11-14 23:13:20 CET)"
+    assert rows["end"] == rows["started"]
+    assert rows["outcome"] == "Complete: 1000 of 1000 samples, 0 missed, 0 late"
+    assert rows["tare drift"] == "-6.11e-05 N·m"
+    assert rows["tare mean fx"] == "0.4 N"
+    assert rows["beam length"] == "0.98 m"
+    assert rows["sensor projection"] == "0, 0, -1"
+    assert rows["simulation seed"] == "3"
+    assert rows["series"] == "1 of 2"
+
+
+def test_several_files_are_told_one_after_the_other(gappy, rigd_here, tmp_path):
+    done = rigd_here("info", gappy, "missing.mcap", gappy)
+    assert done.returncode == 1
+    assert done.stdout.count("outcome ") == 2
+    assert done.stderr.startswith("Error: missing.mcap cannot be read")
+    done = rigd_here("info", "--json", gappy, "missing.mcap")
+    first, second = json.loads(done.stdout)["files"]
+    assert first == describe(gappy).as_dict()
+    assert second["path"] == "missing.mcap"
+    done = rigd_here("info", "--json", gappy)
+    assert (done.returncode, json.loads(done.stdout)) == (0, first)

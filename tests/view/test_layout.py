@@ -3,6 +3,8 @@
 import pytest
 
 from rigd.view import _plots as plots
+from rigd.view._banner import SIZE as VALUES_SIZE
+from rigd.view._banner import VALUES
 from rigd.view._frequency_charts import SIZES
 from rigd.view._layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
 from rigd.view._plots import TIMELINE
@@ -98,6 +100,18 @@ def test_plots_show_a_window_up_to_the_cursor(time_series):
     assert windows_s == {WINDOW_S, CLOSE_UP_S, HISTORY_S}
 
 
+def test_plots_of_which_nothing_comes_are_left_out():
+    absent = plots.OF_A_BUS | plots.OF_REAL_TIME
+    health = {
+        view.name
+        for tab in blueprint(absent=absent).root_container.contents
+        if tab.name == "Health"
+        for view in leaves(tab)
+    }
+    left = (plots.FAULTY_TICKS, plots.BACKLOG, plots.DISK)
+    assert health == {plot.title for plot in left} | {"Health"}
+
+
 def test_charts_fill_their_views(tabs):
     charts = {
         view.origin: view
@@ -105,7 +119,8 @@ def test_charts_fill_their_views(tabs):
         for view in views
         if view.class_identifier == "2D"
     }
-    assert charts.keys() == {*SIZES, "/spectrogram"}
-    for entity, (width, height) in SIZES.items():
+    sizes = {**SIZES, VALUES: VALUES_SIZE}
+    assert charts.keys() == {*sizes, "/spectrogram"}
+    for entity, (width, height) in sizes.items():
         bounds = charts[entity].properties["VisualBounds2D"].as_component_batches()
         assert component(bounds, "range") == [{"x_range": [0.0, width], "y_range": [0.0, height]}]

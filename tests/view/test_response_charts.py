@@ -18,6 +18,7 @@ from rigd.view._frequency_charts import (
     magnitude_db,
     phase_deg,
 )
+from rigd.view._plots import GREY
 
 GRID = np.arange(9601) / 160.0
 
@@ -27,7 +28,7 @@ def estimate(subject, *, excited_up_to_hz=20.0, delays_s=(0.0, 0.0)) -> RunningE
     s = 2j * np.pi * GRID
     exact = transfer(s, subject.beam, subject.damping) + subject.tool_inertia_kg_m2 * s * s
     late = np.exp(-s * (delays_s[1] - delays_s[0]))
-    response = FrequencyResponse(GRID, exact * late, np.full(GRID.shape, 0.75), 3, "h1")
+    response = FrequencyResponse(GRID, exact * late, np.full(GRID.shape, 0.9), 3, "h1")
     below, above = np.searchsorted(GRID, [0.1, excited_up_to_hz], side="right")
     excited = np.zeros(GRID.shape, bool)
     excited[below:above] = True
@@ -81,7 +82,7 @@ def test_measured_response_lies_on_the_model_it_was_made_of(
             assert np.median(abs(seen - expected)) < 1e-3 * (axis.last - axis.first)
             assert np.mean(abs(seen - expected) < 5e-3 * (axis.last - axis.first)) > 0.97
     (strip,) = strips(found[f"{COHERENCE}/measured"])
-    assert values(charts, COHERENCE, strip)[1] == pytest.approx(np.full(len(strip), 0.75), abs=1e-5)
+    assert values(charts, COHERENCE, strip)[1] == pytest.approx(np.full(len(strip), 0.9), abs=1e-5)
 
 
 def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
@@ -125,6 +126,46 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     assert times_ns == [20_000_000_000]
 
 
+def test_where_the_coherence_is_low_the_response_is_grey(subject, shown):
+    charts = ResponseCharts(subject)
+    known = estimate(subject)
+    coherence = np.where((GRID > 5.0) & (GRID < 8.0), 0.5, 0.9)
+    charts.update(0, replace(known, response=replace(known.response, coherence=coherence)))
+    found = shown([charts.draw])
+    for entity in (MAGNITUDE, OVERVIEW_MAGNITUDE, PHASE):
+        below, above = strips(found[f"{entity}/measured"])
+        assert values(charts, entity, below)[0].max() == pytest.approx(5.0, rel=0.02)
+        assert values(charts, entity, above)[0].min() == pytest.approx(8.0, rel=0.02)
+        (grey,) = strips(found[f"{entity}/uncertain"])
+        ends_hz = values(charts, entity, grey)[0][[0, -1]]
+        assert ends_hz == pytest.approx((FIRST_HZ, 20.0), rel=5e-3)
+        assert found[f"{entity}/uncertain"].last("LineStrips2D:colors") == packed(GREY)
+    (whole,) = strips(found[f"{COHERENCE}/measured"])
+    assert values(charts, COHERENCE, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_last_session_s_response_is_drawn_beneath(subject, shown):
+    before = ResponseCharts(replace(subject, name="before", specimen="A"))
+    assert before.as_last(subject) is None
+    before.update(0, estimate(subject))
+    last = before.as_last(replace(subject, name="before", specimen="A"))
+    assert (last.session, last.specimen) == ("before", "A")
+    charts = ResponseCharts(subject, last)
+    found = shown([charts.draw_frames])
+    for entity in (MAGNITUDE, OVERVIEW_MAGNITUDE, PHASE):
+        (strip,) = strips(found[f"{entity}/last"])
+        (model,) = strips(found[f"{entity}/model"])
+        assert values(charts, entity, strip)[0][-1] == pytest.approx(20.0, rel=5e-3)
+        inside = model[:, 0] < strip[:, 0].max()
+        assert np.median(abs(np.interp(model[inside, 0], *strip.T) - model[inside, 1])) < 1.0
+        assert "last session" in [key.label for key in charts.chart(entity).legend]
+    assert f"{COHERENCE}/last" not in found
+
+
+def packed(color) -> int:
+    return int.from_bytes(bytes((*color, 255)), "big")
+
+
 def test_an_empty_coherence_chart_says_why(subject, shown):
     charts = ResponseCharts(subject)
 
@@ -155,7 +196,7 @@ def test_axes_state_their_units(subject, shown):
     found = shown([ResponseCharts(subject).draw_frames])
     titles = {
         MAGNITUDE: "Magnitude (dB re 1 N·m/rad)",
-        OVERVIEW_MAGNITUDE: "Magnitude (dB re 1 N·m/rad)",
+        OVERVIEW_MAGNITUDE: "dB re 1 N·m/rad",  # the title of its view says of what
         PHASE: "Phase (degrees)",
         COHERENCE: "Coherence (1)",
     }

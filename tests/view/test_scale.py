@@ -61,7 +61,7 @@ def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
     n = 30 * RATE_HZ
     t_s = np.arange(n) / RATE_HZ
     # Through all amplitudes in turn, as in a chirp that passes a resonance.
-    torque_nm = 0.003 * 10 ** (2.5 * np.sin(np.pi * t_s / 30)) * np.sin(2 * np.pi * 5 * t_s)
+    torque_nm = 0.03 * 10 ** (2.5 * np.sin(np.pi * t_s / 30)) * np.sin(2 * np.pi * 5 * t_s)
     samples = make_samples(n, coupling_torque_nm=torque_nm)
     scale = Scale(SIGNALS, TIME_VIEWS)
     drawings = scale.frame()
@@ -72,7 +72,7 @@ def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
     ticks = shown(drawings)[SIGNALS.ticks]
     tick_ns = np.array(ticks.times_ns[view.ticks])
     tick_values = np.array(ticks.values[view.ticks])[:, 0]
-    fills = []
+    fills, free = [], []
     for end in range(2 * RATE_HZ, n + 1, BLOCK):
         now_ns = samples["t_ns"][end - 1]
         window = torque_nm[end - 2 * RATE_HZ : end]
@@ -81,9 +81,25 @@ def test_axes_hold_two_labels_at_every_moment_and_forget(make_samples, shown):
         least = min(low, *tick_values[seen], high)
         greatest = max(high, *tick_values[seen], low)
         assert labels(least, greatest, view.height) >= 2, end
-        fills.append((high - low) / (greatest - least))
+        free.append(high - low > view.plot.least_span)
+        fills.append(max(high - low, view.plot.least_span) / (greatest - least))
     assert min(fills) > 0.3
-    assert np.mean(np.array(fills) > 0.99) > 0.3
+    assert np.mean(free) > 0.3
+    assert np.mean(np.array(fills)[free] > 0.99) > 0.3
+
+
+@pytest.mark.parametrize("view", [view for view in TIME_VIEWS if view.plot.least_span])
+def test_single_steps_and_noise_do_not_fill_an_axis(view):
+    least = view.plot.least_span
+    for middle in (0.0, 7.0 * least, -0.3 * least):
+        for span in (0.0, 0.01 * least, 0.4 * least):
+            low, high = middle - span / 2, middle + span / 2
+            below, above = missing_ticks(low, high, view.height, least)
+            first = low if below is None else below
+            last = high if above is None else above
+            assert first <= low <= high <= last
+            assert least <= last - first <= 6.0 * least
+            assert labels(first, last, view.height) >= 2
 
 
 def test_it_makes_no_difference_how_much_comes_at_a_time(make_samples, shown):

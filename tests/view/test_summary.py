@@ -24,7 +24,7 @@ def test_a_session_that_goes_well(subject):
         "late ticks": "0",
         "lost ticks": "0",
         "recorder backlog": "17 samples",
-        "not shown here": "0 samples",
+        "dropped by the viewer": "0 samples",
         "bus load": "31 %",
         "bus errors": "0",
         "sensor status": "well",

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-import re
+import resource
 import signal
 import subprocess
 import sys
@@ -14,14 +14,13 @@ import pytest
 from playwright.sync_api import expect
 from processes import child_running, eventually
 
-from rigd import testing
 from rigd.daemon import page_address
-from tests.conftest import BRIEF, PATIENT
 
 RIGD = Path(sys.executable).parent / "rigd"
 TELL_S = 1.0
+"""Within this time the page has to say what the daemon has seen."""
 END_MS = 60_000
-"""For what the rig or the analysis does; the tests fail earlier at what the page is to do."""
+"""For what the rig or the analysis does, on a computer that is overloaded."""
 
 
 @dataclass
@@ -30,19 +29,21 @@ class Served:
 
     process: subprocess.Popen
     address: str
-    folder: Path
 
 
 @contextlib.contextmanager
-def served(folder, name, *options):
-    profile = testing.write_profile(folder, BRIEF_AND_PATIENT | {"name": name}, base="sim")
+def served(profile, name, folder, *options):
     command = [RIGD, "serve", "--profile", profile, "--output", folder / "out", "--web", *options]
-    with (folder / "serve.txt").open("w") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
+    told = folder / "serve.txt"
+    environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
+    with told.open("w") as said:
+        process = subprocess.Popen(
+            command, stdout=said, stderr=said, start_new_session=True, env=environment
+        )
     try:
         address = eventually(lambda: page_address(name), within_s=60.0)
-        assert address, (folder / "serve.txt").read_text()
-        yield Served(process, address, folder / "out")
+        assert address, told.read_text()
+        yield Served(process, address)
     finally:
         process.send_signal(signal.SIGCONT)
         process.terminate()
@@ -53,13 +54,155 @@ def served(folder, name, *options):
             process.wait()
 
 
-@pytest.fixture(scope="module")
-def fast(tmp_path_factory):
-    with served(tmp_path_factory.mktemp("fast"), "page-fast", "--fast") as daemon:
-        yield daemon
+@pytest.fixture
+def serve(tmp_path, write_profile):
+    """Start a daemon with its page, on a rig of this test's own."""
+    with contextlib.ExitStack() as ending:
+
+        def start(*options):
+            name = f"page-{os.getpid()}-{time.monotonic_ns()}"
+            profile = write_profile("sim", {"name": f'"{name}"'}, patient=True)
+            return ending.enter_context(served(profile, name, tmp_path, *options))
+
+        yield start
 
 
 @pytest.fixture
-def in_real_time(tmp_path):
-    with served(tmp_path, f"page-{os.getpid()}") as daemon:
-        yield daemon
+def operate(serve, open_page):
+    """Open the page of a new daemon, and fill in a chirp of 10 s."""
+
+    def operate(*options):
+        daemon = serve(*options)
+        page = open_page(daemon.address)
+        page.wait_for_selector("#start-button:enabled", timeout=END_MS)
+        for name, value in (("duration_s", 10), ("rest_s", 0.2), ("ring_down_s", 0.5)):
+            page.fill(f"#parameter-{name}", str(value))
+        page.fill("#operator", "A. Novice")
+        page.fill("#specimen", "antenna 3")
+        page.evaluate(WATCH)
+        return daemon, page
+
+    return operate
+
+
+WATCH = """() => {
+    const word = document.querySelector("#state-word");
+    window.told = {};
+    new MutationObserver(() => { window.told[word.textContent] = Date.now() / 1e3; })
+        .observe(word, { childList: true, characterData: true, subtree: true });
+}"""
+
+
+def says(page, selector, text):
+    expect(page.locator(selector)).to_contain_text(text, timeout=END_MS)
+
+
+def start(page):
+    page.wait_for_selector("#start-button:enabled", timeout=END_MS)
+    page.click("#start-button")
+    says(page, "#state-word", "RUNNING")
+
+
+def delay_s(page, word, event):
+    """How long after an event, as the daemon dates it, the page showed a state."""
+    entry = page.locator("#event-list li", has_text=event).first
+    return page.evaluate("() => window.told")[word] - float(entry.get_attribute("data-at")) / 1e9
+
+
+def rows(page, count, outcome):
+    """Wait for so many sessions in the table, the newest with an outcome."""
+    expect(page.locator("#rows tr[id]")).to_have_count(count, timeout=END_MS)
+    says(page, "#rows tr >> nth=0", outcome)
+
+
+@pytest.mark.parametrize("options", [("--fast",), ()], ids=["fast", "real-time"])
+def test_a_new_operator_runs_stops_and_compares_sessions(operate, open_page, options):
+    daemon, page = operate(*options)
+    page.click("#predict")
+    says(page, "#prediction", "Predicted peaks")
+    says(page, "#prediction", "Largest allowed")
+
+    # A chirp of 10 s, watched.
+    start(page)
+    says(page, "#phase", "recording")
+    if not options:
+        says(page, "#frequency", "Hz")
+        says(page, "#response-keys", "measured")
+        assert page.locator("#gauge-angle .percent").inner_text() != "–"
+        assert page.get_attribute("#strip-angle", "aria-label") != "Angle: no data yet"
+    says(page, "#state-reason", "Chirp is complete.")
+    rows(page, 1, "complete")
+
+    # A second one, stopped.
+    if options:
+        page.fill("#parameter-duration_s", "600")
+    start(page)
+    says(page, "#phase", "recording")
+    page.click("#stop")
+    says(page, "#state-reason", "was stopped")
+    assert delay_s(page, "READY", "→ ready: chirp was stopped") < TELL_S
+    rows(page, 2, "stopped")
+    if not options:
+        return  # what follows has nothing to do with time
+
+    # A third one, compared with the first; the report of it.
+    page.fill("#parameter-duration_s", "10")
+    start(page)
+    rows(page, 3, "complete")
+    row = "#rows tr[id] >> nth=0"
+    expect(page.locator(f"{row} >> .modes")).to_contain_text("Hz", timeout=END_MS)
+    page.click(f"{row} >> button.link >> nth=0")
+    says(page, ".detail:not([hidden])", "95 % interval")
+    for number in (0, 2):
+        page.check(f"#rows tr[id] >> nth={number} >> input")
+    page.click("#overlay")
+    says(page, "#comparison-keys", "antenna 3")
+    expect(page.locator("#comparison-keys .key")).to_have_count(2)
+    page.click(f"{row} >> text=Make report")
+    report = page.locator("#sessions-result a")
+    expect(report).to_have_text("open the report", timeout=2 * END_MS)
+    address = daemon.address.split("#")[0].rstrip("/") + report.get_attribute("href")
+    assert not open_page.complaints
+    assert "antenna 3" in open_page(address).inner_text("body")
+    # A report has no origin, and so no icon of the page's.
+    open_page.complaints.clear()
+
+
+def test_what_fails_is_told_within_a_second(operate, open_page):
+    daemon, page = operate()
+
+    def begin():
+        start(page)
+        says(page, "#phase", "recording")
+
+    def fails(reason):
+        says(page, "#state-word", "FAULT")
+        assert delay_s(page, "FAULT", "→ fault") < TELL_S
+        assert reason in page.inner_text("#fault-reason")
+        page.click("#fault-reset")
+        says(page, "#state-word", "READY")
+
+    begin()
+    os.kill(child_running(daemon.process.pid, "control_process"), signal.SIGKILL)
+    fails("control")
+
+    begin()
+    recorder = child_running(daemon.process.pid, "recorder")
+    resource.prlimit(recorder, resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
+    fails("cannot be written")
+
+    begin()
+    daemon.process.send_signal(signal.SIGSTOP)
+    stopped_s = time.time()
+    says(page, "#state-word", "OFFLINE")
+    assert "press the STO" in page.inner_text("#state-reason")
+    # What the daemon says twice a second may just have come.
+    assert page.evaluate("() => window.told.OFFLINE") - stopped_s < TELL_S + 0.2
+    daemon.process.send_signal(signal.SIGCONT)
+    says(page, "#state-word", "RUNNING")
+    killed_s = time.time()
+    daemon.process.kill()
+    says(page, "#state-word", "OFFLINE")
+    assert page.evaluate("() => window.told.OFFLINE") - killed_s < TELL_S
+    # The page's server ends too, and the browser tells that it finds nobody.
+    open_page.complaints.clear()

@@ -1,4 +1,4 @@
-"""Through the wires, one period a SYNC, the samples are those of the direct simulation."""
+"""Through the wires, one period per SYNC, the samples are those of the direct simulation."""
 
 import time
 from dataclasses import replace

@@ -201,7 +201,7 @@ class BusSimulation:
     rig, simulated
         Parameters of the rig, and the plant with its devices.
     lock_step
-        One period a SYNC, instead of wall time.
+        One period per SYNC, instead of wall time.
     now_ns
         Wall time, on a clock that never steps back.
     send

@@ -221,7 +221,7 @@ class SimulatorOptions:
     """Options of a simulated rig."""
 
     lock_step: bool = False
-    """Move on by one period a SYNC instead of by wall time."""
+    """Advance one period per SYNC instead of by wall time."""
     log: Path | None = None
     """File of JSON lines, one an event; a new one."""
     faults: tuple[Fault, ...] = ()
@@ -475,7 +475,7 @@ class _Process:
     def _invitation(self) -> Iterator[str]:
         address, rig = self._address, self._rig
         assert rig.can is not None
-        mode = "one period a SYNC (lock-step)" if address.lock_step else "by wall time"
+        mode = "one period per SYNC (lock-step)" if address.lock_step else "by wall time"
         yield f"Simulated rig {rig.name}, {rig.rate_hz:g} Hz, {mode}; Ctrl-C ends it."
         yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
         if address.serial_port:

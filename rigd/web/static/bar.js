@@ -113,6 +113,7 @@ export class Bar {
   #render() {
     const word = this.#word();
     const gone = word === "OFFLINE" || word === "CONNECTING";
+    document.body.classList.toggle("gone", gone);
     byId("bar").dataset.tone = TONES[word] ?? "quiet";
     setText(byId("state-word"), word);
     const reason = this.#reason(word);

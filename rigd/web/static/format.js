@@ -5,17 +5,18 @@ const NOTHING = "–";
 /** A minus is no hyphen. */
 export const minus = (text) => text.replaceAll("-", "−");
 
-/** Endings of names and the units they stand for, the longer endings first (rigd/units.py). */
-const UNITS = {
-  _nm_s_per_rad: "N·m·s/rad", _nm_per_rad: "N·m/rad", _kg_per_m: "kg/m", _kg_m2: "kg·m²",
-  _n_m2: "N·m²", _percent: "%", _rad_s2: "rad/s²", _rad_s: "rad/s", _rad: "rad", _nm: "N·m",
-  _mb: "MB", _hz: "Hz", _us: "µs", _ns: "ns", _m: "m", _n: "N", _s: "s", _c: "°C",
-};
+/** Endings of names and the units they stand for, the longer endings first; the server's table. */
+let units = {};
 
-const suffixOf = (name) => Object.keys(UNITS).find((suffix) => name.endsWith(suffix)) ?? "";
+/** Take the table of units. */
+export function useUnits(table) {
+  units = table;
+}
+
+const suffixOf = (name) => Object.keys(units).find((suffix) => name.endsWith(suffix)) ?? "";
 
 /** Unit that the ending of a name stands for; empty if there is none. */
-export const unitOf = (name) => UNITS[suffixOf(name)] ?? "";
+export const unitOf = (name) => units[suffixOf(name)] ?? "";
 
 /** A name as words: `start_hz` is the start frequency. */
 export function wordsOf(name) {

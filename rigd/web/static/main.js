@@ -2,6 +2,7 @@
 
 import { Bar } from "./bar.js";
 import { Events } from "./events.js";
+import { useUnits } from "./format.js";
 import { Gauges } from "./gauges.js";
 import { Link } from "./link.js";
 import { LiveResponse } from "./response.js";
@@ -11,6 +12,7 @@ import { StartForm } from "./start.js";
 import { Strips } from "./strips.js";
 
 const link = new Link();
+link.on("hello", ({ units }) => useUnits(units));
 for (const Part of [Bar, Gauges, Strips, LiveResponse, StartForm, Rig, Sessions, Events]) {
   new Part(link);
 }

@@ -1,7 +1,7 @@
 // Quick look at a session: modes with intervals, what is flagged, and against the last session.
 
 import { make } from "./dom.js";
-import { digits, estimate } from "./format.js";
+import { estimate, level } from "./format.js";
 
 /** Modes in short, as a cell of the table of sessions has them. */
 export function modesInShort(modes) {
@@ -26,19 +26,6 @@ function modeTable(modes) {
     })));
 }
 
-/** What has changed since the last session of the same specimen. */
-function changes({ file, sentence, modes = [] }) {
-  const signed = (value) => (value > 0 ? "+" : "") + digits(value);
-  const lines = modes.map((mode, k) => {
-    const known = Number.isFinite(mode.frequency_hz_change);
-    return known ? make("li", {},
-      `Mode ${k + 1}: frequency ${signed(mode.frequency_hz_change)} Hz, damping ratio `
-      + `${signed(mode.damping_ratio_change_percent)} %, `
-      + (mode.significant ? "beyond the intervals" : "within the intervals")) : null;
-  });
-  return [make("p", {}, sentence || `Against ${file}:`), make("ul", {}, ...lines)];
-}
-
 /** The look as elements; a sentence where there is none. */
 export function lookElements(look) {
   if (!look) return [make("p", { class: "muted" }, "No quick look at this session.")];
@@ -47,13 +34,13 @@ export function lookElements(look) {
   else parts.push(make("p", {}, "No mode was identified."));
   if (Number.isFinite(look.coherence?.mean)) {
     const bands = (look.coherence.low_bands ?? []).map(([from, to]) =>
-      `${digits(from)} to ${digits(to)} Hz`);
+      `${level(from)} to ${level(to)} Hz`);
     parts.push(make("p", {}, `Mean coherence ${look.coherence.mean.toFixed(3)}`
       + (bands.length ? `; low from ${bands.join(", ")}.` : ".")));
   }
   if (look.flags?.length) {
     parts.push(make("ul", {}, ...look.flags.map((flag) => make("li", {}, flag))));
   }
-  if (look.against_last) parts.push(...changes(look.against_last));
+  if (look.against_last) parts.push(make("p", {}, look.against_last.sentence));
   return parts;
 }

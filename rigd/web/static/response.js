@@ -11,7 +11,7 @@ const PHASE_FROM = -90;  // phases lie about 0° and 180°; cut here, they do no
 const LEFT = 52;
 const RIGHT = 6;
 const TOP = 6;
-const BOTTOM = 34;
+const BOTTOM = 20;
 const BETWEEN = 14;
 const PHASE_SHARE = 0.3;
 
@@ -55,7 +55,7 @@ export class ResponsePlot {
   #label() {
     const entries = this.#curves.map(({ name, colour }) => [colour, name]);
     const first = this.#curves[0]?.response;
-    if (first && "coherence" in first) {
+    if (first && (first.coherence || known(first.reached_hz))) {
       entries.push(["shade", `not reached, or coherence below ${LOW_COHERENCE}`]);
     }
     const texts = JSON.stringify(entries);
@@ -137,10 +137,10 @@ export class ResponsePlot {
     for (const frequency of [0.5, 1, 2, 5, 10, 20, 50]) {
       surface.line(x(frequency), magnitude.top, x(frequency), magnitude.top + magnitude.height, "grid");
       surface.line(x(frequency), phase.top, x(frequency), bottom, "grid");
-      surface.text(String(frequency), x(frequency), bottom + 11, "center");
+      surface.text(frequency === 50 ? "50 Hz" : String(frequency), x(frequency), bottom + 11, "center");
     }
-    surface.text("Hz", right, bottom + 26, "right");
-    surface.text("upper: dB re 1 N·m/rad, lower: phase in degrees", LEFT, bottom + 26);
+    surface.text("Magnitude (dB re 1 N·m/rad)", LEFT + 6, magnitude.top + 10);
+    surface.text("Phase", LEFT + 6, phase.top + 10);
     const step = roundStep(high - low, 7);
     for (const tick of roundTicks(low, high, 7)) {
       const y = magnitude.top + (magnitude.height * (high - tick)) / (high - low);

@@ -180,7 +180,8 @@ export class Sessions {
     show(byId("comparison"), true);
     this.#plot.show(responses.map((response, k) => ({
       name: [this.#ticked.get(response.id) ?? response.id, response.specimen].filter(Boolean).join(", "),
-      colour: `curve-${k + 1}`, response: { ...response, reached_hz: null },
+      // Each on its own: what one of them does not know is not shaded for all.
+      colour: `curve-${k + 1}`, response: { ...response, coherence: undefined, reached_hz: null },
     })));
     byId("comparison").scrollIntoView({ block: "nearest" });
   }

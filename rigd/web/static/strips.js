@@ -19,13 +19,12 @@ class Strip {
   #small = 0;
   #spoken = -Infinity;
 
-  constructor(canvas, { name, unit, least, band, curves }) {
+  constructor(canvas, { name, unit, least, bands }) {
     this.canvas = canvas;
     this.name = name;
     this.unit = unit;
     this.least = least;
-    this.band = band;
-    this.curves = curves;
+    this.bands = bands;
     this.bins = [];
     this.#half = least;
     this.#surface = new Surface(canvas, () => this.draw());
@@ -73,8 +72,7 @@ class Strip {
       surface.text(ago ? `−${ago} s` : "now", at, height - 7, align);
     }
     surface.within(LEFT, TOP, inner.width, inner.height, (context) => {
-      for (const curve of this.curves) this.#drawCurve(context, x, y, curve);
-      this.#drawBand(context, x, y);
+      for (const band of this.bands) this.#drawBand(context, x, y, band);
     });
     this.#speak();
   }
@@ -89,31 +87,21 @@ class Strip {
     return runs.filter((run) => run.length);
   }
 
-  #drawBand(context, x, y) {
-    const { low, high, colour } = this.band;
+  #drawBand(context, x, y, { low, high, colour, width, filled = 1 }) {
     context.fillStyle = this.#surface.colour(colour);
     context.strokeStyle = this.#surface.colour(colour);
-    context.lineWidth = 1.4;
+    context.lineWidth = width;
+    context.lineJoin = "round";
     const lows = this.#runs(low);
     this.#runs(high).forEach((upper, k) => {
       context.beginPath();
       for (const [t, value] of [...upper, ...[...lows[k]].reverse()]) context.lineTo(x(t), y(value));
       context.closePath();
+      context.globalAlpha = filled;
       context.fill();
+      context.globalAlpha = 1;
       context.stroke();
     });
-  }
-
-  /** A curve behind the band: a halo where both agree, a line where they do not. */
-  #drawCurve(context, x, y, { index, colour }) {
-    context.strokeStyle = this.#surface.colour(colour);
-    context.lineWidth = 3.5;
-    context.lineJoin = "round";
-    for (const run of this.#runs(index)) {
-      context.beginPath();
-      for (const [t, value] of run) context.lineTo(x(t), y(value));
-      context.stroke();
-    }
   }
 
   /** Tell the extremes to those who do not see the strip, once a second. */
@@ -121,7 +109,7 @@ class Strip {
     const now = performance.now();
     if (now - this.#spoken < SPOKEN_MS || this.bins.length === 0) return;
     this.#spoken = now;
-    const { low, high } = this.band;
+    const { low, high } = this.bands.at(-1);
     const lows = this.bins.map((bin) => bin.values[low]).filter(Number.isFinite);
     const highs = this.bins.map((bin) => bin.values[high]).filter(Number.isFinite);
     if (lows.length === 0) return;
@@ -133,12 +121,16 @@ class Strip {
 export class Strips {
   #angle = new Strip(byId("strip-angle"), {
     name: "Angle", unit: "rad", least: LEAST.angle,
-    band: { low: 0, high: 1, colour: "measured" }, curves: [{ index: 2, colour: "reference" }],
+    // The reference behind what is measured: a rim where both agree, a band where they do not.
+    bands: [
+      { low: 2, high: 3, colour: "reference", width: 2.5, filled: 0.35 },
+      { low: 0, high: 1, colour: "measured", width: 1.4 },
+    ],
   });
 
   #torque = new Strip(byId("strip-torque"), {
     name: "Coupling torque", unit: "N·m", least: LEAST.torque,
-    band: { low: 0, high: 1, colour: "torque" }, curves: [],
+    bands: [{ low: 0, high: 1, colour: "torque", width: 1.4 }],
   });
 
   constructor(link) {
@@ -158,7 +150,8 @@ export class Strips {
       strip.draw();
     };
     if (!block.angle_min.length) return;
-    add(this.#angle, [block.angle_min, block.angle_max, block.reference]);
+    add(this.#angle,
+      [block.angle_min, block.angle_max, block.reference_min, block.reference_max]);
     add(this.#torque, [block.torque_min, block.torque_max]);
   }
 }

@@ -1,0 +1,120 @@
+"""Gauges: how near the signals of a session come to their limits."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import exp, isfinite, sqrt
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.session import Status
+
+Records = npt.NDArray[Any]
+
+NEAR: Final = 0.8
+"""Fraction of a limit from which on a gauge is near it, as the interlocks' warnings."""
+
+WRENCH: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+
+UNITS: Final = {
+    "angle": "rad",
+    "velocity": "rad/s",
+    "tracking_error": "rad",
+    "torque_command": "N·m",
+    "i2t": "N·m",
+} | {field.partition("_")[0]: "N" if field.endswith("_n") else "N·m" for field in WRENCH}
+"""Units of the gauges, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """A signal beside its limit.
+
+    Attributes
+    ----------
+    value
+        Largest magnitude; None where it is not known.
+    limit
+        Magnitude at which the session ends, or a torque is clipped; None where there is none.
+    unit
+        Unit of both.
+    """
+
+    value: float | None
+    limit: float | None
+    unit: str
+
+    @property
+    def fraction(self) -> float | None:
+        """Value as a fraction of the limit; None where either is not known."""
+        return None if self.value is None or self.limit is None else self.value / self.limit
+
+
+class Gauges:
+    """Peaks of the samples, block by block, beside their limits.
+
+    The rms torque (i²t) counts from the first sample on: the motor is taken for cold before.
+
+    Parameters
+    ----------
+    rate_hz
+        Scheduled ticks a second.
+    limits
+        Limits by the names of ``UNITS``; one that is absent or infinite is none.
+    thermal_time_constant_s
+        Time over which the rms torque is taken.
+    """
+
+    def __init__(
+        self, rate_hz: float, limits: Mapping[str, float], thermal_time_constant_s: float = 10.0
+    ) -> None:
+        self._rate_hz = rate_hz
+        self._limits = {name: limit for name, limit in limits.items() if isfinite(limit)}
+        self._time_constant_s = thermal_time_constant_s
+        self._heat_nm2 = 0.0
+        self._last: tuple[int, float] | None = None  # tick and angle of the last fresh reading
+
+    def take(self, samples: Records) -> dict[str, Gauge]:
+        """Return the peaks of a block by the names of ``UNITS``.
+
+        Parameters
+        ----------
+        samples
+            (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps.
+        """
+        torque_nm = samples["torque_command_nm"]
+        peaks = {
+            "angle": _peak(samples["angle_rad"]),
+            "velocity": _peak(self._speeds_rad_s(samples)),
+            "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
+            "torque_command": _peak(torque_nm),
+            "i2t": self._rms_nm(torque_nm),
+        } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH}
+        return {
+            name: Gauge(peak, self._limits.get(name), UNITS[name]) for name, peak in peaks.items()
+        }
+
+    def _speeds_rad_s(self, samples: Records) -> npt.NDArray[np.float64]:
+        """Return the speeds between fresh angles: one that is held would double the next."""
+        fresh = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
+        ticks, angles_rad = fresh["tick"].astype(np.int64), fresh["angle_rad"]
+        if self._last is not None:
+            ticks = np.append(self._last[0], ticks)
+            angles_rad = np.append(self._last[1], angles_rad)
+        if ticks.size:
+            self._last = int(ticks[-1]), float(angles_rad[-1])
+        speeds: npt.NDArray[np.float64] = np.diff(angles_rad) / np.diff(ticks) * self._rate_hz
+        return speeds
+
+    def _rms_nm(self, torque_nm: npt.NDArray[np.float64]) -> float:
+        known = torque_nm[np.isfinite(torque_nm)]
+        ticks = self._rate_hz * self._time_constant_s
+        self._heat_nm2 *= exp(-torque_nm.size / ticks)
+        self._heat_nm2 += float(known @ known) / ticks
+        return sqrt(self._heat_nm2)
+
+
+def _peak(values: npt.NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.abs(known).max()) if known.size else None

@@ -1,0 +1,95 @@
+"""Predictions and checks of the daemon, made in a process of their own, whatever else is done."""
+
+import asyncio
+
+from rigd.daemon import aside
+from rigd.daemon._service import CommandError
+from rigd.runner import excitation_for, plan_session
+
+CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
+
+
+def loud(amplitude_rad):
+    return CHIRP | {"parameters": CHIRP["parameters"] | {"amplitude_rad": amplitude_rad}}
+
+
+def test_a_prediction_is_that_of_a_start_and_needs_no_rig(operate, profile):
+    operated = operate()  # not connected
+    told = operated.ask("predict", **loud(0.01))
+    excitation = excitation_for(profile, "chirp", loud(0.01)["parameters"])
+    planned = plan_session(profile, excitation)
+    assert told["plan"]["peak_torque_nm"] == planned.prediction.peak_torque_nm
+    assert told["plan"]["refused"] is None
+    assert operated.service.controller is None
+    largest_rad = told["largest_amplitude_rad"]
+    refused = operated.ask("predict", **loud(3.0))
+    assert refused["largest_amplitude_rad"] == largest_rad
+    assert "exceeds" in refused["plan"]["refused"]
+    assert operated.ask("predict", excitation="hold")["largest_amplitude_rad"] is None
+
+
+def test_what_no_prediction_can_be_made_of_is_refused(operate):
+    told = operate().ask("predict", excitation="chirp", parameters={"stop_hz": 1e5})
+    assert isinstance(told, CommandError)
+    assert "stop_hz" in str(told)
+    assert told.wrong_use
+
+
+def test_only_so_many_predictions_wait(operate, monkeypatch):
+    operated = operate()
+
+    async def never(_):
+        await asyncio.sleep(0.05)
+        return {}
+
+    monkeypatch.setattr(aside, "perform", never)
+
+    async def many():
+        return await asyncio.gather(*(operated.handle("predict", **CHIRP) for _ in range(5)))
+
+    *made, refused = operated.loop.run_until_complete(many())
+    assert made == [{}] * 4
+    assert isinstance(refused, CommandError)
+
+
+def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
+    monkeypatch.setattr(aside.sys, "executable", "/bin/true")
+    told = operate().ask("predict", **CHIRP)
+    assert isinstance(told, CommandError)
+    assert "exit code 0" in str(told)
+
+
+def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):
+    asked = []
+
+    async def look_first(job, perform=aside.perform):
+        asked.append(await operated.handle("start", **CHIRP))
+        await operated.service.watch()
+        return await perform(job)
+
+    monkeypatch.setattr(aside, "perform", look_first)
+    told = operated.ask("check")
+    (refused,) = asked
+    assert "busy (check)" in str(refused)
+    rows = {row["what"]: row for row in told["rows"]}
+    assert rows["devices: connection"]["text"] == "connected by the daemon"
+    assert rows["sensor: device"]["text"] == "simulated force-torque sensor"
+    assert {row["status"] for row in told["rows"]} <= {"ok", "warning", "failed", "skipped"}
+    assert all(row.keys() == {"what", "status", "text", "remedy"} for row in told["rows"])
+    assert operated.service.status()["last_check"]["verdict"] == told["verdict"]
+    assert operated.state == "ready"
+
+
+def test_a_check_is_for_a_rig_without_a_session(operated):
+    def check(_):
+        told.append(operated.meanwhile("check"))
+
+    told = []
+    operated.world.then, operated.world.countdown = check, 50
+    operated.ask("start", **CHIRP)
+    assert "no session runs" in str(told[0])
+
+
+def test_an_unconnected_rig_can_be_checked(operate):
+    rows = {row["what"]: row for row in operate().ask("check")["rows"]}
+    assert rows["devices: connection"]["status"] == "skipped"

@@ -1,0 +1,109 @@
+"""The process of the operator's page: found by its user, started again, ended with the daemon."""
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from processes import eventually
+
+from rigd.daemon import _page, page_address
+from rigd.daemon._page import PageProcess
+from rigd.profile import load_profile
+
+
+@pytest.fixture
+def serve(runtime_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(_page, "_PAUSE_S", 0.05)
+    started = []
+
+    def serve(port=None):
+        told = []
+        socket = runtime_folder / "no.daemon"
+        started.append(PageProcess(load_profile("sim"), tmp_path, socket, port, told.append))
+        started[-1].told = told
+        return started[-1]
+
+    yield serve
+    for page in started:
+        page.close()
+
+
+def found():
+    return eventually(lambda: page_address("sim"), within_s=60.0)
+
+
+def answers(address):
+    with urllib.request.urlopen(address.partition("#")[0], timeout=30.0) as answer:
+        return answer.status == 200
+
+
+def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_folder):
+    page = serve()
+    address = found()
+    url, _, token = address.partition("#token=")
+    assert answers(address)
+    assert len(token) >= 32
+    (file,) = (runtime_folder / "rigd").glob("page-*")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert page.told == [url]
+    assert token not in url
+    pid = page._process.pid
+    command = Path(f"/proc/{pid}/cmdline").read_bytes() + Path(f"/proc/{pid}/environ").read_bytes()
+    assert token.encode() not in command
+    page.close()
+    assert page_address("sim") is None
+    assert not Path(f"/proc/{pid}").exists()
+    assert not file.exists()
+
+
+def test_a_page_that_is_killed_comes_back_at_its_place_and_is_given_up_at_last(serve, monkeypatch):
+    monkeypatch.setattr(_page, "_MOST_STARTS", 2)
+    page = serve()
+    address = found()
+    first = page._process.pid
+    os.kill(first, signal.SIGKILL)
+    assert eventually(lambda: page._process.pid != first and len(page.told) == 3, within_s=60.0)
+    assert page.told == [page.told[0], None, page.told[0]]
+    assert page_address("sim") == address
+    assert answers(address)
+    os.kill(page._process.pid, signal.SIGKILL)
+    page._thread.join(30.0)
+    assert not page._thread.is_alive()
+    assert page.told[-1] is None
+
+
+def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, caplog):
+    monkeypatch.setattr(_page, "_MOST_STARTS", 1)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        page = serve(port)
+        page._thread.join(60.0)
+        assert f"port {port} cannot be had" in caplog.text
+        assert page_address("sim") is None
+        monkeypatch.setattr(_page, "PAGE_PORT", port)
+        other = serve()
+        assert answers(found())
+        assert other.told[0] != f"http://127.0.0.1:{port}/"
+
+
+def test_a_file_of_a_daemon_that_is_gone_is_no_address(runtime_folder):
+    folder = runtime_folder / "rigd"
+    folder.mkdir()
+    told = {"pid": os.getpid(), "born": 1, "url": "http://127.0.0.1:1/", "token": "x"}
+    (folder / "page-sim.json").write_text(json.dumps(told))
+    assert page_address("sim") is None
+
+
+def test_a_daemon_imports_nothing_of_the_page():
+    code = (
+        "import sys, rigd.daemon._main, rigd.daemon._page, rigd.cli.daemon; "
+        "print([name for name in ('aiohttp', 'rigd.web') if name in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"

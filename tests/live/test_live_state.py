@@ -1,0 +1,169 @@
+"""The overview says within a second in which state a session is, and why."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import eventually
+
+from rigd.beam import Beam
+from rigd.engine import Phase, Stop, Word, create_channels, shared_memory_fd
+from rigd.engine._topics import DESCRIPTORS
+from rigd.live._ring_reader import LiveSession
+from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
+from rigd.view import (
+    RETURNING,
+    RUNNING,
+    STOPPING,
+    SUPERVISOR_SILENT,
+    LastResponse,
+    Subject,
+    preparing,
+)
+
+
+@pytest.fixture
+def channels():
+    made = create_channels(1000.0, [shared_memory_fd() for _ in range(DESCRIPTORS)])
+    yield made
+    made.close()
+
+
+def test_the_board_tells_every_state_of_a_session(channels):
+    board, states = channels.board, StateWatch(channels)
+
+    def state(**words):
+        for name, value in words.items():
+            board[Word[name]] = value
+        board.beat(Word.SUPERVISOR_BEAT)
+        return states.look(0.0)
+
+    assert state(PHASE=Phase.OFF) == preparing()
+    assert state(PHASE=Phase.TARING) == preparing("Taring.")
+    assert state(PHASE=Phase.WAITING) == preparing("Waiting for the beam to rest.")
+    assert state(PHASE=Phase.READY, GO=1) == preparing("Ready.")
+    assert state(PHASE=Phase.RUNNING) == RUNNING
+    assert state(STOP=Stop.OPERATOR) == STOPPING
+    assert state(STOP=Stop.NO, PHASE=Phase.RETURNING) == RETURNING
+    assert state(PHASE=Phase.OFF) == RETURNING
+
+
+def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
+    board, states, now_s = channels.board, StateWatch(channels), 100.0
+    board[Word.GO], board[Word.PHASE] = 1, Phase.RUNNING
+    for _ in range(100):
+        now_s += _PERIOD_S
+        board.beat(Word.SUPERVISOR_BEAT)
+        assert states.look(now_s) == RUNNING
+    hung_s = now_s
+    while states.look(now_s) != SUPERVISOR_SILENT:
+        now_s += _PERIOD_S
+    assert now_s - hung_s < 0.8
+    board.beat(Word.SUPERVISOR_BEAT)
+    assert states.look(now_s + _PERIOD_S) == RUNNING
+    board[Word.PHASE] = Phase.OFF  # between sessions nobody need be there at once
+    assert states.look(now_s + 5.0) != SUPERVISOR_SILENT
+
+
+def words(columns) -> list[str]:
+    """Return the headings of the banner, in the order in which they came."""
+    _, texts = columns.sent("/state", "TextDocument:text")
+    found = [text.split("\n")[0].removeprefix("# ").split(" · ")[0] for (text,) in texts]
+    return [word for i, word in enumerate(found) if i == 0 or word != found[i - 1]]
+
+
+def first_sent_s(columns, word: str) -> float:
+    sent_s, texts = columns.sent("/state", "TextDocument:text")
+    return min(s for s, (text,) in zip(sent_s, texts, strict=True) if text.startswith(f"# {word}"))
+
+
+def test_running_and_fault_are_shown_within_a_second(publisher, producer, receive):
+    board, told_s = producer.channels.board, {"RUNNING": [], "FAULT": []}
+    received = receive(publisher)
+    for number in range(3):  # what else happens on this computer only makes it slower
+        begins = tuple(ring.written for ring in producer.channels.rings)
+        publisher.show(f"session {number}", begins)
+        told_s["RUNNING"].append(time.time())
+        board[Word.PHASE] = Phase.RUNNING
+        time.sleep(0.5)
+        told_s["FAULT"].append(time.time())
+        publisher.finish("fault", "The drive was lost.")
+        time.sleep(0.3)
+    recordings = received()
+    for word, times_s in told_s.items():
+        delays_s = [
+            first_sent_s(recordings[f"recording of session {number}"], word) - told
+            for number, told in enumerate(times_s)
+        ]
+        assert min(delays_s) < 1.0, (word, delays_s)
+    shown = recordings["recording of session 0"]
+    assert words(shown)[-2:] == ["RUNNING", "FAULT"]
+    _, texts = shown.sent("/state", "TextDocument:text")
+    assert "The drive was lost." in texts[-1][0]
+
+
+@pytest.mark.parametrize("off", [True, False])
+def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
+    producer, start_publisher, save, off
+):
+    publisher = start_publisher(first="from rigd.live import publisher as p; p._ORPHANED_S = 0.5")
+    board = producer.channels.board
+    board[Word.PHASE] = Phase.RUNNING
+    saver = save(publisher.address)
+    assert eventually(saver.has_begun)
+    if off:
+        board[Word.PHASE] = Phase.OFF
+    publisher.end()
+    (columns,) = saver.recordings().values()
+    assert words(columns)[-1] == "SUPERVISOR LOST"
+    _, texts = columns.sent("/state", "TextDocument:text")
+    assert ("the torque is off." in texts[-1][0]) is off
+    _, lines = columns("/events", "TextLog:text")
+    assert lines[-1][0].startswith("The supervising process ended")
+
+
+# Response of the last session
+
+
+def look(folder: Path, name: str, specimen: str | None, magnitude: float = 2.0) -> None:
+    response = {
+        "frequency_hz": [1.0, 2.0], "magnitude": [magnitude, None], "phase_rad": [np.pi, 0.0]
+    }  # fmt: skip
+    text = json.dumps({"version": 1, "specimen": specimen, "response": response})
+    (folder / f"{name}.look.json").write_text(text)
+
+
+def own(session: str, specimen: str) -> LastResponse:
+    return LastResponse(session, specimen, np.array([1.0]), np.array([5.0 + 0j]))
+
+
+def asked(folder: Path | None, specimen: str) -> LiveSession:
+    beam = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
+    subject = Subject("20261122-120000-chirp", 1000.0, 10, (0, 10), beam, None, specimen=specimen)
+    return LiveSession(subject, "id", (0,), folder)
+
+
+def test_the_newest_quick_look_of_the_specimen_is_taken(tmp_path):
+    look(tmp_path, "20261122-100000-chirp", "A", magnitude=1.0)
+    look(tmp_path, "20261122-110000-chirp", "A", magnitude=3.0)
+    look(tmp_path, "20261122-113000-chirp", "B")
+    look(tmp_path, "20261122-114000-chirp", None)
+    (tmp_path / "20261122-115000-chirp.look.json").write_text("{")
+    found = last_response(asked(tmp_path, "A"), None)
+    assert found.session == "20261122-110000-chirp"
+    assert found.frequency_hz.tolist() == [1.0, 2.0]
+    assert found.response[0] == pytest.approx(-3.0)
+    assert np.isnan(found.response[1])
+    assert last_response(asked(tmp_path, ""), None).session == "20261122-114000-chirp"
+    assert last_response(asked(tmp_path, "C"), None) is None
+
+
+def test_what_the_view_computed_itself_stands_in_for_a_look_that_is_not_there_yet(tmp_path):
+    look(tmp_path, "20261122-100000-chirp", "A")
+    later, earlier = own("20261122-113000-chirp", "A"), own("20261122-090000-chirp", "A")
+    assert last_response(asked(tmp_path, "A"), later) is later
+    assert last_response(asked(tmp_path, "A"), earlier).session == "20261122-100000-chirp"
+    assert last_response(asked(None, "A"), earlier) is earlier
+    assert last_response(asked(None, "B"), later) is None

@@ -1,0 +1,155 @@
+"""The page's server in a thread, in front of a daemon that only notes what it is asked."""
+
+import asyncio
+import contextlib
+import json
+import socket
+import threading
+
+import pytest
+
+from rigd.daemon._page import _job
+from rigd.profile import load_profile
+from rigd.web import _access, _server
+
+TOKEN = "the-right-one"
+ACTING = ("start", "tare", "zero", "reset", "check")
+STATUS = {
+    "daemon": {"pid": 1, "profile": "sim"},
+    "state": "ready",
+    "since_utc_ns": 0,
+    "reason": "",
+    "doing": "",
+    "controller": None,
+    "series": None,
+    "progress": None,
+    "rig": None,
+    "history": [],
+}
+
+
+class FakeDaemon:
+    """A socket that answers as the daemon does, and obeys nothing."""
+
+    def __init__(self):
+        self.asked = []
+        self.status = dict(STATUS)
+        self.replies = {}
+        self.watchers = []
+        self.silent = False
+
+    @property
+    def acted(self):
+        return [each for each in self.asked if each["command"] in ACTING]
+
+    async def serve(self, reader, writer):
+        with contextlib.suppress(ConnectionError):
+            while line := await reader.readline():
+                request = json.loads(line)
+                command = request["command"]
+                self.asked.append(request)
+                if command == "watch":
+                    self.watchers.append(writer)
+                if self.silent:
+                    continue
+                reply = {"reply": command, "ok": True} | self.replies.get(command, {})
+                self.say(writer, self.status | reply if command == "status" else reply)
+        writer.close()
+
+    def say(self, writer, document):
+        writer.write(json.dumps(document).encode() + b"\n")
+
+    def publish(self, event):
+        for writer in self.watchers:
+            self.say(writer, event)
+
+
+class Served:
+    """A page's server in a thread of its own, and the daemon behind it."""
+
+    def __init__(self, folder, path, profile):
+        self.folder = folder
+        self.daemon = FakeDaemon()
+        self.loop = asyncio.new_event_loop()
+        self._path = path
+        self._job = _job(profile, folder, path) | {"token": TOKEN, "port": 0, "any_port": False}
+        self._thread = threading.Thread(target=self._work)
+        self._ready = threading.Event()
+        self._thread.start()
+        assert self._ready.wait(30.0)
+
+    def _work(self):
+        self.loop.run_until_complete(self._run())
+        self.loop.close()
+
+    async def _run(self):
+        self._end = asyncio.Event()
+        behind = await asyncio.start_unix_server(self.daemon.serve, self._path)
+        self.server, runner, listening = await _server.open_page(self._job)
+        self.port = _server.port_of(listening)
+        running = asyncio.create_task(self.server.run())
+        self._ready.set()
+        await self._end.wait()
+        listening.close()
+        behind.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        self.server.pages.drop_all()
+        for writer in self.daemon.watchers:
+            writer.close()
+        await runner.cleanup()
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    def call(self, function, *arguments):
+        """Have a function called in the server's thread."""
+        self.loop.call_soon_threadsafe(function, *arguments)
+
+    def close(self):
+        self.call(self._end.set)
+        self._thread.join(30.0)
+        assert not self._thread.is_alive()
+
+    def connect(self):
+        return socket.create_connection(("127.0.0.1", self.port), 30.0)
+
+    def send(self, data):
+        """Send bytes; returns what is answered, to the end of the connection or of the answer."""
+        with self.connect() as link:
+            with contextlib.suppress(ConnectionError):  # it may be closed before all is sent
+                for block in [data] if isinstance(data, bytes) else data:
+                    link.sendall(block)
+            answer = b""
+            with contextlib.suppress(ConnectionError):
+                while block := link.recv(65_536):
+                    answer += block
+            return answer
+
+    def ask(self, method, target, headers=(), body=b""):
+        """Send a request; returns its status and what comes with it."""
+        given = {"Host": f"127.0.0.1:{self.port}", "Connection": "close"} | dict(headers)
+        if body:
+            given.setdefault("Content-Length", str(len(body)))
+        lines = [f"{method} {target} HTTP/1.1"]
+        lines += [f"{name}: {value}" for name, value in given.items() if value is not None]
+        answer = self.send("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
+        head, _, rest = answer.partition(b"\r\n\r\n")
+        return (int(head.split()[1]) if head else 0), head.decode("latin-1"), rest
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sessions")
+    path = tmp_path_factory.mktemp("s") / "daemon"
+    server = Served(folder, path, load_profile("sim"))
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def hurried(monkeypatch):
+    """Who says nothing is let go soon."""
+    monkeypatch.setattr(_access, "_SILENT_S", 0.2)
+    monkeypatch.setattr(_access, "_READ_S", 0.2)

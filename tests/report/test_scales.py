@@ -1,0 +1,149 @@
+"""What a report says of the scales, and of the fit in per cent."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.identify import with_scales
+from analysis.report._document import (
+    document,
+    finite,
+    record_entries,
+    response_fit_percent,
+)
+from analysis.report._record_tables import modes_table, parameters_table, structures_table
+from analysis.report._scales import scale_notes
+from analysis.report._signal_figures import torque_in_band
+
+ALL = {"torque_scale": 0.005, "length": 0.0005, "density": 0.003}
+
+
+@pytest.fixture
+def stated(record_result):
+    """Whole record whose file states some uncertainties."""
+
+    def made(**uncertainty):
+        whole = record_result.whole
+        return replace(whole, record=replace(whole.record, uncertainty=uncertainty))
+
+    return made
+
+
+def test_without_statement_intervals_are_called_statistical(stated):
+    table = parameters_table(stated())
+    assert "combined_low_si" not in table.keys
+    notes = " ".join(table.notes)
+    assert (
+        "Intervals are statistical only. Not included: the uncertainty of torque scale and" in notes
+    )
+    assert "γ ∝ length⁻⁴, ρ/EI ∝ length⁻⁴, EI ∝ torque scale · length, J ∝ torque scale" in notes
+    assert "Mass per length" not in notes
+    assert "statistical only" in modes_table(stated()).notes[0]
+
+
+def test_stated_uncertainties_stand_beside_the_statistical_intervals(stated):
+    whole = stated(**ALL)
+    table = parameters_table(whole)
+    rows = {row["parameter"]: row for row in table.rows}
+    combined = with_scales(whole.headline.parameters, ALL)
+    stiffness = combined["bending_stiffness_n_m2"]
+    ends = rows["EI"]["combined_low_si"].value, rows["EI"]["combined_high_si"].value
+    assert ends == stiffness.interval_95
+    assert rows["EI"]["combined_std_si"].value == stiffness.std
+    assert ends[1] - ends[0] > 2 * (rows["EI"]["high_si"].value - rows["EI"]["low_si"].value)
+    for end in ("low_si", "high_si"):
+        assert rows["ζ"][f"combined_{end}"].value == rows["ζ"][end].value
+    notes = " ".join(table.notes)
+    assert "torque scale 0.5 % and length 0.05 %, in quadrature" in notes
+    assert "Not included" not in notes
+    assert "Mass per length from the record" in notes
+    assert "They agree." in notes
+
+
+def test_what_is_not_stated_is_named(stated):
+    notes = " ".join(scale_notes(stated(torque_scale=0.01)))
+    assert "relative standard uncertainty of torque scale 1 %" in notes
+    assert "Not included: the uncertainty of length, which the file does not state" in notes
+
+
+def test_a_density_that_contradicts_is_told(stated):
+    whole = stated(**ALL)
+    beam = replace(whole.record.beam, density_kg_per_m=1.05 * whole.record.beam.density_kg_per_m)
+    whole = replace(whole, record=replace(whole.record, beam=beam))
+    assert "check torque scale and length" in " ".join(scale_notes(whole))
+
+
+def test_what_is_held_leaves_no_combined_interval(stated):
+    whole = stated(**ALL)
+    fit = whole.fit
+    interval = {k: v for k, v in fit.interval.items() if k != "bending_stiffness_n_m2"}
+    headline = replace(whole.headline, fit=replace(fit, interval=interval))
+    held = replace(
+        whole,
+        selection=replace(whole.selection, headline=headline),
+        fixed=("bending_stiffness_n_m2",),
+    )
+    assert held.combined == {}
+    (note,) = scale_notes(held)
+    assert "the file's values of EI, which were held" in note
+
+
+def test_the_document_has_both(stated):
+    entries = finite(record_entries(stated(**ALL), None))
+    told = json.loads(json.dumps(entries["headline"]))
+    assert told["scale_uncertainty"] == ALL
+    assert told["combined"].keys() == {
+        "gamma", "density_over_stiffness", "bending_stiffness_n_m2", "tool_inertia_kg_m2",
+    }  # fmt: skip
+    for name, each in told["combined"].items():
+        low, high = told["parameters"][name]["interval_95"]
+        assert each["interval_95"][0] <= low < high < each["interval_95"][1]
+        assert each["value"] == told["parameters"][name]["value"]
+    assert finite(record_entries(stated(), None))["headline"]["combined"] == {}
+
+
+def test_units_of_a_file_are_those_of_its_numbers(record_result):
+    rows = {row["parameter"]: row for row in parameters_table(record_result.whole).rows}
+    units = {symbol: (row["unit"].value, row["unit"].text) for symbol, row in rows.items()}
+    assert units["ζ"] == ("s^α", "1e-5 s^α")
+    assert units["γ"] == ("s^λ/m⁴", "1e-2 s^λ/m⁴")
+    assert units["τ"] == ("s", "µs")
+    assert units["EI"] == ("N·m²", "N·m²")
+    assert units["α"] == ("1", "1")
+
+
+def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
+    """The same number from signals: measured against predicted torque, without their means."""
+    whole = record_result.whole
+    torque = torque_in_band(whole.record, whole.fit.plant, whole.band_hz[1])
+    measured = torque.measured - torque.measured.mean()
+    expected = 100 * (1 - np.linalg.norm(torque.residual) / np.linalg.norm(measured))
+    found = whole.analysis.fit_percent(whole.fit)
+    assert found == pytest.approx(expected, abs=0.3)
+    assert 50 < found < 100
+    table = structures_table(whole)
+    by_type = {row["type"]: row["nrmse_percent"] for row in table.rows}
+    assert by_type["VI"] == found > by_type["I"]
+    assert any("NRMSE" in note for note in table.notes)
+
+
+def test_every_fit_of_the_document_has_its_per_cent(record_result):
+    content = document([record_result])
+    by_name = {
+        (fit["estimator"], fit["type"], fit["weighting"]): fit["nrmse_percent"]
+        for fit in content["fits"]
+    }
+    assert len(by_name) == len(content["fits"])
+    assert all(value < 100 for value in by_name.values())
+    for model in record_result.welch.models:
+        expected = response_fit_percent(record_result.welch, model)
+        assert by_name["welch", model.fit.structure.name, model.fit.weighting] == expected
+        square = model.indices.mse / np.mean(
+            np.abs(
+                record_result.welch.response.response - record_result.welch.response.response.mean()
+            )
+            ** 2
+        )
+        assert expected == pytest.approx(100 * (1 - square**0.5))

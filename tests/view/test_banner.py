@@ -1,0 +1,144 @@
+"""The overview says the state of a session, and how near its values are to their limits."""
+
+from dataclasses import replace
+
+import pytest
+
+from rigd.view._banner import (
+    RUNNING,
+    STATE,
+    SUPERVISOR_LOST,
+    VALUES,
+    banner,
+    ended,
+    gauge_color,
+    gauge_text,
+    preparing,
+)
+from rigd.view._gauges import Gauge
+from rigd.view._plots import GREEN, GREY, ORANGE, RED
+from rigd.view._scene import Scene
+from rigd.view._session_info import RECENT_EVENTS, Health, Note
+
+FAULT = ended("fault", "The disk is full.")
+
+
+@pytest.fixture
+def sweep(subject):
+    """The paper's session with all that a banner tells."""
+    return replace(
+        subject, excitation="chirp", sweep_hz=(0.05, 50.0), specimen="A_3", limits={"angle": 1.0}
+    )
+
+
+def packed(color) -> int:
+    return int.from_bytes(bytes((*color, 255)), "big")
+
+
+def test_a_running_session_says_what_is_run_and_how_long_it_takes(sweep):
+    said = banner(sweep, RUNNING, 61_000_000_000, Health(missed_ticks=0))
+    heading, what = said.split("\n\n")
+    assert heading == "# RUNNING · 75 s left"
+    assert what == (
+        "**chirp** 0.05 → 50 Hz, now **25 Hz**, specimen **A\\_3**, session 20261121-101500-chirp"
+    )
+
+
+def test_an_overloaded_computer_is_named(sweep):
+    said = banner(sweep, RUNNING, 10_000_000_000, Health(missed_ticks=50))
+    assert "Computer overloaded: 50 ticks missed (0.5 %)." in said
+    assert "overloaded" not in banner(sweep, FAULT, 10_000_000_000, Health(missed_ticks=50))
+
+
+@pytest.mark.parametrize(
+    ("state", "heading"),
+    [
+        (preparing("Taring."), "# PREPARING\n\nTaring."),
+        (ended("complete", ""), "# COMPLETE\n\n**chirp**"),
+        (ended("stopped", "Stopped by the operator."), "# STOPPED\n\nStopped by the operator."),
+        (FAULT, "# FAULT\n\n**The disk is full.**"),
+        (SUPERVISOR_LOST, "# SUPERVISOR LOST\n\n**The supervising process ended."),
+    ],
+)
+def test_every_state_says_its_word_and_its_reason(sweep, state, heading):
+    said = banner(sweep, state, 30_000_000_000, Health())
+    assert said.startswith(heading)
+    assert "left" not in said.split("\n")[0]
+    if state.over:
+        assert "now" not in said
+
+
+def test_a_recorded_session_is_not_taken_for_one_that_runs(sweep):
+    said = banner(replace(sweep, recorded=True), FAULT, 0, Health())
+    assert said.startswith("# Recorded: FAULT")
+
+
+def test_only_a_linear_sweep_has_a_frequency(subject, sweep):
+    assert sweep.frequency_hz(999) is None
+    assert sweep.frequency_hz(1000) == pytest.approx(0.05)
+    assert sweep.frequency_hz(121_000) is None
+    assert subject.frequency_hz(5000) is None
+    down = replace(sweep, sweep_hz=(60.0, 50.0))
+    assert down.frequency_hz(61_000) == pytest.approx(55.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "color"), [(None, GREY), (0.79, GREEN), (0.81, ORANGE), (1.0, RED)]
+)
+def test_a_gauge_turns_orange_near_its_limit_and_red_at_it(value, color):
+    assert gauge_color(Gauge(value, 1.0, "rad")) == color
+
+
+@pytest.mark.parametrize(
+    ("gauge", "text"),
+    [
+        (Gauge(1.0512, 15.0, "rad/s"), "speed 1.05 of 15 rad/s"),
+        (Gauge(0.00012, 0.5, "rad"), "speed 0.0001 of 0.5 rad"),
+        (Gauge(0.2, None, "N·m"), "speed 0.2 N·m"),
+        (Gauge(None, 1.0, "N"), "speed unknown"),
+    ],
+)
+def test_a_gauge_is_told_to_a_thousandth_of_its_limit(gauge, text):
+    assert gauge_text("speed", gauge) == text
+
+
+def test_state_and_values_are_drawn_as_they_come(sweep, make_samples, shown):
+    scene = Scene(sweep)
+    drawings = scene.frame()
+    drawings += scene.state(0, RUNNING)
+    assert scene.state(0, RUNNING) == []
+    drawings += scene.samples(make_samples(1000, angle_rad=0.9))
+    drawings += scene.health(1_000_000_000, Health(missed_ticks=0))
+    drawings += scene.state(1_000_000_000, FAULT)
+    found = shown(drawings)
+    words = [text.split("\n")[0] for (text,) in found[STATE].values["TextDocument:text"]]
+    assert words == ["# PREPARING", "# RUNNING · 136 s left", "# RUNNING · 135 s left", "# FAULT"]
+    bands = [colors[0] for colors in found[f"{VALUES}/bars"].values["LineStrips2D:colors"]]
+    assert bands == [packed(color) for color in (ORANGE, GREEN, GREEN, RED)]
+    assert "angle 0.900 of 1 rad" in found[f"{VALUES}/texts"].values["Points2D:labels"][-1]
+    colors = found[f"{VALUES}/bars"].values["LineStrips2D:colors"][-1]
+    assert packed(ORANGE) in colors  # the bar of the angle
+
+
+def test_a_peak_between_two_drawings_is_not_lost(sweep, make_samples, shown):
+    scene = Scene(sweep)
+    samples = make_samples(1000)
+    samples["angle_rad"][50] = 0.5
+    for i in range(0, 1000, 100):
+        scene.samples(samples[i : i + 100])
+    found = shown(scene.health(1_000_000_000, Health()))
+    assert "angle 0.500 of 1 rad" in found[f"{VALUES}/texts"].values["Points2D:labels"][-1]
+
+
+def test_events_are_shown_in_full_the_newest_first(sweep, shown):
+    scene = Scene(sweep)
+    long = "The *torque* command " + 40 * "is above its warning level " + "now."
+    found = shown(
+        scene.events([Note(0, "info", "Record starts."), Note(2_500_000_000, "warning", long)])
+    )
+    newest, first = found[RECENT_EVENTS].last("TextDocument:text").split("\n\n")
+    assert newest.startswith("**2.5 s** ⚠ The \\*torque\\* command is above")
+    assert newest.endswith("level now.")
+    assert first == "**0.0 s** Record starts."
+    # A log cuts what is longer than its view.
+    assert max(map(len, found["/events"].last("TextLog:text").split("\n"))) <= 150

@@ -1,0 +1,290 @@
+"""Hostile requests to the page's server: none acts, none reads what is not the sessions'."""
+
+import base64
+import json
+import os
+import time
+import zlib
+
+import pytest
+from web_daemon import TOKEN
+
+START = json.dumps({"command": "start", "excitation": "chirp"}).encode()
+RIGHT = {
+    "Authorization": f"Bearer {TOKEN}",
+    "X-Rigd": "1",
+    "Content-Type": "application/json",
+}
+SECRET = b"nobody is to read this"
+
+
+def without(*names):
+    return {name: value for name, value in RIGHT.items() if name not in names}
+
+
+@pytest.fixture(scope="module")
+def lure(served, tmp_path_factory):
+    """Files beside the folder of the sessions, and links in it that lead to them."""
+    secret = tmp_path_factory.mktemp("elsewhere") / "secret.mcap"
+    secret.write_bytes(SECRET)
+    (served.folder / "link.mcap").symlink_to(secret)
+    (served.folder / "good.mcap").write_bytes(b"no session")
+    (served.folder / "link.look.json").symlink_to(secret)
+    (served.folder / "campaign.report").symlink_to(secret.parent)
+    (served.folder / "good.report").mkdir()
+    (served.folder / "good.report" / "report.html").write_text("a report")
+    (served.folder / "good.report" / "secret.html").symlink_to(secret)
+    (served.folder.parent / "secret.mcap").write_bytes(SECRET)
+    (served.folder / ".hidden.mcap").write_bytes(SECRET)
+    return secret
+
+
+@pytest.fixture(autouse=True)
+def _lives_and_has_not_acted(served, lure):
+    before = len(served.daemon.asked)
+    yield
+    asked = [each for each in served.daemon.asked[before:] if each["command"] not in OBSERVING]
+    assert asked == []
+    status, head, _ = served.ask("GET", "/")
+    assert status == 200
+    assert "default-src 'self'" in head
+
+
+OBSERVING = ("status", "watch")
+
+WITHOUT_RIGHT = {
+    "no token": without("Authorization"),
+    "empty token": RIGHT | {"Authorization": "Bearer "},
+    "wrong token": RIGHT | {"Authorization": f"Bearer {TOKEN}x"},
+    "part of the token": RIGHT | {"Authorization": f"Bearer {TOKEN[:-1]}"},
+    "token that is no ASCII": RIGHT | {"Authorization": "Bearer \xe4\xf6"},
+    "other scheme": RIGHT
+    | {"Authorization": "Basic " + base64.b64encode(f"u:{TOKEN}".encode()).decode()},
+    "token as cookie": without("Authorization") | {"Cookie": f"token={TOKEN}"},
+    "other origin": RIGHT | {"Origin": "http://evil.example"},
+    "no origin at all": RIGHT | {"Origin": "null"},
+    "origin of another local port": RIGHT | {"Origin": "http://127.0.0.1:1"},
+    "origin of another scheme": RIGHT | {"Origin": "https://127.0.0.1"},
+    "other site, says the browser": RIGHT | {"Sec-Fetch-Site": "cross-site"},
+    "same site, says the browser": RIGHT | {"Sec-Fetch-Site": "same-site"},
+    "other host": RIGHT | {"Host": "evil.example"},
+    "host that begins like ours": RIGHT | {"Host": "127.0.0.1.evil.example"},
+    "host with a user": RIGHT | {"Host": "127.0.0.1@evil.example"},
+    "host with a path": RIGHT | {"Host": "evil.example/127.0.0.1"},
+    "host that is no name": RIGHT | {"Host": "[::1"},
+    "no host": RIGHT | {"Host": None},
+    "form of text/plain": without("X-Rigd") | {"Content-Type": "text/plain"},
+    "plain text with our header": RIGHT | {"Content-Type": "text/plain"},
+    "form": RIGHT | {"Content-Type": "application/x-www-form-urlencoded"},
+    "form in parts": RIGHT | {"Content-Type": "multipart/form-data; boundary=x"},
+    "without our header": without("X-Rigd"),
+}
+
+
+@pytest.mark.parametrize("headers", WITHOUT_RIGHT.values(), ids=WITHOUT_RIGHT)
+def test_without_the_right_nothing_is_started(served, headers):
+    status, _, body = served.ask("POST", "/api/command", headers, START)
+    assert status in (400, 403)
+    assert TOKEN.encode() not in body
+
+
+@pytest.mark.parametrize("command", ["tare", "zero", "reset", "check"])
+def test_without_a_token_nothing_else_acts(served, command):
+    body = json.dumps({"command": command}).encode()
+    status, _, _ = served.ask("POST", "/api/command", without("Authorization"), body)
+    assert status == 403
+
+
+def test_a_token_in_the_address_is_none(served):
+    target = f"/api/command?token={TOKEN}"
+    status, _, _ = served.ask("POST", target, without("Authorization"), START)
+    assert status == 403
+
+
+def test_a_prediction_without_a_token_has_no_file_read(served, lure):
+    request = {"command": "predict", "excitation": "file", "parameters": {"path": str(lure)}}
+    status, _, _ = served.ask(
+        "POST", "/api/command", without("Authorization"), json.dumps(request).encode()
+    )
+    assert status == 403
+
+
+@pytest.mark.parametrize("method", ["OPTIONS", "PUT", "DELETE", "TRACE", "GET", "PATCH", "FOO"])
+def test_other_methods_get_nothing_and_no_permission(served, method):
+    asks = {"Origin": f"http://127.0.0.1:{served.port}", "Access-Control-Request-Method": "POST"}
+    status, head, _ = served.ask(method, "/api/command", RIGHT | asks, START)
+    assert status in (400, 405)
+    assert "access-control" not in head.lower()
+
+
+BODIES = {
+    "no JSON": b"command=start",
+    "a list": b"[" + START + b"]",
+    "nested too deeply": b"[" * 30_000,
+    "no command": b"{}",
+    "command that is a list": b'{"command": ["start"]}',
+    "one that watches": b'{"command": "watch"}',
+    "two lines": START + b"\n" + START,
+    "no UTF-8": b'{"command": "\xff"}',
+    "more than is read": b" " * 70_000 + START,
+    "nothing": b"",
+}
+
+
+@pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
+def test_what_is_no_request_is_refused_with_the_token_as_well(served, body):
+    status, _, _ = served.ask("POST", "/api/command", RIGHT, body)
+    assert status in (400, 413)
+
+
+def test_a_compressed_request_is_not_unpacked(served):
+    body = zlib.compress(START)
+    headers = RIGHT | {"Content-Encoding": "deflate"}
+    status, _, _ = served.ask("POST", "/api/command", headers, body)
+    assert status == 400
+
+
+def test_bodies_of_100_mb_are_not_taken(served):
+    block = b"x" * 65_536
+    head = f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nX-Rigd: 1\r\n"
+    head += f"Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
+    began_s = time.monotonic()
+    with_length = [head.encode() + b"Content-Length: 100000000\r\n\r\n", *[block] * 1526]
+    answer = served.send(with_length)
+    assert answer == b"" or b" 413 " in answer
+    piece = b"10000\r\n" + block + b"\r\n"
+    answer = served.send([head.encode() + b"Transfer-Encoding: chunked\r\n\r\n", *[piece] * 1526])
+    assert answer == b"" or b" 413 " in answer
+    assert time.monotonic() - began_s < 20.0
+
+
+GARBAGE = {
+    "noise": bytes(range(256)) * 8,
+    "zeros": bytes(4096),
+    "TLS": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(64),
+    "header without end": b"GET / HTTP/1.1\r\nX: " + b"a" * 100_000 + b"\r\n\r\n",
+    "many headers": b"GET / HTTP/1.1\r\n" + b"X: 1\r\n" * 10_000 + b"\r\n",
+    "two lengths": b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\n"
+    b"Content-Length: 90\r\n\r\n" + START,
+    "length and pieces": b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n"
+    b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + START,
+    "address of another server": b"GET http://evil.example/ HTTP/1.1\r\n"
+    b"Host: evil.example\r\nConnection: close\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("data", GARBAGE.values(), ids=GARBAGE)
+def test_garbage_is_refused(served, hurried, data):
+    answer = served.send(data)
+    assert answer == b"" or answer.split()[1][:1] == b"4"
+
+
+READS = [
+    "/static/../_server.py",
+    "/static/%2e%2e/_server.py",
+    "/static/..%2f_server.py",
+    "/static/..%5c_server.py",
+    "/static//etc/passwd",
+    "/static/.",
+    "/../../etc/passwd",
+    "/api/sessions/../secret/file.mcap",
+    "/api/sessions/%2e%2e%2fsecret/file.mcap",
+    "/api/sessions/..%2Fsecret/file.mcap",
+    "/api/sessions/%2fetc%2fpasswd/file.mcap",
+    "/api/sessions/link/file.mcap",
+    "/api/sessions/link/file.mat",
+    "/api/sessions/link/look",
+    "/api/sessions/.hidden/file.mcap",
+    "/api/sessions/good%00/file.mcap",
+    "/api/sessions/good/file.py",
+    "/api/sessions/good/file...%2f..%2fsecret.mcap",
+    "/api/sessions/good/report/secret.html",
+    "/api/sessions/good/report/..%2f..%2fsecret.mcap",
+    "/api/sessions/good/report/%2e%2e",
+    "/api/campaign/campaign.report/secret.mcap",
+    "/api/campaign/..%2f/secret.mcap",
+    "/api/campaign/good.report/report.html",
+    "/api/sessions/" + "a" * 5000 + "/file.mcap",
+]
+
+
+@pytest.mark.parametrize("target", READS)
+def test_no_file_is_read_but_the_sessions_own(served, target):
+    status, _, body = served.ask("GET", target)
+    assert status in (400, 404)
+    assert SECRET not in body
+    assert b"root:" not in body
+    assert b"import" not in body
+
+
+def test_the_overlay_reads_no_other_files(served):
+    for ids in ("..%2fsecret", "link", ",".join(["good"] * 20)):
+        status, _, body = served.ask("GET", f"/api/frf?ids={ids}")
+        assert SECRET not in body
+        assert status in (200, 400, 404)
+
+
+def test_absurd_pages_of_the_list_are_refused(served):
+    for query in ("limit=-1", "limit=1e9", "offset=x", "limit=99999999999"):
+        assert served.ask("GET", f"/api/sessions?{query}")[0] == 400
+
+
+def test_reports_and_campaigns_ask_for_the_token_and_for_sessions(served):
+    ids = json.dumps({"ids": ["good", "link"]}).encode()
+    for target in ("/api/sessions/good/report", "/api/campaign"):
+        assert served.ask("POST", target, without("Authorization"), ids)[0] == 403
+    assert served.ask("POST", "/api/sessions/..%2fsecret/report", RIGHT, b"{}")[0] == 404
+    for ids in (["good", "../secret"], ["good", "link"], ["good", "--jobs"], "good", ["good", 1]):
+        body = json.dumps({"ids": ids}).encode()
+        assert served.ask("POST", "/api/campaign", RIGHT, body)[0] in (400, 404)
+
+
+def handshake(**headers):
+    key = base64.b64encode(os.urandom(16)).decode()
+    return {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": key,
+    } | headers
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://localhost:1"},
+        {"Host": "evil.example"},
+    ],
+    ids=str,
+)
+def test_no_other_page_reads_the_live_signals(served, headers):
+    status, _, _ = served.ask("GET", "/api/live", handshake(**headers, Connection="close, Upgrade"))
+    assert status == 403
+
+
+def test_a_page_that_says_something_is_let_go(served):
+    lines = [f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{served.port}"]
+    lines += [f"{name}: {value}" for name, value in handshake().items()]
+    # A frame of 16 MB, as far as its head says.
+    frame = b"\x82\xff" + (1 << 24).to_bytes(8, "big") + b"mask" + b"x" * 100_000
+    answer = served.send("\r\n".join(lines).encode() + b"\r\n\r\n" + frame)
+    assert b" 101 " in answer
+
+
+def test_who_says_nothing_or_half_is_let_go(served, hurried):
+    half = b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nX-Rigd: 1\r\n"
+    for said in (b"", b"GET / HT", half):
+        with served.connect() as link:
+            link.sendall(said)
+            assert link.recv(1) == b""
+    body = half + b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+    assert b" 408 " in served.send(body)
+
+
+def test_more_connections_than_are_served_are_turned_away(served, hurried):
+    links = [served.connect() for _ in range(150)]
+    for link in links:
+        assert link.recv(1) == b""  # at once, or because they say nothing
+        link.close()

@@ -1,0 +1,177 @@
+"""Sessions on the page: rows, looks, downloads, reports, and the jobs that make them."""
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from processes import eventually
+from web_daemon import TOKEN
+
+from rigd.web import _jobs
+from rigd.web._jobs import JobError, Jobs
+
+ACTING = {
+    "Authorization": f"Bearer {TOKEN}",
+    "X-Rigd": "1",
+    "Content-Type": "application/json",
+}
+
+
+@pytest.fixture
+def two(served, record_briefly, write_look):
+    """Two sessions, of which one has a quick look and a report."""
+    for name, specimen in (("first", "antenna"), ("second", "")):
+        record_briefly(name, day=float(name == "second"), specimen=specimen).replace(
+            served.folder / f"{name}.mcap"
+        )
+    response = {"frequency_hz": [1.0], "magnitude": [2.0], "phase_rad": [0.0], "coherence": [1.0]}
+    look = {"version": 1, "specimen": "antenna", "modes": [], "response": response}
+    (served.folder / "first.look.json").write_text(json.dumps(look))
+    report = served.folder / "first.report"
+    report.mkdir(exist_ok=True)
+    (report / "report.html").write_text("<style>p {}</style><p>A report")
+    (report / "fits.csv").write_text("a,b")
+    return response
+
+
+def get(served, target):
+    status, head, body = served.ask("GET", target)
+    return status, head, json.loads(body) if "application/json" in head else body
+
+
+def test_the_rows_are_the_librarys(served, two):
+    _, _, found = get(served, "/api/sessions?excitation=chirp")
+    assert found["total"] == 2
+    assert [row["id"] for row in found["sessions"]] == ["second", "first"]
+    _, _, found = get(served, "/api/sessions?specimen=antenna")
+    assert [row["id"] for row in found["sessions"]] == ["first"]
+    assert found["sessions"][0]["missed"] == 7
+    _, _, found = get(served, "/api/sessions?limit=1&offset=1")
+    assert (found["total"], [row["id"] for row in found["sessions"]]) == (2, ["first"])
+
+
+def test_files_looks_reports_and_responses_are_served(served, two):
+    status, head, body = get(served, "/api/sessions/first/file.mcap")
+    assert (status, body) == (200, (served.folder / "first.mcap").read_bytes())
+    assert 'attachment; filename="first.mcap"' in head
+    assert get(served, "/api/sessions/first/look")[2]["response"] == two
+    assert get(served, "/api/sessions/second/look")[0] == 404
+    status, head, body = get(served, "/api/sessions/first/report/")
+    assert (status, body[-8:]) == (200, b"A report")
+    assert "sandbox" in head
+    assert "script-src" not in head.replace("default-src 'none'", "")
+    assert get(served, "/api/sessions/first/report/fits.csv")[2] == b"a,b"
+    assert get(served, "/api/sessions/second/report/")[0] == 404
+    _, _, overlay = get(served, "/api/frf?ids=first,second")
+    assert overlay["responses"] == [{"id": "first", "specimen": "antenna", **two}]
+    assert "second" in overlay["errors"][0]
+
+
+def test_another_format_is_made_and_sent(served, two):
+    assert eventually(lambda: not served.server._jobs.paused)
+    status, head, body = get(served, "/api/sessions/first/file.mat")
+    assert (status, body[:6]) == (200, b"MATLAB"), body
+    assert 'filename="first.mat"' in head
+
+
+@pytest.fixture
+def jobs(tmp_path, monkeypatch):
+    """Jobs whose program runs the Python code it is given."""
+    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c"))
+    monkeypatch.setattr(_jobs, "_LOOK_S", 0.02)
+    told = []
+    jobs = Jobs(tmp_path, told.append)
+    jobs.told = told
+    return jobs
+
+
+def run(jobs, scenario):
+    async def whole():
+        running = asyncio.create_task(jobs.run())
+        try:
+            return await asyncio.wait_for(scenario(), 60.0)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    return asyncio.run(whole())
+
+
+def state_of(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "gone"
+
+
+def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
+    program = (
+        "import os, pathlib, time\n"
+        "while os.sched_getscheduler(0) != os.SCHED_IDLE: time.sleep(0.01)\n"
+        "pathlib.Path('pid').write_text(f'{os.getpid()} {os.getpriority(os.PRIO_PROCESS, 0)}')\n"
+        "time.sleep(600)"
+    )
+
+    async def wait_for(condition):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+    async def scenario():
+        job = jobs.put("report", [program], "a")
+        await asyncio.sleep(0.1)
+        assert not (tmp_path / "pid").exists()  # it has not begun
+        jobs.paused = False
+        await wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+        pid, niceness = map(int, (tmp_path / "pid").read_text().split())
+        jobs.paused = True
+        await wait_for(lambda: state_of(pid) == "T")
+        jobs.paused = False
+        await wait_for(lambda: state_of(pid) == "S")
+        assert job.state == "running"
+        return pid, niceness
+
+    pid, niceness = run(jobs, scenario)
+    assert niceness == 19
+    assert eventually(lambda: state_of(pid) in ("Z", "gone"))  # it has ended with the server
+
+
+def test_what_became_of_a_job_is_told(jobs):
+    async def scenario():
+        jobs.paused = False
+        done = jobs.put("campaign", ["pass"], address="/api/campaign/x/")
+        failed = jobs.put("report", ["import sys; sys.exit('too short')"], "b", "/there")
+        await failed.done.wait()
+        assert done.done.is_set()
+
+    run(jobs, scenario)
+    last = {told["number"]: told for told in jobs.told}
+    assert (last[1]["state"], last[1]["address"]) == ("done", "/api/campaign/x/")
+    assert (last[2]["state"], last[2]["address"]) == ("failed", "")
+    assert last[2]["error"] == "The report was not made: too short"
+
+
+def test_only_so_many_jobs_wait(jobs):
+    async def scenario():
+        for _ in range(_jobs.MOST_JOBS + 1):
+            await asyncio.sleep(0)
+            jobs.put("report", ["pass"])
+        with pytest.raises(JobError):
+            jobs.put("report", ["pass"])
+
+    run(jobs, scenario)
+
+
+def test_a_report_and_a_campaign_are_queued_with_the_token(served, two, monkeypatch):
+    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", "pass"))
+    told = []
+    monkeypatch.setattr(served.server._jobs, "_tell", told.append)
+    status, _, body = served.ask("POST", "/api/sessions/first/report", ACTING, b"{}")
+    assert (status, json.loads(body)["ok"]) == (202, True)
+    ids = json.dumps({"ids": ["first", "second"]}).encode()
+    assert served.ask("POST", "/api/campaign", ACTING, ids)[0] == 202
+    assert eventually(lambda: [job["kind"] for job in told if job["state"] == "done"] == BOTH)
+
+
+BOTH = ["report", "campaign"]

@@ -1,0 +1,208 @@
+"""The page's server in front of a daemon: what pages are told, and what is passed on."""
+
+import asyncio
+import base64
+import json
+import time
+
+import aiohttp
+import numpy as np
+import pytest
+from web_daemon import TOKEN
+
+from rigd.web import _live
+
+ACTING = {
+    "Authorization": f"Bearer {TOKEN}",
+    "X-Rigd": "1",
+    "Content-Type": "application/json",
+}
+
+
+class Pages:
+    """A browser's part, in an event loop of this thread."""
+
+    def __init__(self, served):
+        self.served = served
+        self.base = f"http://127.0.0.1:{served.port}/"
+
+    def run(self, scenario):
+        async def whole():
+            async with aiohttp.ClientSession(self.base) as session:
+                return await asyncio.wait_for(scenario(session), 60.0)
+
+        return asyncio.run(whole())
+
+
+@pytest.fixture
+def pages(served):
+    return Pages(served)
+
+
+async def until(socket, kind, **members):
+    """Wait for a message of a type; returns it with all that came before."""
+    before = []
+    async for message in socket:
+        told = json.loads(message.data)
+        if told["type"] == kind and members.items() <= told.items():
+            return told, before
+        before.append(told)
+    raise AssertionError(f"closed before {kind}: {before}")
+
+
+async def command(session, headers=ACTING, **request):
+    async with session.post("/api/command", data=json.dumps(request), headers=headers) as answer:
+        return answer.status, await answer.json()
+
+
+def test_a_page_that_opens_is_told_of_rig_state_and_model(pages):
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            _, before = await until(socket, "nominal")
+            return before
+
+    hello, *_ = before = pages.run(scenario)
+    assert [each["type"] for each in before][:2] == ["hello", "status"]
+    assert hello["profile"] == "sim"
+    assert hello["limits"]["angle_rad"] == 1.57
+    chirp = {option["name"]: option for option in hello["excitations"]["chirp"]}
+    assert chirp["amplitude_rad"] == {
+        "name": "amplitude_rad", "unit": "rad", "default": 0.025, "help": "Amplitude A.",
+    }  # fmt: skip
+    assert all(option["help"] for kind in hello["excitations"].values() for option in kind)
+    assert set(hello["excitations"]) == {"chirp", "hold", "step", "multisine", "file", "modes"}
+
+
+@pytest.mark.parametrize(
+    ("reply", "status"),
+    [
+        ({}, 200),
+        ({"ok": False, "error": "no", "wrong_use": True}, 400),
+        ({"ok": False, "error": "later", "wrong_use": False}, 409),
+    ],
+)
+def test_requests_are_passed_on_and_answered_as_the_daemon_does(served, pages, reply, status):
+    served.daemon.replies["tare"] = reply
+
+    async def scenario(session):
+        return await command(session, command="tare", id=3)
+
+    assert pages.run(scenario) == (status, {"reply": "tare", "ok": True} | reply)
+    assert {"command": "tare", "id": 3} in served.daemon.acted
+
+
+def test_a_stop_and_a_prediction_need_no_token(served, pages):
+    served.daemon.replies["stop"] = {"stopping": True}
+    plain = {name: value for name, value in ACTING.items() if name != "Authorization"}
+
+    async def scenario(session):
+        return (
+            await command(session, plain, command="stop"),
+            await command(session, plain, command="predict", excitation="hold"),
+        )
+
+    (stopped, told), (predicted, _) = pages.run(scenario)
+    assert (stopped, predicted) == (200, 200)
+    assert told["stopping"]
+
+
+def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served, pages):
+    angle = base64.b64encode(np.full(100, 0.5, dtype="<f4").tobytes()).decode()
+    gauges = {"angle": {"value": 0.5, "limit": 1.0, "unit": "rad", "fraction": 0.5}}
+    signals = {
+        "event": "signals", "first_tick": 0, "count": 100, "rate_hz": 1000.0, "t_ns": 0,
+        "angle_rad": angle, "angle_reference_rad": angle, "coupling_torque_nm": angle,
+        "gauges": gauges, "frequency_hz": 3.0,
+    }  # fmt: skip
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            served.call(served.daemon.publish, signals)
+            strip, _ = await until(socket, "strip")
+            told, _ = await until(socket, "gauges")
+            level = {"event": "message", "level": "warning", "text": "Hot."}
+            served.call(served.daemon.publish, level)
+            event, _ = await until(socket, "event")
+            transition = {"from": "ready", "to": "running", "reason": "r", "utc_ns": 5}
+            served.call(served.daemon.publish, {"event": "state", **transition})
+            state, _ = await until(socket, "state")
+        async with session.ws_connect("/api/live") as socket:  # a page that is opened later
+            again, before = await until(socket, "event")
+            return strip, told, event, state, again, before
+
+    strip, told, event, state, again, before = pages.run(scenario)
+    assert strip["angle_max"] == [0.5, 0.5]
+    assert (told["angle"], told["frequency_hz"]) == (gauges["angle"], 3.0)
+    assert abs(event["utc_ns"] * 1e-9 - time.time()) < 30.0
+    assert (event["level"], event["text"]) == ("warning", "Hot.")
+    assert state == {"type": "state", "from": "ready", "to": "running", "reason": "r", "utc_ns": 5}
+    assert again == event
+    assert strip in before
+
+
+def test_a_daemon_that_falls_silent_or_goes_is_told_within_a_second(served, pages):
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            began_s = time.monotonic()
+            served.daemon.silent = True
+            lost, _ = await until(socket, "lost")
+            took_s = time.monotonic() - began_s
+            served.daemon.silent = False
+            await until(socket, "status")
+            began_s = time.monotonic()
+            for writer in served.daemon.watchers:
+                served.call(writer.close)
+            gone, _ = await until(socket, "lost")
+            gone_s = time.monotonic() - began_s
+            await until(socket, "status")
+            return lost, took_s, gone, gone_s
+
+    lost, took_s, gone, gone_s = pages.run(scenario)
+    assert "has said nothing" in lost["reason"]
+    assert "rigd serve" in gone["reason"]
+    assert took_s < 1.5
+    assert gone_s < 1.0
+
+
+def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(served, pages, monkeypatch):
+    monkeypatch.setattr(_live, "_MOST_WAITING", 20)
+    stopped = served.connect()
+    stopped.sendall(
+        f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nConnection: Upgrade\r\n"
+        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+    )
+    assert b" 101 " in stopped.recv(1000)
+    long = {"event": "message", "level": "info", "text": "x" * 50_000}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            assert len(served.server.pages) == 2
+            for _ in range(200):
+                served.call(served.daemon.publish, long)
+                await until(socket, "event", text=long["text"])
+                if len(served.server.pages) == 1:
+                    return True
+        return False
+
+    try:
+        assert pages.run(scenario)
+    finally:
+        stopped.close()
+        served.server.pages._events.clear()
+
+
+def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
+    monkeypatch.setattr(_live, "MOST_PAGES", 1)
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+                await session.ws_connect("/api/live")
+            return refusal.value.status
+
+    assert pages.run(scenario) == 503
