@@ -267,18 +267,22 @@ class Service:
         while True:
             at_work = self.state in (State.RUNNING, State.STOPPING)
             await asyncio.sleep(_SIGNALS_S if at_work else LOOK_S)
-            if not self._signal_watchers:
-                continue
-            series = self._series
-            planned = series.planned if series is not None and series.running else None
-            for block in self._rig.signals():
-                self._publish(
-                    signals_document(
-                        block,
-                        self._profile.rig.rate_hz,
-                        None if planned is None else planned.frequency_hz(block.last_tick),
-                    )
+            self._publish_signals()
+
+    def _publish_signals(self) -> None:
+        """Publish what has come of the signals, if anybody wants them."""
+        if not self._signal_watchers:
+            return
+        series = self._series
+        planned = series.planned if series is not None and series.running else None
+        for block in self._rig.signals():
+            self._publish(
+                signals_document(
+                    block,
+                    self._profile.rig.rate_hz,
+                    None if planned is None else planned.frequency_hz(block.last_tick),
                 )
+            )
 
     async def close(self, reason: str) -> None:
         """End a running session safely and let the rig go."""
@@ -617,6 +621,10 @@ class Service:
                     fault = last.reason
         if not self._rig.connected:
             fault = fault or series.reason or "The connection to the devices is lost."
+        try:
+            self._publish_signals()  # the last ones come before the end is told
+        except Exception:
+            _log.exception("the last signals could not be told")
         series.running = False
         series.failed = bool(fault or (series.reason and not series.stop.requested))
         self._states.move(*_after(series, fault))

@@ -19,6 +19,7 @@ from rigd.daemon import _server as server
 from rigd.daemon._address import AddressError, UnknownGroupError, bind, find, running, socket_path
 from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.daemon._states import Peer, State
+from rigd.runner import _signals
 from rigd.runtime import answers
 
 LONG = {
@@ -374,7 +375,9 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
         assert isinstance(find("one"), Path)
 
 
-def test_signals_go_to_those_who_asked_for_them(served):
+def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
+    monkeypatch.setattr(_signals, "_ABANDONED_S", 1e9)  # however slow the computer is
+
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.tell_signals())
         plain, watcher = await served.connect(), await served.connect()

@@ -360,6 +360,14 @@ def test_what_nobody_foresaw_ends_with_everything_off(operated, monkeypatch):
     assert "ZeroDivisionError" in operated.last["reason"]
 
 
+def test_signals_that_cannot_be_told_do_not_keep_a_session_from_its_end(operated, monkeypatch):
+    monkeypatch.setattr(operated.rig, "signals", lambda: 1 / 0)
+    operated.service._signal_watchers.add(operated.peer)
+    operated.ask("start", **SHORT)
+    assert operated.state is State.READY
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
 def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate, monkeypatch):
     def break_(*_, **__):
         raise ZeroDivisionError
