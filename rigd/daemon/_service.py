@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon import aside
+from rigd.daemon import background
 from rigd.daemon._log import NAME
 from rigd.daemon._states import (
     Document,
@@ -447,7 +447,7 @@ class Service:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are being made; try again in a moment.")
-        job = aside.PredictionJob(
+        job = background.PredictionJob(
             self._profile,
             request.excitation,
             request.parameters,
@@ -457,7 +457,7 @@ class Service:
         self._predictions += 1
         try:
             async with self._predicting:
-                return await _aside(job)
+                return await _in_background(job)
         finally:
             self._predictions -= 1
 
@@ -470,7 +470,7 @@ class Service:
         self._refuse_if_busy()
         self._doing = "check"
         try:
-            told = await _aside(aside.CheckJob(self._profile, self._rig.calibration))
+            told = await _in_background(background.CheckJob(self._profile, self._rig.calibration))
         finally:
             self._doing = ""
         self._last_check = {"utc_ns": time.time_ns(), "verdict": told["verdict"]}
@@ -546,18 +546,18 @@ class Service:
             moving = self._moving()
             if moving is not self._began_moving:
                 raise RigError(
-                    f"What would move now is {moving.value}, and it was {self._began_moving.value} "
-                    "when the daemon was started; stop the daemon and start it anew if that is "
-                    "meant."
+                    f"{moving.value.capitalize()} would move now, where it was "
+                    f"{self._began_moving.value} when the daemon was started; restart the daemon "
+                    "if that is intended."
                 )
             await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
         except RigError as error:
             self._fail_again(str(error), fault)
             raise CommandError(str(error)) from None
         except Exception as error:
-            _log.exception("the rig could not be connected, in a way that was not foreseen")
+            _log.exception("unexpected error while the rig was being connected")
             await self._let_go()
-            reason = f"The rig could not be connected, in an unforeseen way ({error!r})."
+            reason = f"The rig could not be connected: unexpected error ({error!r})."
             self._fail_again(reason, fault)
             raise CommandError(reason) from None
         if self._closing:
@@ -606,8 +606,8 @@ class Service:
                 fault = series.reason = f"{error} {what_is_kept(path)}"
         except Exception as error:
             # Nobody may be left to switch off: what cannot be explained ends with everything off.
-            _log.exception("a session ended in a way that was not foreseen")
-            fault = series.reason = f"The session failed in an unforeseen way ({error!r})."
+            _log.exception("unexpected error in a session")
+            fault = series.reason = f"The session failed: unexpected error ({error!r})."
             await self._let_go()
         else:
             last = series.results[-1] if series.results else None
@@ -627,7 +627,7 @@ class Service:
         try:
             await self._call(self._rig.disconnect)
         except Exception:
-            _log.exception("the rig could not be let go")
+            _log.exception("the rig could not be disconnected")
 
     def _run_series(
         self, series: ServedSeries, planned: Series, loop: asyncio.AbstractEventLoop
@@ -702,11 +702,11 @@ class Service:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
 
 
-async def _aside(job: aside.PredictionJob | aside.CheckJob) -> Document:
+async def _in_background(job: background.PredictionJob | background.CheckJob) -> Document:
     """Have a job done in a process of its own."""
     try:
-        return await aside.perform(job)
-    except aside.AsideError as error:
+        return await background.perform(job)
+    except background.BackgroundError as error:
         raise CommandError(str(error), wrong_use=error.wrong_use) from None
 
 
@@ -736,6 +736,7 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
+        line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
@@ -743,8 +744,10 @@ class _Told:
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result_line(result.as_dict()),
+            line,
         )
+        # For lists of events, in the words of the terminal.
+        self._publish({"event": "message", "level": "info", "text": line})
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 
     def _tell(self, level: str, text: str) -> None:
