@@ -129,7 +129,19 @@ def send_columns(
     t_ns: npt.NDArray[np.int64],
     columns: Mapping[str, Values],
 ) -> None:
-    """Send values (n, k) by component, which were at times (n,) of the session, to an entity."""
+    """Send values to an entity.
+
+    Parameters
+    ----------
+    stream
+        Recording to send to.
+    entity
+        Entity path in Rerun.
+    t_ns
+        Times of the session, shape (n,).
+    columns
+        Values by component, shape (n, k) each.
+    """
     import rerun as rr
 
     time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
