@@ -39,9 +39,9 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     columns = min(len(types), 4 if len(types) > 6 else 3)
     rows = -(-len(types) // columns)
     legend_rows = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
-    width_in = max(4.4 * columns, 10.0)
+    width_in = max(3.2 * columns, 8.0)
     head_in = 1.0 + 0.2 * legend_rows
-    height_in = 3.75 * rows + 1.15 + head_in
+    height_in = 2.9 * rows + 1.0 + head_in
     figure = style.new_figure(
         width_in, height_in, "Frequency response by Welch's method",
         f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 _BAND: Final = "#C3DCED"
-"""Of an interval: the blue of the pooled line, but light and opaque."""
+"""Colour of intervals: the blue of the pooled line, but light and opaque."""
 _SESSION: Final = "#A8A8A8"
 _POINTS: Final = 400
 _COLUMNS: Final = 1500

@@ -338,7 +338,7 @@ class Lines:
     title
         Title of the view, with the unit.
     names, colors, widths
-        Of each line, from the lowest to the topmost.
+        Look of each line, from the lowest to the topmost.
     values
         Makes of the torque the lines' values (n, lines).
     """

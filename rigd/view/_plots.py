@@ -134,13 +134,13 @@ def send_columns(
     Parameters
     ----------
     stream
-        Recording to send to.
+        Takes them.
     entity
         Entity path in Rerun.
     t_ns
-        Times of the session, shape (n,).
+        (n,) times since the start of the session.
     columns
-        Values by component, shape (n, k) each.
+        Values (n, k) at these times, by component.
     """
     import rerun as rr
 

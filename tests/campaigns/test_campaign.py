@@ -133,7 +133,9 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert len(content["errors"]) == 2
     assert len(content["sessions_welch"]) == len(found.sessions) * 4
     page = (tmp_path / "report.html").read_text()
-    assert page.index("type VI: damping") < page.index("<figure") < page.index('id="table3"')
+    assert (
+        page.index("type VI: internal damping") < page.index("<figure") < page.index('id="table3"')
+    )
     assert "torn.mcap" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     text = (tmp_path / "tables.txt").read_text()
@@ -161,7 +163,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     )
     assert not found.homogeneity.mixed
     assert any("No between-session variance" in sentence for sentence in verdict.sentences)
-    assert "\nThe numbers are those of type VI: damping" in campaign_text(found)
+    assert "\nThe numbers are those of type VI: internal" in campaign_text(found)
     document = campaign_document(found)
     assert document["verdict"]["structure"] == "III"
     *each, shared = document["headlines"]

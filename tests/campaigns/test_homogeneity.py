@@ -151,7 +151,7 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     assert "in 2 files (0.mcap, 1.mcap)" in where
     assert "in 2 files (stiff20.mcap, stiff21.mcap)" in where
     assert structure.startswith("The numbers are those of type VI")
-    assert "type III has the lowest BIC" in structure
+    assert "Type III has the lowest BIC" in structure
     assert not any("No between-session variance" in each for each in mixture.verdict.sentences)
     assert campaign_text(mixture).startswith("The files are not of one specimen")
 
@@ -193,7 +193,7 @@ def test_page_and_json_tell_it_too(mixture):
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
     page = campaign_page(mixture, (), datetime.now(UTC), with_paper=False)
-    assert page.index("The files are not of one specimen") < page.index("type VI: damping")
+    assert page.index("The files are not of one specimen") < page.index("type VI: internal damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page
         assert content[name]

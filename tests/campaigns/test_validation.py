@@ -11,6 +11,7 @@ import pytest
 from analysis.campaigns import CampaignError, campaign
 from analysis.campaigns._validation import LostTrial, left_out_errors, validate
 from analysis.cli.campaign import campaign_command
+from analysis.cli.sessions import Outputs
 from analysis.identify import BAND_HZ
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_figures import validation_figure
@@ -84,7 +85,8 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
     monkeypatch.setattr("analysis.report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
-    code = campaign_command(paths, shaken.settings, structures=("III",), report=tmp_path / "new")
+    outputs = Outputs(report=tmp_path / "new")
+    code = campaign_command(paths, shaken.settings, outputs, structures=("III",))
     assert code == 1
     assert "1.mcap is not predicted from the others: its worker" in capsys.readouterr().err
 

@@ -144,8 +144,8 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_o
     both = ranked(six, seven)
     found = campaign_verdict(sessions, both, ALIKE, (), ())
     assert (found.headline, found.structure) == ("VI", "VII")
-    assert found.sentences[0].startswith("The numbers are those of type VI: damping by the mat")
-    assert "type VII has the lowest BIC" in found.sentences[0]
+    assert found.sentences[0].startswith("The numbers are those of type VI: internal damping (")
+    assert "Type VII has the lowest BIC" in found.sentences[0]
     assert found.alpha.value == pytest.approx(0.996)
     # Not if it is of two sessions where the other is of all.
     few = replace(pooled(six), sessions=2)
@@ -155,7 +155,7 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_o
 def test_damping_that_no_session_needs_is_absent(estimates_of):
     order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4, ALIKE)
     assert (order.status, order.value) == ("absent", None)
-    assert "No external damping shows" in sentences.order(order)
+    assert "No external damping was found" in sentences.order(order)
 
 
 def delay(value):
@@ -202,7 +202,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
     assert found.alone == {"VI": 3, "VII": 1}
     ((name, structure, margin),) = [(d.file, d.structure, d.margin) for d in found.dissent]
     assert (name, structure, margin) == ("2.mcap", "VII", 30.0)
-    (told,) = (s for s in found.sentences if "dismissed" in s)
+    (told,) = (s for s in found.sentences if "is excluded by" in s)
     assert "2.mcap (type VII)" in told
     assert found.experiments == ("Sweep longer.",)
     assert campaign_verdict(sessions, (), ALIKE, (), ()) is None
@@ -212,6 +212,6 @@ def test_words_about_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
     assert "No between-session variance" in sentences.scatter(best)
     shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
-    assert "differ by more than their own uncertainties in ζ" in sentences.scatter(shaken)
-    assert "no structure tried" in sentences.left_over(replace(best, misfit=9.0), 4, 4)
+    assert "Between-session variance in ζ" in sentences.scatter(shaken)
+    assert "no structure fitted" in sentences.left_over(replace(best, misfit=9.0), 4, 4)
     assert "noise in 3 of 4 sessions" in sentences.left_over(best, 3, 4)

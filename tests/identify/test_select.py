@@ -75,8 +75,8 @@ def test_what_a_simpler_structure_gives_is_a_condition(type_iii):
     assert (simpler.name, simpler.fixed) == ("III", {"alpha": 1.0, "lambda": 1.0})
     assert simpler.parameters["zeta"].value == pytest.approx(0.54e-4, rel=0.02)
     assert simpler.parameters["zeta"].std < 0.5 * type_iii.headline.parameters["zeta"].std
-    (said,) = [each for each in type_iii.verdict.sentences if "only if" in each]
-    assert said.startswith("Alpha = 1 and lambda = 1 are not excluded (type III)")
+    (said,) = [each for each in type_iii.verdict.sentences if "if true" in each]
+    assert said.startswith("Alpha = 1 and lambda = 1 are not excluded; if true (type III)")
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def test_what_cannot_be_told_apart_is_said(one_mode):
     assert list(verdict.rivals) == close
     status = dict(one_mode.headline.structures)
     assert all(status[name] in ("compatible", "selected") for name in close)
-    assert "does not tell damping of the material" in verdict.sentences[0]
+    assert "does not separate internal from external damping" in verdict.sentences[0]
 
 
 def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, stiffening):

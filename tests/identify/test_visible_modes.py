@@ -77,6 +77,6 @@ def test_a_sweep_that_covered_the_mode_is_to_be_louder_not_wider(sessions):
     field = SimpleNamespace(comparison=analysis.comparison, best=best)
     unknown = SimpleNamespace(order="alpha", status="not identifiable")
     (said,) = experiments(field, (unknown,), (1,), (), ())
-    assert "sweep louder" in said
-    assert "not wider" in said
+    assert "increase the amplitude" in said
+    assert "a wider band does not help" in said
     assert "sweep up to" not in said
