@@ -56,7 +56,7 @@ def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexVa
     -------
     welch, whole_record : dict
         ``mse`` and ``wmse`` in (N·m/rad)², ``md`` in N·m/rad: against Welch's estimate, on the
-        bins of the paper's fits, and against the ratio of the whole record's transforms.
+        bins of the paper's fits, and against the empirical transfer function estimate.
     """
     record = welch.record
     # Of the responses the delay that the file states has been taken out.
@@ -243,7 +243,7 @@ def document(
     Parameters
     ----------
     results : sequence of RecordResult
-        The entries of whole records follow those of the Welch fits.
+        The entries of whole records follow those of the Welch method.
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
 

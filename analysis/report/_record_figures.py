@@ -69,7 +69,7 @@ def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
     Parameters
     ----------
     measured : FrequencyResponse
-        Ratio of the whole record's transforms, with the delay between the channels in it.
+        Empirical transfer function estimate, with the delay between the channels in it.
     fit : RecordFit
     """
     first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
@@ -469,7 +469,7 @@ def _loss_description(whole: WholeRecord) -> str:
 
 
 def measured_response(whole: WholeRecord) -> FrequencyResponse:
-    """Ratio of the whole record's transforms, from well below the first mode to the band's end.
+    """Empirical transfer function estimate, from well below the first mode to the band's end.
 
     The delay between the channels is still in it.
     """

@@ -6,8 +6,6 @@ import hashlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from markupsafe import Markup
-
 from analysis.models import ESTIMATOR_WORDS
 from analysis.report._equation import definitions, equations, mathml, types_table
 from analysis.report._page import page, versions
@@ -68,7 +66,7 @@ def record_page(
         experiments=whole.verdict.experiments,
         warnings=result.warnings,
         pictures=pictures,
-        equations=[Markup(mathml(each)) for each in equations(whole)],
+        equations=[mathml(each) for each in equations(whole)],
         definitions=definitions(whole),
         types=types_table(whole),
         modes=modes,

@@ -159,11 +159,11 @@ def condition_table(whole: WholeRecord) -> Table | None:
         )
     return Table.of(
         "on_condition",
-        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which suffices",
+        f"If {taken or 'the rest'} is assumed: type {simpler.name} (sufficient)",
         (
             Column("Parameter", "parameter", WORDS),
             Column("Unit", "unit", WORDS),
-            Column("Then", "value"),
+            Column("Assumed", "value"),
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
             Column("Free", "free_value"),
@@ -171,7 +171,7 @@ def condition_table(whole: WholeRecord) -> Table | None:
             Column("to", "free_high_95"),
         ),
         rows,
-        ("The intervals on the left hold only if what is taken for granted is true.",),
+        ("The intervals on the left hold only if the assumption is true.",),
     )
 
 

@@ -63,7 +63,7 @@ def _write_page(
 
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
-    """Make the table of modes, those of the whole-record fits, and those of the Welch fits."""
+    """Make the table of modes, those of the whole-record fits, and those of the Welch method."""
     whole, welch = result.whole, result.welch
     assert whole is not None
     condition = tables.condition_table(whole)

@@ -90,7 +90,7 @@ class Client:
     path
         Path of the socket.
     connect_s
-        Time for a daemon that takes no connections, being suspended or beset by others.
+        Time for a daemon that takes no connections, being suspended or overloaded by other clients.
     answer_s
         Time for a reply.
 
@@ -130,7 +130,7 @@ class Client:
             link.close()
             raise DaemonGoneError(
                 f"The daemon on {self._path} takes no connection within {self._connect_s:g} s: "
-                f"it is suspended, or beset by others. {_UNKNOWN}"
+                f"it is suspended, or overloaded by other clients. {_UNKNOWN}"
             ) from None
         except OSError as error:
             link.close()

@@ -431,8 +431,8 @@ async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
     except CommandError as error:
         return _refusal(request.id, str(error), command=request.command, wrong_use=error.wrong_use)
     except Exception as error:
-        _log.exception("a request was not foreseen")
-        text = f"The daemon failed in an unforeseen way ({error!r}); its log says more."
+        _log.exception("unexpected error in a request")
+        text = f"Unexpected error in the daemon ({error!r}); its log says more."
         return _refusal(request.id, text, command=request.command, wrong_use=False)
     told = {"reply": request.command, "ok": True, **told}
     return told if request.id is None else told | {"id": request.id}

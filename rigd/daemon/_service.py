@@ -546,18 +546,18 @@ class Service:
             moving = self._moving()
             if moving is not self._began_moving:
                 raise RigError(
-                    f"What would move now is {moving.value}, and it was {self._began_moving.value} "
-                    "when the daemon was started; stop the daemon and start it anew if that is "
-                    "meant."
+                    f"{moving.value.capitalize()} would move now, where it was "
+                    f"{self._began_moving.value} when the daemon was started; restart the daemon "
+                    "if that is intended."
                 )
             await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
         except RigError as error:
             self._fail_again(str(error), fault)
             raise CommandError(str(error)) from None
         except Exception as error:
-            _log.exception("the rig could not be connected, in a way that was not foreseen")
+            _log.exception("unexpected error while the rig was being connected")
             await self._let_go()
-            reason = f"The rig could not be connected, in an unforeseen way ({error!r})."
+            reason = f"The rig could not be connected: unexpected error ({error!r})."
             self._fail_again(reason, fault)
             raise CommandError(reason) from None
         if self._closing:
@@ -606,8 +606,8 @@ class Service:
                 fault = series.reason = f"{error} {what_is_kept(path)}"
         except Exception as error:
             # Nobody may be left to switch off: what cannot be explained ends with everything off.
-            _log.exception("a session ended in a way that was not foreseen")
-            fault = series.reason = f"The session failed in an unforeseen way ({error!r})."
+            _log.exception("unexpected error in a session")
+            fault = series.reason = f"The session failed: unexpected error ({error!r})."
             await self._let_go()
         else:
             last = series.results[-1] if series.results else None
@@ -627,7 +627,7 @@ class Service:
         try:
             await self._call(self._rig.disconnect)
         except Exception:
-            _log.exception("the rig could not be let go")
+            _log.exception("the rig could not be disconnected")
 
     def _run_series(
         self, series: ServedSeries, planned: Series, loop: asyncio.AbstractEventLoop
@@ -736,6 +736,7 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
+        line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
@@ -743,8 +744,10 @@ class _Told:
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result_line(result.as_dict()),
+            line,
         )
+        # For lists of events, in the words of the terminal.
+        self._publish({"event": "message", "level": "info", "text": line})
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 
     def _tell(self, level: str, text: str) -> None:

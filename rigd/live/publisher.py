@@ -33,7 +33,9 @@ from rigd.live._feed import Feed
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown
 from rigd.live._server import Outlet
+from rigd.printable import printable
 from rigd.runtime import ignore as ignore_signals
+from rigd.session import look_path
 from rigd.view import (
     RETURNING,
     RUNNING,
@@ -200,6 +202,8 @@ class _Shown:
         self._vitals = Vitals(channels)
         self._states = StateWatch(channels)
         self._unsent = 0
+        folder, name = session.folder, session.subject.name
+        self._look = None if folder is None else look_path(folder / f"{name}.mcap")
 
     @property
     def dropped(self) -> int:
@@ -208,8 +212,9 @@ class _Shown:
         return self._dropped_before + here
 
     def gather(self) -> None:
-        """Take what has come, while the session lasts."""
+        """Take what has come, while the session lasts, and then the quick look at it."""
         if self.over:
+            self._take_look()
             return
         harvest = self.intake.take()
         drawings = harvest.drawings
@@ -245,6 +250,21 @@ class _Shown:
         # Behind all that waits, which says that the session goes on; nothing comes after it.
         self.backlog.put([*picture.finish(), *picture.state(t_ns, state)], 0)
         self.over = True
+        self._take_look()
+
+    def _take_look(self) -> None:
+        """Add the text of the quick look to the events, once there is one."""
+        if self._look is None:
+            return
+        try:
+            lines = [str(line) for line in json.loads(self._look.read_text("utf-8"))["text"]]
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError):
+            lines = []
+        self._look = None
+        picture, t_ns = self.intake.picture, self.intake.t_ns
+        self.backlog.owe(picture.events([Note(t_ns, "info", printable(line)) for line in lines]))
 
     def send(self, feed: Feed, *, connected: bool) -> None:
         """Send what waits; if newly `connected`, with the frame of the scene."""

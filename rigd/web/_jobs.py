@@ -22,7 +22,8 @@ MOST_JOBS: Final = 16
 """Jobs that may wait."""
 _PROGRAM: Final = (sys.executable, "-m", "analysis")
 _LOOK_S: Final = 0.2
-_MOST_SAID: Final = 4096
+_MOST_SAID: Final = 1000
+_MOST_LINES: Final = 3
 _LOWEST_PRIORITY: Final = 19
 
 
@@ -151,9 +152,9 @@ class Jobs:
                 _signal(process.pid, signal.SIGKILL)
                 await asyncio.wait((ending,))
         if process.returncode != 0:
-            words = said.decode(errors="replace").strip()[-_MOST_SAID:]
-            last = words.splitlines()[-1] if words else f"exit code {process.returncode}"
-            raise JobError(f"The {job.kind} was not made: {last}")
+            words = said.decode(errors="replace").strip()[-_MOST_SAID:].splitlines()[-_MOST_LINES:]
+            why = " ".join(words) or f"exit code {process.returncode}"
+            raise JobError(f"The {job.kind} was not made: {why}")
 
 
 def _give_way(pid: int) -> None:

@@ -254,7 +254,7 @@ def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
     operated.world.countdown, operated.world.then = 1200, fail
     operated.ask("start", **SHORT)
     operated.moving = WhatMoves.HARDWARE
-    assert "start it anew" in str(operated.ask("reset"))
+    assert "restart the daemon" in str(operated.ask("reset"))
     assert operated.state is State.FAULT
     assert len(operated.world.drives) == 1
 

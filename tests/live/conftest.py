@@ -140,12 +140,17 @@ class Publisher:
         if isinstance(self.answer, LiveAddress):
             self.show()
 
-    def show(self, name: str = "chirp under test", begins: tuple[int, ...] | None = None) -> None:
+    def show(
+        self,
+        name: str = "chirp under test",
+        begins: tuple[int, ...] | None = None,
+        folder: Path | None = None,
+    ) -> None:
         """Have it show a session; `begins` says how many records were written before it."""
         begins = begins or (0,) * len(TOPICS)
         ticks = 120_000
         subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3))
-        self.send(LiveSession(subject, f"recording of {name}", begins))
+        self.send(LiveSession(subject, f"recording of {name}", begins, folder))
         self._hear(LiveShown)
 
     def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:

@@ -1,5 +1,6 @@
 """The publisher as the supervisor sees it: one line, loopback only, and never in the way."""
 
+import json
 import os
 import signal
 import socket
@@ -92,6 +93,22 @@ def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
     assert dropped[-1, 1] == 0
     assert publisher.dropped == 0
     assert producer.refused == 0
+
+
+def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
+    publisher.show("looked at", folder=tmp_path)
+    saver = save(publisher.address)
+    assert eventually(saver.has_begun)
+    publisher.producer.stop()
+    publisher.finish()
+    look = {"text": ["Quick look at it", "  mode 1\x1b[31m"]}
+    (tmp_path / "looked at.look.json.new").write_text(json.dumps(look))
+    (tmp_path / "looked at.look.json.new").rename(tmp_path / "looked at.look.json")
+    time.sleep(1.5)  # it is looked for once a second
+    assert eventually(saver.has_all)
+    publisher.end()
+    _, lines = saver.recordings()["recording of looked at"]("/events", "TextLog:text")
+    assert lines.tolist()[-2:] == [["Quick look at it"], ["  mode 1?[31m"]]
 
 
 @pytest.mark.parametrize("at_once", [False, True])

@@ -282,7 +282,7 @@ def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
     told = replace(record_result.whole.headline, simpler=simpler)
     _modes, tables, _ = report_tables(retold(record_result, headline=told))
     (table,) = [table for table in tables if table.name == "on_condition"]
-    assert "If α = 1 is taken for granted: type VII" in table.caption
+    assert "If α = 1 is assumed: type VII" in table.caption
     row = {row["parameter"].text: row for row in table.rows}["ζ"]
     assert row["value"].value == record_result.whole.fits["VII"].parameters["zeta"]
     assert row["free_value"].value == record_result.whole.fits["VI"].parameters["zeta"]

@@ -1,0 +1,109 @@
+"""`rigd start` as it follows a series, by the events of a daemon that is none."""
+
+import pytest
+import typer
+
+from rigd.cli import start
+
+DONE = {
+    "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,
+    "recorded": 1200, "missed": 0, "late": 0, "lost": 0, "stale_angles": 0, "stale_wrenches": 0,
+}  # fmt: skip
+
+
+class Client:
+    """Has events to tell, and presses Ctrl-C where there is a number of times."""
+
+    def __init__(self, interrupts, *events):
+        self.interrupts = interrupts
+        self.events = list(events)
+        self.sent = []
+
+    def event(self, _timeout_s):
+        event = self.events.pop(0) if self.events else None
+        if isinstance(event, int):
+            self.interrupts.count += event
+            return None
+        return event
+
+    def send(self, command):
+        self.sent.append(command)
+
+
+@pytest.fixture
+def follow(monkeypatch):
+    """Follow series 7; returns what it comes to, and what was done with lines of progress."""
+
+    def run(*events, looks=True):
+        done = []
+
+        class Line:
+            def __init__(self):
+                done.append("new")
+
+            def __getattr__(self, name):
+                return lambda *what, **_: done.append((name, *what[:1]))
+
+        monkeypatch.setattr("rigd.runner.ProgressLine", Line)
+        interrupts = start._Interrupts()
+        client = Client(interrupts, *events)
+        try:
+            ended = start._follow(client, 7, interrupts, as_json=True, looks=looks)
+        except typer.Exit as ending:
+            ended = ending.exit_code
+        return ended, done, client.sent
+
+    return run
+
+
+def progress(session):
+    counts = {"tick": 1, "total": 1200, "missed": 0, "late": 0}
+    return {"event": "progress", "phase": "running", "session": session, "repeat": 2} | counts
+
+
+def session(number):
+    return DONE | {"number": number, "path": f"out/{number}.mcap"}
+
+
+def series(*numbers):
+    sessions = [session(number) for number in numbers]
+    return {"event": "series", "series": 7, "sessions": sessions}
+
+
+def look(number, text="Quick look"):
+    content = {"text": [text]}
+    return {"event": "quick_look", "path": f"out/{number}.mcap", "look": content, "error": ""}
+
+
+def test_no_bar_is_drawn_after_a_session_before_the_next(follow):
+    events = (progress(1), session(1), progress(1), progress(2), session(2), progress(2))
+    _, done, _ = follow(*events, series(1, 2), looks=False)
+    updates = [each[0] for each in done if each[0] == "update"]
+    assert len(updates) == 2
+    first = done.index(("say", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
+    assert done[first + 1 : first + 4] == [("close",), "new", ("update", done[first + 3][1])]
+    assert done[-1] == ("close",)
+
+
+def test_the_last_quick_look_is_waited_for(follow):
+    other = look(9)  # of somebody else's session
+    ended, done, _ = follow(session(1), look(1), session(2), series(1, 2), other, look(2, "Last"))
+    assert [each["look"] for each in ended["sessions"]] == [
+        "out/1.look.json",
+        "out/2.look.json",
+    ]
+    said = [each[1] for each in done if each[0] == "say"]
+    assert said[-2:] == ["Quick look at the session; Ctrl-C skips it.", "Last"]
+    assert said.count("Quick look") == 1
+
+
+@pytest.mark.parametrize("interrupts", [(), (1,)])  # the session was stopped by a first one
+def test_ctrl_c_skips_the_quick_look(follow, interrupts):
+    ended, _, sent = follow(*interrupts, session(1), series(1), 1)
+    assert ended["sessions"][0]["look"] is None
+    assert sent == ["stop"] * len(interrupts)
+
+
+def test_a_second_ctrl_c_in_a_session_leaves_it_to_the_daemon(follow):
+    ended, _, sent = follow(1, 1)
+    assert (ended, sent) == (130, ["stop"])
