@@ -14,10 +14,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import NAME
-from rigd.profile import Profile
 from rigd.runtime import (
     SINGLE_THREADED,
     announce,
@@ -27,6 +26,9 @@ from rigd.runtime import (
     runtime_folder,
     started_at,
 )
+
+if TYPE_CHECKING:
+    from rigd.profile import Profile
 
 PAGE_PORT: Final = 8720
 """Port of the page unless another is asked for."""
@@ -56,7 +58,7 @@ class PageProcess:
 
     def __init__(
         self,
-        profile: Profile,
+        profile: "Profile",
         folder: Path,
         socket: Path,
         port: int | None,
@@ -161,7 +163,7 @@ def _file(rig: str) -> Path:
     return runtime_folder() / f"page-{file_name(rig)}.json"
 
 
-def _job(profile: Profile, folder: Path, socket: Path) -> dict[str, Any]:
+def _job(profile: "Profile", folder: Path, socket: Path) -> dict[str, Any]:
     """Return what the page shows of a rig beside what the socket tells."""
     rig = profile.rig
     return {

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon import aside
+from rigd.daemon import background
 from rigd.daemon._log import NAME
 from rigd.daemon._states import (
     Document,
@@ -447,7 +447,7 @@ class Service:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are being made; try again in a moment.")
-        job = aside.PredictionJob(
+        job = background.PredictionJob(
             self._profile,
             request.excitation,
             request.parameters,
@@ -457,7 +457,7 @@ class Service:
         self._predictions += 1
         try:
             async with self._predicting:
-                return await _aside(job)
+                return await _in_background(job)
         finally:
             self._predictions -= 1
 
@@ -470,7 +470,7 @@ class Service:
         self._refuse_if_busy()
         self._doing = "check"
         try:
-            told = await _aside(aside.CheckJob(self._profile, self._rig.calibration))
+            told = await _in_background(background.CheckJob(self._profile, self._rig.calibration))
         finally:
             self._doing = ""
         self._last_check = {"utc_ns": time.time_ns(), "verdict": told["verdict"]}
@@ -702,11 +702,11 @@ class Service:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
 
 
-async def _aside(job: aside.PredictionJob | aside.CheckJob) -> Document:
+async def _in_background(job: background.PredictionJob | background.CheckJob) -> Document:
     """Have a job done in a process of its own."""
     try:
-        return await aside.perform(job)
-    except aside.AsideError as error:
+        return await background.perform(job)
+    except background.BackgroundError as error:
         raise CommandError(str(error), wrong_use=error.wrong_use) from None
 
 

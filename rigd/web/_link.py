@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -10,10 +11,13 @@ from typing import Any, Final
 Document = dict[str, Any]
 _Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
-_STATUS_S: Final = 0.4
-"""Time from one question for the status to the next."""
-_SILENT_S: Final = 0.9
+_STATUS_S: Final = 1.0
+"""Time from one question for the status to the next, where signals come meanwhile."""
+_ALIVE_S: Final = 0.4
+"""Likewise, where they do not."""
+_SILENT_S: Final = 0.85
 """A daemon from which nothing is heard for so long is told of."""
+_LOOK_S: Final = 0.1
 _RETRY_S: Final = 0.5
 _CONNECT_S: Final = 5.0
 _ANSWER_S: Final = 90.0
@@ -48,6 +52,9 @@ class DaemonLink:
         self._asking = asyncio.Event()
         self._held: _Connection | None = None
         self._commanding = asyncio.Lock()
+        self._heard_s = 0.0
+        self._silent = False
+        self._told_signals = False
 
     async def run(self) -> None:
         """Follow the daemon, until cancelled."""
@@ -115,43 +122,51 @@ class DaemonLink:
     async def _follow(self) -> None:
         """Read what one connection brings, to its end."""
         reader, writer = await self._connect()
-        asking = asyncio.create_task(self._keep_asking(writer))
-        silent = False
-        line = asyncio.create_task(reader.readline())
+        self._heard_s = time.monotonic()
+        beside = [
+            asyncio.create_task(self._keep_asking(writer)),
+            asyncio.create_task(self._note_silence()),
+        ]
         try:
             writer.write(b'{"command": "watch", "signals": true}\n')
             while True:
-                await asyncio.wait((line,), timeout=_SILENT_S)
-                if not line.done():
-                    if not silent:
-                        self._on_lost(f"The daemon has said nothing for {_SILENT_S:g} s.")
-                    silent = True
-                    continue
-                silent = False
-                self._take(line.result())
-                line = asyncio.create_task(reader.readline())
+                self._take(await reader.readline())
         finally:
-            asking.cancel()
-            line.cancel()
+            for task in beside:
+                task.cancel()
             writer.close()
 
     def _take(self, line: bytes) -> None:
         if not line:
             raise DaemonError(_GONE)
+        self._heard_s, self._silent = time.monotonic(), False
         message = json.loads(line)
         if message.get("reply") == "watch" and not message.get("ok"):
             raise DaemonError(str(message.get("error")))
-        if message.get("event") == "series":
+        if message.get("event") == "signals":
+            self._told_signals = True
+        elif message.get("event") == "series":
             self._let_go()
         if "event" in message or message.get("reply") == "status":
             self._on_message(message)
+
+    async def _note_silence(self) -> None:
+        """Tell of a daemon from which nothing has come for a while."""
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            if not self._silent and time.monotonic() - self._heard_s > _SILENT_S:
+                self._silent = True
+                self._on_lost(f"The daemon has said nothing for {_SILENT_S:g} s.")
 
     async def _keep_asking(self, writer: asyncio.StreamWriter) -> None:
         while True:
             writer.write(b'{"command": "status"}\n')
             self._asking.clear()
+            # Where no signals come, nothing else shows that the daemon is alive.
+            pause_s = _STATUS_S if self._told_signals else _ALIVE_S
+            self._told_signals = False
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._asking.wait(), _STATUS_S)
+                await asyncio.wait_for(self._asking.wait(), pause_s)
 
     def _let_go(self) -> None:
         """Give control back."""

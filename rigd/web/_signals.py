@@ -27,6 +27,7 @@ _GROUPS: Final = 200
 """Groups of frequencies of which the extremes are told: at most twice as many points."""
 _MODEL_STEP_HZ: Final = 0.01
 _DIGITS: Final = 6
+_FED_AT_ONCE: Final = 20
 _SAMPLE: Final = np.dtype(
     [
         ("tick", np.int64),
@@ -142,6 +143,7 @@ class SessionResponse:
         self._subject = subject
         self._sweep = SweepResponse(subject, LAST_HZ)
         self._thinning: Thinning | None = None
+        self._waiting: list[npt.NDArray[Any]] = []
         self._fresh = False
         self._reached_hz = 0.0
 
@@ -154,11 +156,20 @@ class SessionResponse:
         samples["angle_reference_rad"] = block.reference_rad[known]
         samples["coupling_torque_nm"] = block.torque_nm[known]
         if samples.size:
-            self._sweep.feed(samples)
+            self._waiting.append(samples)
+        if len(self._waiting) >= _FED_AT_ONCE:
+            self._feed_sweep()
+
+    def _feed_sweep(self) -> None:
+        """Feed what waits: a call for many blocks costs no more than one for a single block."""
+        if self._waiting:
+            self._sweep.feed(np.concatenate(self._waiting))
+            self._waiting.clear()
             self._fresh = True
 
     def document(self) -> Document | None:
         """Return the response as the page is told it; None if nothing new is known."""
+        self._feed_sweep()
         estimate = self._sweep.estimate() if self._fresh else None
         self._fresh = False
         if estimate is None or not estimate.excited.any():

@@ -13,9 +13,15 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
+from rigd.cli.status_view import _rows
 from rigd.daemon import _page, page_address
 from rigd.daemon._page import PageProcess
 from rigd.profile import load_profile
+
+STATUS = {
+    "state": "ready", "doing": "", "since_utc_ns": 0, "reason": "", "zero_lost": False,
+    "controller": None, "series": None, "progress": None, "rig": None,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -54,6 +60,10 @@ def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_f
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert page.told == [url]
     assert token not in url
+    told = STATUS | {
+        "daemon": {"profile": "sim", "moving": "m", "pid": 1, "output": "o", "web": url}
+    }
+    assert dict(_rows(told))["page"].plain == address
     pid = page._process.pid
     command = Path(f"/proc/{pid}/cmdline").read_bytes() + Path(f"/proc/{pid}/environ").read_bytes()
     assert token.encode() not in command

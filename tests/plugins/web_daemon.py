@@ -36,6 +36,7 @@ class FakeDaemon:
         self.status = dict(STATUS)
         self.replies = {}
         self.watchers = []
+        self.connected = set()
         self.silent = False
 
     @property
@@ -43,6 +44,7 @@ class FakeDaemon:
         return [each for each in self.asked if each["command"] in ACTING]
 
     async def serve(self, reader, writer):
+        self.connected.add(writer)
         with contextlib.suppress(ConnectionError):
             while line := await reader.readline():
                 request = json.loads(line)
@@ -54,6 +56,7 @@ class FakeDaemon:
                     continue
                 reply = {"reply": command, "ok": True} | self.replies.get(command, {})
                 self.say(writer, self.status | reply if command == "status" else reply)
+        self.connected.discard(writer)
         writer.close()
 
     def say(self, writer, document):
@@ -88,6 +91,8 @@ class Served:
         self.server, runner, listening = await _server.open_page(self._job)
         self.port = _server.port_of(listening)
         running = asyncio.create_task(self.server.run())
+        while self.server._status is None:
+            await asyncio.sleep(0.01)
         self._ready.set()
         await self._end.wait()
         listening.close()

@@ -206,3 +206,25 @@ def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
             return refusal.value.status
 
     assert pages.run(scenario) == 503
+
+
+def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
+    held = []
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            await command(session, command="start", excitation="chirp")
+            await command(session, command="reset")
+            held.append(served.daemon.connected - {following})
+            served.call(served.daemon.publish, {"event": "series", "series": 1})
+            await until(socket, "series")
+            while served.daemon.connected != {following}:
+                await asyncio.sleep(0.01)
+            await command(session, command="zero")
+            return following
+
+    following = pages.run(scenario)
+    assert [len(each) for each in held] == [1]
+    assert served.daemon.connected == {following}

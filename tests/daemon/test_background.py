@@ -2,7 +2,7 @@
 
 import asyncio
 
-from rigd.daemon import aside
+from rigd.daemon import background
 from rigd.daemon._service import CommandError
 from rigd.runner import excitation_for, plan_session
 
@@ -42,7 +42,7 @@ def test_only_so_many_predictions_wait(operate, monkeypatch):
         await asyncio.sleep(0.05)
         return {}
 
-    monkeypatch.setattr(aside, "perform", never)
+    monkeypatch.setattr(background, "perform", never)
 
     async def many():
         return await asyncio.gather(*(operated.handle("predict", **CHIRP) for _ in range(5)))
@@ -53,7 +53,7 @@ def test_only_so_many_predictions_wait(operate, monkeypatch):
 
 
 def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
-    monkeypatch.setattr(aside.sys, "executable", "/bin/true")
+    monkeypatch.setattr(background.sys, "executable", "/bin/true")
     told = operate().ask("predict", **CHIRP)
     assert isinstance(told, CommandError)
     assert "exit code 0" in str(told)
@@ -62,12 +62,12 @@ def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
 def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):
     asked = []
 
-    async def look_first(job, perform=aside.perform):
+    async def look_first(job, perform=background.perform):
         asked.append(await operated.handle("start", **CHIRP))
         await operated.service.watch()
         return await perform(job)
 
-    monkeypatch.setattr(aside, "perform", look_first)
+    monkeypatch.setattr(background, "perform", look_first)
     told = operated.ask("check")
     (refused,) = asked
     assert "busy (check)" in str(refused)
@@ -87,7 +87,7 @@ def test_a_check_is_for_a_rig_without_a_session(operated):
     told = []
     operated.world.then, operated.world.countdown = check, 50
     operated.ask("start", **CHIRP)
-    assert "no session runs" in str(told[0])
+    assert "without a running session" in str(told[0])
 
 
 def test_an_unconnected_rig_can_be_checked(operate):

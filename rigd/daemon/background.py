@@ -1,8 +1,8 @@
-"""Work of the daemon that takes processor time: predictions and checks, in a process of their own.
+"""Background jobs of the daemon: predictions and checks, each in a process of its own.
 
-They come while a session runs, asked for by anybody. In the daemon's own process they would hold
-the interpreter that supervises the session; the process that is started for each has an ordinary
-program's lowest priority.
+They take processor time, and anybody may ask for a prediction while a session runs. In the daemon's
+own process they would hold the interpreter that supervises the session; theirs has the lowest
+priority of an ordinary program.
 """
 
 import asyncio
@@ -88,7 +88,7 @@ class CheckJob:
         }
 
 
-class AsideError(FailureError):
+class BackgroundError(FailureError):
     """The work was refused or failed; the message is for the operator.
 
     Parameters
@@ -114,32 +114,32 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
 
     Raises
     ------
-    AsideError
+    BackgroundError
         If it is refused, fails, or takes longer than 60 s.
     """
     try:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "rigd.daemon.aside"),
+            *(sys.executable, "-m", "rigd.daemon.background"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=os.environ | SINGLE_THREADED,
         )
     except OSError as error:
-        raise AsideError(f"No process can be started for it ({error.strerror}).") from None
+        raise BackgroundError(f"No process can be started for it ({error.strerror}).") from None
     try:
         told, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
         answer = json.loads(told)
     except TimeoutError:
-        raise AsideError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
+        raise BackgroundError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
     except ValueError:
-        raise AsideError(f"Its process ended with exit code {process.returncode}.") from None
+        raise BackgroundError(f"Its process ended with exit code {process.returncode}.") from None
     finally:
         if process.returncode is None:
             process.kill()
             await process.wait()
     if "error" in answer:
-        raise AsideError(answer["error"], wrong_use=answer["wrong_use"])
+        raise BackgroundError(answer["error"], wrong_use=answer["wrong_use"])
     done: dict[str, Any] = answer
     return done
 
