@@ -283,7 +283,7 @@ def check_clock(
         raise RecordError(
             f"{path}: the time stamp t_ns goes from {t_ns[place]} ns at tick {ticks[place]} to "
             f"{t_ns[place + 1]} ns at tick {ticks[place + 1]}, but time must go forward; it does "
-            f"not at {back.size} of {len(ticks)} samples. Whoever writes the file must correct it."
+            f"not at {back.size} of {len(ticks)} samples. Correct the program that wrote the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
     rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
@@ -320,7 +320,7 @@ def check_finite(
     if bad.size:
         raise RecordError(
             f"{path}: {field} is {values[bad[0]]} at tick {ticks[bad[0]]} and not finite in "
-            f"{bad.size} of {len(values)} samples; no estimate is made from such a record."
+            f"{bad.size} of {len(values)} samples; such a record cannot be analysed."
         )
     if large.size:
         raise RecordError(

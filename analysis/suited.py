@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Band = tuple[float, float]
 
 _NO_SWEEP: Final = {
-    "step": "a step excites every frequency at one moment, which no average over segments shows",
+    "step": "a step excites all frequencies at one moment, which averaging over segments loses",
     "multisine": "a multisine excites single lines, and segments spread noise between them",
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
 }
@@ -163,7 +163,7 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
     """
     kind = record.metadata.get("excitation", "")
     if kind in _NO_SWEEP:
-        return f"{_NO_SWEEP[kind]} (--method welch makes them all the same)"
+        return f"{_NO_SWEEP[kind]} (--method welch makes them nevertheless)"
     planned_s = _number(record, "duration_s")
     swept_s = record.sweep_samples / record.rate_hz
     if asked_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
@@ -173,8 +173,8 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
     if reached_hz is None or not first_hz < reached_hz < last_hz:
         return None
     return (
-        f"the sweep ended after {swept_s:.4g} of {planned_s:g} s, at {reached_hz:.3g} Hz, and they "
-        f"would be over noise beyond; --band {first_hz:g},{reached_hz:.3g} makes them"
+        f"the sweep ended after {swept_s:.4g} of {planned_s:g} s, at {reached_hz:.3g} Hz, and "
+        f"beyond there is noise alone; --band {first_hz:g},{reached_hz:.3g} makes them up to there"
     )
 
 

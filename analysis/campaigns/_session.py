@@ -167,9 +167,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     except failures as error:
         return SessionFailure(path, str(error), experiment)
     except MemoryError:
-        return SessionFailure(
-            path, f"{path}: there is not memory enough to analyse it; use fewer --jobs."
-        )
+        return SessionFailure(path, f"{path}: not enough memory to analyse it; use fewer --jobs.")
     warnings = record.warnings if welch is None else welch.warnings
     warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
     whole = None
@@ -181,7 +179,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
                 return SessionFailure(path, str(error), experiment)
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
         except (MemoryError, np.linalg.LinAlgError) as error:
-            why = "there is not memory enough" if isinstance(error, MemoryError) else error
+            why = "not enough memory" if isinstance(error, MemoryError) else error
             warnings = (*warnings, f"Not in the whole-record estimate: {path}: {why}")
     found = whole.verdict.findings if whole else ()
     if wrong := next((each.sentence for each in found if each.kind in _MISREAD), None):

@@ -138,7 +138,7 @@ def left_out_errors(
     except task_errors() as why:
         return LostTrial(path, str(why))
     except MemoryError:
-        return LostTrial(path, "there is not memory enough to predict it; use fewer --jobs")
+        return LostTrial(path, "not enough memory to predict it; use fewer --jobs")
     measured = comparison.torque_nm[comparison.kept]
     size = np.linalg.norm(comparison.spectrum(measured))
 

@@ -221,7 +221,7 @@ def _told(file: Path, error: Exception) -> str:
     from numpy.linalg import LinAlgError
 
     if isinstance(error, MemoryError):
-        return f"{file}: there is not memory enough to analyse it."
+        return f"{file}: not enough memory to analyse it; close other programs."
     if isinstance(error, LinAlgError):
         return f"{file}: the estimate failed ({error}); is this a record of the rig?"
     return str(error)

@@ -336,6 +336,6 @@ def _check_rate(path: Path, rate_hz: float) -> None:
     lowest_hz, highest_hz = RATES_HZ
     if not lowest_hz <= rate_hz <= highest_hz:
         raise ExchangeError(
-            f"{path}: a rate of {rate_hz:g} Hz is none of a session, which are {lowest_hz:g} to "
+            f"{path}: a rate of {rate_hz:g} Hz is outside the range of sessions, {lowest_hz:g} to "
             f"{highest_hz:g} Hz; check the unit of the time."
         )

@@ -96,7 +96,7 @@ def check_target(target: Path, *, binary: bool) -> None:
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise TargetError(
-            f"{target}: the ending says what is written; choose one of {', '.join(SUFFIXES)}."
+            f"{target}: the ending selects the format; choose one of {', '.join(SUFFIXES)}."
         )
     if binary and suffix not in _UNIVERSAL:
         raise TargetError(

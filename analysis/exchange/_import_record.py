@@ -406,14 +406,13 @@ def check_units(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChann
             )
         if said is None and label not in _NO_UNIT:
             warnings.append(
-                f"The file says '{printable(label, 20)}' of '{choice.channel}', which was taken "
-                f"to be in {choice.unit} as stated."
+                f"The file states '{printable(label, 20)}' for '{choice.channel}'; {choice.unit} "
+                "was used as stated."
             )
         suffix = unit_in_suffix(choice.channel)
         if said is None and suffix not in (None, choice.unit):
             warnings.append(
-                f"The name '{choice.channel}' sounds like {suffix}; it was taken to be in "
-                f"{choice.unit} as stated."
+                f"The name '{choice.channel}' suggests {suffix}; {choice.unit} was used as stated."
             )
     return warnings
 
@@ -507,12 +506,12 @@ def unlikely_torque(
         return None
     if not 1 / _FACTOR < size < _FACTOR:
         return (
-            f"The torque is {size:.3g} times what this beam asks for: check the units of "
+            f"The torque is {size:.3g} times that of this beam: check the units of "
             "angle and torque, and the beam's length and density."
         )
     if ratio.real < 0.0:
         return (
-            "The torque has the opposite sign of what this beam asks for: a sensor that reports "
-            "the reaction is imported with --reverse-torque."
+            "The torque has the opposite sign to that of this beam: import a sensor that measures "
+            "the reaction with --reverse-torque."
         )
     return None

@@ -100,7 +100,7 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
     kind = _FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ExchangeError(
-            f"{path}: what kind of file this is, is told by its ending; known are "
+            f"{path}: the ending of the name selects the format; give a file that ends in one of "
             f"{', '.join(_FORMATS)}."
         )
     _check_file(path, kind)
@@ -143,7 +143,7 @@ def _check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
         )
     length = min(lengths.values())
     if length < 2:
-        raise ExchangeError(f"{path}: has {length} samples, which is no record.")
+        raise ExchangeError(f"{path}: has {length} samples, too few for a record.")
     check_samples(path, "The file", length)
 
 

@@ -169,7 +169,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     if rate_hz <= 0:
         raise SessionError(
             f"{path}: rate_hz in the metadata 'session' is {rate_hz:g}, but must be greater than 0 "
-            "Hz. Whoever writes the file must correct it."
+            "Hz. The writing program must correct it."
         )
     ticks = session.samples["tick"]
     span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0

@@ -283,7 +283,7 @@ class MessageDecoder:
         if size > MAX_MESSAGE_BYTES:
             raise SessionError(
                 f"{self._path}: a message of {layout.topic} has {size} bytes, more than the "
-                f"{MAX_MESSAGE_BYTES} that are read. Whoever writes the file must write one sample "
+                f"{MAX_MESSAGE_BYTES} that are read. The writing program must write one sample "
                 "a message."
             )
         if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
@@ -396,7 +396,7 @@ class MessageDecoder:
             raise SessionError(
                 f"{self._path}: more than {MAX_SINGLE_MESSAGES} messages of {self._layout.topic} "
                 "differ so much from one another that they would have to be decoded one by one, "
-                "which would take too long. Whoever writes the file must write all fields of every "
+                "which would take too long. The writing program must write all fields of every "
                 "message, in one order."
             )
         decode = self._class(channel).FromString
@@ -410,7 +410,7 @@ class MessageDecoder:
         except OverflowError as error:
             raise SessionError(
                 f"{self._path}: a message of {self._layout.topic} holds a number that its field "
-                f"cannot take ({error}). Whoever writes the file must keep to the types of the "
+                f"cannot take ({error}). The writing program must keep to the types of the "
                 "format."
             ) from None
 
@@ -443,8 +443,8 @@ class MessageDecoder:
         schema = contents.schemas.get(channel.schema_id)
         if len(self._fixed) >= MAX_CHANNELS:
             raise SessionError(
-                f"{path} has more than {MAX_CHANNELS} channels {layout.topic}. Whoever writes the "
-                "file must put all such messages into one."
+                f"{path} has more than {MAX_CHANNELS} channels {layout.topic}. The writing program "
+                "must put all such messages into one."
             )
         if (
             channel.message_encoding == "protobuf"
@@ -497,8 +497,8 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
         return message_class(schema.name, schema.data)
     except ValueError as error:
         raise SessionError(
-            f"{path}: {channel.topic} cannot be decoded, because its {error}. Whoever writes the "
-            "file must put a FileDescriptorSet with all it needs there."
+            f"{path}: {channel.topic} cannot be decoded, because its {error}. The writing program "
+            "must put a FileDescriptorSet with all it needs there."
         ) from None
 
 

@@ -112,7 +112,7 @@ class Session:
             if default is not None:
                 return default
             raise SessionError(
-                f"{self.path}: the metadata 'session' has no {key}. Whoever writes the file must "
+                f"{self.path}: the metadata 'session' has no {key}. The writing program must "
                 f"state it as a number{unit}."
             )
         try:
@@ -122,7 +122,7 @@ class Session:
         if not isfinite(value):
             raise SessionError(
                 f"{self.path}: {key} in the metadata 'session' is {quoted(text)}, which is not a "
-                f"finite number. Whoever writes the file must state it as a number{unit}."
+                f"finite number. The writing program must state it as a number{unit}."
             )
         return value
 
@@ -347,8 +347,8 @@ class _Log:
             if channel not in decoders:
                 if len(decoders) == MAX_CHANNELS:
                     raise SessionError(
-                        f"{path} has more than {MAX_CHANNELS} channels {EVENT_TOPIC}. Whoever "
-                        "writes the file must put all such messages into one."
+                        f"{path} has more than {MAX_CHANNELS} channels {EVENT_TOPIC}. The "
+                        "writing program must put all such messages into one."
                     )
                 decoders[channel] = class_of_channel(path, contents, channel).FromString
             message = decoded_message(path, EVENT_TOPIC, decoders[channel], data)
@@ -486,8 +486,8 @@ def _start_utc_ns(
         if text.isascii() and text.isdigit() and len(text) < 20:
             return int(text)
         raise SessionError(
-            f"{path}: start_utc_ns in the metadata 'session' is {quoted(text)}. Whoever writes "
-            "the file must state it as a whole number of ns since 1970, or leave it out."
+            f"{path}: start_utc_ns in the metadata 'session' is {quoted(text)}. The writing "
+            "program must state it as a whole number of ns since 1970, or leave it out."
         )
     if log_time is not None and len(samples):
         return log_time - int(samples["t_ns"][0])
@@ -503,14 +503,14 @@ def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
             or len(text) > 40
         ):
             raise SessionError(
-                f"{path}: the segment {quoted(name)} is {quoted(text)}. Whoever writes the file "
+                f"{path}: the segment {quoted(name)} is {quoted(text)}. The writing program "
                 "must state it as 'first,end', two whole numbers of ticks."
             )
         first, end = (int(n) for n in numbers)
         if end < first:
             raise SessionError(
                 f"{path}: the segment {quoted(name)} ends at tick {end}, before its first, "
-                f"{first}. Whoever writes the file must correct it."
+                f"{first}. The writing program must correct it."
             )
         segments[name] = (first, end)
     return segments

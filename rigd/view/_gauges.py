@@ -91,9 +91,35 @@ class Gauges:
             "torque_command": _peak(torque_nm),
             "i2t": self._rms_nm(torque_nm),
         } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH}
+        return self.beside(peaks)
+
+    def beside(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
+        """Return values beside their limits, by the names of ``UNITS``.
+
+        Parameters
+        ----------
+        values
+            Magnitudes by name; what is absent is not known.
+        """
         return {
-            name: Gauge(peak, self._limits.get(name), UNITS[name]) for name, peak in peaks.items()
+            name: Gauge(values.get(name), self._limits.get(name), unit)
+            for name, unit in UNITS.items()
         }
+
+    def cool(self, duration_s: float) -> float:
+        """Let the motor cool without torque; return its rms torque (i²t) then.
+
+        Parameters
+        ----------
+        duration_s
+            Time of which there are no samples.
+        """
+        self._heat_nm2 *= exp(-duration_s / self._time_constant_s)
+        return sqrt(self._heat_nm2)
+
+    def forget_angle(self) -> None:
+        """Take no speed from the last angle to the next, which is of another record."""
+        self._last = None
 
     def _speeds_rad_s(self, samples: Records) -> npt.NDArray[np.float64]:
         """Return the speeds between fresh angles: one that is held would double the next."""

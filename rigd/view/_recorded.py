@@ -59,7 +59,7 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
     if session.start_utc_ns > _LAST_UTC_NS:
         raise SessionError(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
-            "which Rerun cannot show. Whoever writes the file must correct it."
+            "which Rerun cannot show. The writing program must correct it."
         )
     if end - first > _MOST_SPAN * len(ticks):
         raise SessionError(
@@ -233,7 +233,7 @@ def _within(session: Session, key: str, least: float, most: float) -> float:
     if not least <= value <= most:
         raise SessionError(
             f"{session.path}: {key} is {value:g} {unit_of(key)}, but must be from {least:g} to "
-            f"{most:g} {unit_of(key)}. Whoever writes the file must correct it."
+            f"{most:g} {unit_of(key)}. The writing program must correct it."
         )
     return value
 

@@ -170,7 +170,7 @@ def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path
 def test_a_name_that_sounds_like_another_unit_is_told(csv_of, make_plan, tmp_path):
     source = csv_of(angle_deg=ANGLE, torque=TORQUE)
     done = import_record(source, tmp_path / "a.mcap", make_plan(angle="angle_deg:rad"))
-    assert "sounds like deg" in done.warnings[0]
+    assert "suggests deg" in done.warnings[0]
 
 
 def test_what_a_file_says_of_rate_and_unit_is_compared(make_plan, tmp_path):
@@ -192,7 +192,7 @@ def test_what_a_file_says_of_rate_and_unit_is_compared(make_plan, tmp_path):
         import_record(source, tmp_path / "a.mcap", make_plan(**options))
     channels(unit_string="V")
     done = import_record(source, tmp_path / "a.mcap", make_plan(**options))
-    assert "says 'V' of 'g/angle'" in done.warnings[0]
+    assert "states 'V' for 'g/angle'" in done.warnings[0]
     with pytest.raises(ExchangeError, match="'g/torque' was sampled at 1000 Hz, and 500 Hz was"):
         import_record(source, tmp_path / "b.mcap", make_plan(**options, rate_hz=500.0))
 

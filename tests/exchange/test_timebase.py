@@ -80,5 +80,5 @@ def test_a_rate_is_taken_as_it_is_stated():
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.nan, np.inf, 1e9])
 def test_a_rate_that_is_none_is_refused(rate_hz):
-    with pytest.raises(ExchangeError, match="none of a session"):
+    with pytest.raises(ExchangeError, match="outside the range of sessions"):
         uniform(PATH, 5, rate_hz)

@@ -222,6 +222,10 @@ def test_the_response_grows_over_model_and_last_session(server, page):
     page.hover("#response-plot", position={"x": 60, "y": 50})
     says(page, "#response-readout", "coherence")
     assert "Hz" in page.inner_text("#response-readout")
+    # Another session begins: of the one before there is nothing left.
+    begun = {"type": "state", "utc_ns": UTC_NS, "from": "ready", "to": "running", "reason": ""}
+    server.tell(begun)
+    expect(page.locator("#response-keys")).to_have_text("nominal model")
 
 
 def test_rerun_is_linked_where_there_is_a_live_view(server, page):

@@ -244,7 +244,10 @@ export class LiveResponse {
     link.on("nominal", (response) => this.#set(() => { this.#nominal = response; }));
     link.on("last", (response) => this.#set(() => { this.#last = response; }));
     link.on("state", ({ from, to }) => {
-      if (to === "running" && from === "ready") this.#set(() => { this.#measured = null; });
+      // The last one may have been of another specimen.
+      if (to === "running" && from === "ready") {
+        this.#set(() => { this.#measured = this.#last = null; });
+      }
     });
   }
 

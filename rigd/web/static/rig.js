@@ -76,12 +76,21 @@ const RESULTS = {
     make("tbody", {}, ...Object.keys(mean).map((axis) => make("tr", {},
       make("td", {}, wordsOf(axis)), make("td", {}, withUnit(mean[axis], unitOf(axis))),
       make("td", {}, withUnit(std[axis], unitOf(axis), 2))))))],
-  check: ({ rows, verdict }) => [
-    make("p", {}, make("b", {}, `${at()}${verdict}`)),
-    make("ul", { class: "check-rows" }, ...rows.map((row) => make("li", { class: row.status },
-      make("b", {}, row.status), ` ${row.what}: ${row.text}`,
-      row.remedy && row.status !== "ok" ? make("div", {}, row.remedy) : null)))],
+  check: ({ rows, verdict }) => {
+    const found = (...statuses) => rows.filter(({ status }) => statuses.includes(status));
+    const rest = found("ok", "skipped");
+    return [
+      make("p", {}, make("b", {}, `${at()}Check: ${verdict}`)),
+      checkRows([...found("failed"), ...found("warning")]),
+      make("details", {}, make("summary", {}, `${rest.length} more, OK or skipped`),
+        checkRows(rest))];
+  },
 };
+
+const checkRows = (rows) => make("ul", { class: "check-rows" },
+  ...rows.map(({ what, status, text, remedy }) => make("li", { class: status },
+    make("b", {}, status), ` ${what}: ${text}`,
+    remedy && status !== "ok" ? make("div", { class: "muted" }, remedy) : null)));
 
 /** Serial number of the sensor, date and age of its calibration; not every sensor tells them. */
 function calibrationText(calibration) {
