@@ -216,7 +216,7 @@ def _files(names: Sequence[str]) -> str:
 
 # Verdict
 
-_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
