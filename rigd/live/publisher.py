@@ -43,6 +43,7 @@ from rigd.view import (
     SUPERVISOR_LOST,
     SUPERVISOR_LOST_TORQUE_OFF,
     SUPERVISOR_SILENT,
+    SUPERVISOR_SILENT_TORQUE_OFF,
     Health,
     LastResponse,
     Note,
@@ -436,8 +437,11 @@ class StateWatch:
         board = self._board
         phase = Phase(board[Word.PHASE])
         still_s = self._supervisor.look(board[Word.SUPERVISOR_BEAT], now_s)
-        if phase in _TORQUE_PHASES and still_s > _SILENT_S:
-            return SUPERVISOR_SILENT
+        if still_s > _SILENT_S:
+            if phase in _TORQUE_PHASES:
+                return SUPERVISOR_SILENT
+            if board[Word.GO] and phase is Phase.OFF:
+                return SUPERVISOR_SILENT_TORQUE_OFF
         if board[Word.STOP] != Stop.NO:
             return STOPPING
         if phase is Phase.RUNNING:

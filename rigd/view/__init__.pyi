@@ -4,6 +4,7 @@ from ._banner import STOPPING as STOPPING
 from ._banner import SUPERVISOR_LOST as SUPERVISOR_LOST
 from ._banner import SUPERVISOR_LOST_TORQUE_OFF as SUPERVISOR_LOST_TORQUE_OFF
 from ._banner import SUPERVISOR_SILENT as SUPERVISOR_SILENT
+from ._banner import SUPERVISOR_SILENT_TORQUE_OFF as SUPERVISOR_SILENT_TORQUE_OFF
 from ._banner import State as State
 from ._banner import ended as ended
 from ._banner import preparing as preparing

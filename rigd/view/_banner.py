@@ -50,6 +50,9 @@ SUPERVISOR_SILENT: Final = State(
     RED,
     "Nobody could stop the session now; it is aborted after 2 s. Check CPU load.",
 )
+SUPERVISOR_SILENT_TORQUE_OFF: Final = State(
+    "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."
+)
 SUPERVISOR_LOST: Final = State(
     "SUPERVISOR LOST",
     RED,

@@ -119,5 +119,12 @@ def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
 
 def test_its_links_lead_somewhere():
     for target in re.findall(r"\]\(([^)]+)\)", README):
-        if not target.startswith("http"):
-            assert (PROJECT / target).exists(), target
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        assert (PROJECT / name).exists(), target
+        if anchor:
+            text = (PROJECT / name).read_text(encoding="utf-8") if name else README
+            titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+            anchors = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
+            assert anchor in anchors, target

@@ -18,6 +18,7 @@ from rigd.view import (
     RUNNING,
     STOPPING,
     SUPERVISOR_SILENT,
+    SUPERVISOR_SILENT_TORQUE_OFF,
     LastResponse,
     Subject,
     preparing,
@@ -63,8 +64,13 @@ def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
     assert now_s - hung_s < 0.8
     board.beat(Word.SUPERVISOR_BEAT)
     assert states.look(now_s + _PERIOD_S) == RUNNING
-    board[Word.PHASE] = Phase.OFF  # between sessions nobody need be there at once
-    assert states.look(now_s + 5.0) != SUPERVISOR_SILENT
+    board[Word.PHASE] = Phase.OFF
+    for _ in range(20):
+        now_s += _PERIOD_S
+        state = states.look(now_s)
+    assert state == SUPERVISOR_SILENT_TORQUE_OFF
+    board[Word.GO] = 0  # before a record nobody need be there at once
+    assert states.look(now_s + _PERIOD_S) == preparing()
 
 
 def words(columns) -> list[str]:

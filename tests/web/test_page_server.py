@@ -8,6 +8,7 @@ import time
 import aiohttp
 import numpy as np
 import pytest
+from processes import eventually
 from web_daemon import TOKEN
 
 from rigd.web import _live
@@ -227,4 +228,4 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
 
     following = pages.run(scenario)
     assert [len(each) for each in held] == [1]
-    assert served.daemon.connected == {following}
+    assert eventually(lambda: served.daemon.connected == {following})
