@@ -216,7 +216,7 @@ def _files(names: Sequence[str]) -> str:
 
 # Verdict
 
-_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
@@ -265,9 +265,7 @@ def sizes(freest: PooledEstimate) -> list[str]:
             f"{each.damping} {each.value:.4g} (95 %: {low:.4g} to {high:.4g}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
         )
-    return (
-        [f"Loss factors where they depend least on the orders: {'; '.join(said)}."] if said else []
-    )
+    return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
 
 
 def selected(

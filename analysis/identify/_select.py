@@ -307,14 +307,14 @@ _DAMPING: Final = {
     "I": "Internal damping only",
     "II": "External damping only",
     "III": "Internal and external damping",
-    "IV": "Damping by the material only",
-    "V": "Damping by the surroundings only",
-    "VI": "Damping by material and surroundings",
-    "VII": "Damping by material and surroundings",
+    "IV": "Internal damping only",
+    "V": "External damping only",
+    "VI": "Internal and external damping",
+    "VII": "Internal and external damping",
 }
 _SEVERAL: Final = 2
 _FREE: Final = "modes free"
-_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 
 
 def of_headline(

@@ -119,7 +119,7 @@ def sizes_table(whole: WholeRecord) -> Table:
     told = whole.headline
     return Table.of(
         "damping_sizes",
-        "Loss factor of either damping at the frequency where it depends least on its order",
+        "Loss factor of either damping at its pivot frequency",
         (
             Column("Damping", "damping", WORDS),
             Column("Quantity", "quantity", WORDS),
