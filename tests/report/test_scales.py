@@ -33,7 +33,7 @@ def stated(record_result):
 
 def test_without_statement_intervals_are_called_statistical(stated):
     table = parameters_table(stated())
-    assert "combined_low_si" not in table.keys
+    assert "combined_low_95" not in table.keys
     notes = " ".join(table.notes)
     assert (
         "Intervals are statistical only. Not included: the uncertainty of torque scale and" in notes
@@ -46,14 +46,14 @@ def test_without_statement_intervals_are_called_statistical(stated):
 def test_stated_uncertainties_stand_beside_the_statistical_intervals(stated):
     whole = stated(**ALL)
     table = parameters_table(whole)
-    rows = {row["parameter"]: row for row in table.rows}
+    rows = {row["parameter"].text: row for row in table.rows}
     combined = with_scales(whole.headline.parameters, ALL)
     stiffness = combined["bending_stiffness_n_m2"]
-    ends = rows["EI"]["combined_low_si"].value, rows["EI"]["combined_high_si"].value
+    ends = rows["EI"]["combined_low_95"].value, rows["EI"]["combined_high_95"].value
     assert ends == stiffness.interval_95
-    assert rows["EI"]["combined_std_si"].value == stiffness.std
-    assert ends[1] - ends[0] > 2 * (rows["EI"]["high_si"].value - rows["EI"]["low_si"].value)
-    for end in ("low_si", "high_si"):
+    assert rows["EI"]["combined_std"].value == stiffness.std
+    assert ends[1] - ends[0] > 2 * (rows["EI"]["high_95"].value - rows["EI"]["low_95"].value)
+    for end in ("low_95", "high_95"):
         assert rows["ζ"][f"combined_{end}"].value == rows["ζ"][end].value
     notes = " ".join(table.notes)
     assert "torque scale 0.5 % and length 0.05 %, in quadrature" in notes
@@ -105,7 +105,7 @@ def test_the_document_has_both(stated):
 
 
 def test_units_of_a_file_are_those_of_its_numbers(record_result):
-    rows = {row["parameter"]: row for row in parameters_table(record_result.whole).rows}
+    rows = {row["parameter"].text: row for row in parameters_table(record_result.whole).rows}
     units = {symbol: (row["unit"].value, row["unit"].text) for symbol, row in rows.items()}
     assert units["ζ"] == ("s^α", "1e-5 s^α")
     assert units["γ"] == ("s^λ/m⁴", "1e-2 s^λ/m⁴")
