@@ -162,7 +162,7 @@ def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
         return [], [f"No modes: {_without_name(str(error), record.path)}"]
     said += [each.sentence for each in found]
     if not told.modes:
-        said.append("No modes: the band that was excited holds none.")
+        said.append("No modes: none lies in the excited band.")
     return [_mode(each) for each in told.modes], said
 
 
@@ -430,7 +430,7 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  doubtful: {doubt}" for doubt in doubts)
     unseen = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
     if unseen:
-        yield f"  not shown by this record: mode {' and '.join(unseen)}"
+        yield f"  not visible in this record: mode {' and '.join(unseen)}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from analysis.identify import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
-_MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"
-_ON_BOUND: Final = "the plain mean: it rests on its bound in some session"
+_MIXTURE: Final = "the mean of a mixture: sessions differ significantly"
+_ON_BOUND: Final = "the unweighted mean: at its bound in at least one session"
 _ADEQUATE: Final = 0.9
 
 

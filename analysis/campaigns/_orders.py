@@ -108,7 +108,7 @@ _ADEQUATE: Final = 0.9
 _SURE: Final = 0.999
 """Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
 
-_FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
+_FEW_MODES: Final = "a single mode determines the amount of damping, not its order"
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,12 +209,10 @@ def _judged(
         # None of those fitted has it free: the sessions' own verdicts are all that there is.
         return "compatible", None
     if free is None or _wide(free.interval) > WIDEST_SHARE:
-        return "not identifiable", "the sessions do not tell the order"
+        return "not identifiable", "the sessions do not determine the order"
     if not freest.uniform and len(structure.free) > modes:
         # The modes' frequencies say nothing of the damping here: a loss factor each is all.
-        return "not identifiable", (
-            f"on a beam that is not uniform it rests on {modes} loss factors alone"
-        )
+        return "not identifiable", (f"on a non-uniform beam only {modes} loss factors determine it")
     if sum(v.adequate for v in verdicts) < _ADEQUATE * len(verdicts):
         return "open", "part of the records is unexplained"
     integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]

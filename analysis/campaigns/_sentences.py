@@ -94,8 +94,8 @@ def percent(share: float) -> str:
 MIXTURE_MARK: Final = "‡"
 _OF_MIXTURE: Final = "of a mixture"
 MIXTURE_NOTE: Final = (
-    f"{MIXTURE_MARK} sessions differ in it in kind, not by their uncertainties: the mean of a "
-    "mixture, which may belong to none of them."
+    f"{MIXTURE_MARK} sessions differ by more than their uncertainties: the mean of a "
+    "mixture, which may be valid for none of them."
 )
 _MANY: Final = 5
 _SLIGHT: Final = 2e-3
@@ -131,8 +131,8 @@ def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
     )
     first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)
     return [
-        f"The files are not of one specimen, they state {len(found)}: {each}. Specimens are never "
-        f"pooled: all that follows is of {first}. Run analyze on the files of each of the others, "
+        f"The files state {len(found)} different specimens: {each}. Specimens are never "
+        f"pooled: all results below are for {first}. Analyse the files of the others separately, "
         "or correct the metadata where they are wrong."
     ]
 
@@ -401,8 +401,8 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
     return [
         f"Of {asked} sessions to be predicted from the others, {asked - len(lost)} "
         f"{'was' if asked - len(lost) == 1 else 'were'} and {len(lost)} "
-        f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Errors of prediction are over "
-        "those that were."
+        f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Prediction errors are averaged "
+        "over those predicted."
     ]
 
 

@@ -63,7 +63,7 @@ class CommonFinding:
             return words
         factor, unit = _SHOWN.get(self.example.unit, (1.0, self.example.unit))
         low, high = (f"{factor * end:.3g}" for end in self.span)
-        return f"{words} (So the session in the middle; over the sessions {low} to {high} {unit}.)"
+        return f"{words} (Median session; range over all sessions: {low} to {high} {unit}.)"
 
 
 def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, ...]:

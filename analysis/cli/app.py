@@ -92,7 +92,7 @@ Version = Annotated[
 _EXIT_INTERRUPTED: Final = 130
 
 _COMMANDS: Final = {
-    "import": "Make a session file of a record of another program (.csv, .mat, .tdms, .uff).",
+    "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
     "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
     "export frf": "Write the frequency response of a session (.csv, .mat, .uff).",
 }
@@ -220,7 +220,7 @@ def analyze(
         bool,
         typer.Option(
             "--overwrite",
-            help="Replace an earlier report and its --json file; files of others stay.",
+            help="Replace an earlier report and its --json file; other files are kept.",
         ),
     ] = False,
     verbose: Annotated[
@@ -232,7 +232,7 @@ def analyze(
     ] = False,
     paper: Annotated[
         bool,
-        typer.Option("--paper", help="Campaign: set the paper's Tables 3 and 4 beside."),
+        typer.Option("--paper", help="Campaign: show the paper's Tables 3 and 4 for comparison."),
     ] = False,
     jobs: Annotated[
         int | None,
@@ -325,9 +325,9 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
     if not options:
         return
     if len(files) == 1:
-        why = "one session is no campaign; give several sessions, or leave it out."
+        why = "only for campaigns (two or more sessions); omit it."
     else:
-        why = "--each makes no campaign of the sessions; leave one of the two out."
+        why = "only for campaigns, so not with --each; omit one of the two."
     raise typer.BadParameter(why, param_hint=" and ".join(options))
 
 
@@ -354,7 +354,7 @@ def _lone_session(lone: LoneSessionError, routes: Routes, outputs: Outputs) -> i
     """Tell what is wrong with the other files of a campaign, and report the one that is left."""
     for failure in lone.failures:
         _complain(failure.message)
-    typer.echo(f"One session makes no campaign: {lone.path} is reported by itself.", err=True)
+    typer.echo(f"A campaign needs two sessions: {lone.path} is reported alone.", err=True)
     others = {str(failure.path): failure.message for failure in lone.failures}
     return max(1, session_command([lone.path], routes, outputs, others=others))
 

@@ -102,10 +102,10 @@ def import_command(
         typer.Option(metavar="T0,T1", help="Ring-down after the sweep, s from the start."),
     ] = None,
     angle_delay_s: Annotated[
-        float, typer.Option(metavar="S", help="Age of the angle at its time stamp.")
+        float, typer.Option(metavar="S", help="Latency of the angle at its time stamp.")
     ] = 0.0,
     torque_delay_s: Annotated[
-        float, typer.Option(metavar="S", help="Age of the torque at its time stamp.")
+        float, typer.Option(metavar="S", help="Latency of the torque at its time stamp.")
     ] = 0.0,
     reverse_torque: Annotated[
         bool,
@@ -122,7 +122,7 @@ def import_command(
         str, typer.Option(metavar="TEXT", help="Note, stored in the session file.")
     ] = "",
 ) -> None:
-    """Make a session file of a record that another program measured.
+    """Convert a record of another program to a session file.
 
     Channels and units are stated, never guessed. A channel is named as the file names it (its
     title in CSV and UFF58, Group/Channel in TDMS, struct.field or matrix#column in MATLAB), or #3
@@ -197,7 +197,7 @@ def import_command(
 def export_record_command(session: _Session, target: _Target, binary: _Binary = False) -> None:
     """Write the samples as recorded.
 
-    Written are time, angles, torques, wrench and status bits.
+    Writes time, angles, torques, wrench and status bits.
     """
     from analysis.exchange import export_record
 

@@ -86,7 +86,7 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
             raise NoSessionsError(
                 f"{path}: there is no session (*.mcap) in this folder; give session files, or the "
                 "folder that holds them."
-                + (" Of a torn one (*.mcap.part) `rigd recover` makes a session." if torn else "")
+                + (" Recover an incomplete file (*.mcap.part) with `rigd recover`." if torn else "")
             )
         found += sessions
     return found

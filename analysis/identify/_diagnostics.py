@@ -88,9 +88,9 @@ def at_edges(field: CandidateSet) -> Iterator[Finding]:
             yield Finding(
                 kind="implausible",
                 sentence=(
-                    f"{words} would have to be {factor * value:.4g} {unit} or go farther, which is "
-                    "the edge of the range searched: the record contradicts its file. "
-                    "No number here is the antenna's."
+                    f"{words} would have to be {factor * value:.4g} {unit} or beyond, which is "
+                    "the limit of the search range: the record contradicts its file. "
+                    "No number here is valid for the antenna."
                 ),
                 value=value,
                 unit=unit if factor == 1 else "s",
@@ -293,8 +293,8 @@ def unexplained(
     if related.related:
         where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
-            f"Unmodelled linear dynamics {where}: part of the torque follows the motor as with no "
-            "uniform or nearly uniform beam."
+            f"Unmodelled linear dynamics {where}: part of the torque is a linear response to "
+            "the motor angle that no nearly uniform beam has."
         )
         remedy = (
             "Fasten clamp, motor mount and sensor cable, and sweep again; then sweep without the "

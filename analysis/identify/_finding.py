@@ -89,7 +89,7 @@ def doubted(finding: Finding, because: str) -> Finding:
     >>> delay = Finding("delay", "The torque comes 1 ms later (0.9 to 1.1 ms; 95 %).",
     ...                 1e-3, (9e-4, 1.1e-3), "s", "")
     >>> doubted(delay, "part of the record is unexplained").sentence
-    'No fact while part of the record is unexplained: the torque comes 1 ms later.'
+    'Not established, because part of the record is unexplained: the torque comes 1 ms later.'
     """
     if finding.kind in SEEN:
         return finding
@@ -98,6 +98,6 @@ def doubted(finding: Finding, because: str) -> Finding:
         bare = bare[0].lower() + bare[1:]
     return replace(
         finding,
-        sentence=f"No fact while {because}: {bare}",
+        sentence=f"Not established, because {because}: {bare}",
         interval=None,
     )

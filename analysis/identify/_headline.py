@@ -443,7 +443,7 @@ def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
 
 def _doubted_by(told: Headline, other: Candidate) -> Headline:
     """Flag what another kind of rig, which explains the record as well, would have elsewhere."""
-    flag = f"type {other.name} explains the record as well, and has it elsewhere"
+    flag = f"type {other.name} fits the record equally well with another value"
     values = other.fit.parameters
 
     def elsewhere(quantity: Quantity, value: float) -> bool:

@@ -336,7 +336,7 @@ def of_headline(
     if kind and not beam:
         beam = f", beside {kind}"
     if len(told.visible_modes) < _SEVERAL:
-        said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
+        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
     else:
         said = [
             f"{_DAMPING[free.name]}{beam}. Numbers are those of type {told.name}, all orders free."

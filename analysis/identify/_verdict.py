@@ -31,9 +31,7 @@ EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
 """Deviance above the freest structure's from which a simpler one is excluded, by the number of
 parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a thousand records."""
 
-BESIDE_DRAG: Final = (
-    "drag of the air takes part in it, by a law that is known to a few percent only"
-)
+BESIDE_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
 """Why external damping beside drag must not be taken for a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
@@ -112,10 +110,10 @@ def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
     # The loss at one frequency is all that one mode shows; what may narrow an order then is how
     # exactly the beam is uniform.
     if len(visible) < _MODES_FOR_AN_ORDER:
-        return "one mode alone shows how much damping there is, not of which order"
+        return "a single mode determines the amount of damping, not its order"
     if not freest.uniform and len(freest.structure.free) > len(visible):
         # The modes' frequencies say nothing of the damping here: a loss factor each is all.
-        return f"on a beam that is not uniform it rests on {len(visible)} loss factors alone"
+        return f"on a non-uniform beam only {len(visible)} loss factors determine it"
     return None
 
 
@@ -139,7 +137,7 @@ def _judged(
     if untold is not None:
         return "not identifiable", untold
     if not profile.identifiable:
-        return "not identifiable", "the record does not tell the order"
+        return "not identifiable", "the record does not determine the order"
     if doubt is not None:
         return "open", doubt
     if order == "lambda" and field.drag is not None:

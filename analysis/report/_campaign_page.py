@@ -91,8 +91,8 @@ def _how(campaign: CampaignResult, made_at: datetime) -> list[Facts]:
             [
                 (
                     "estimator",
-                    "output error: the torque that the exact model (Eq. 25) makes of the measured "
-                    "angle against the measured one, whitened with the noise found",
+                    "output error: the torque that the exact model (Eq. 25) predicts from the "
+                    "measured angle minus the measured torque, whitened by the noise model",
                 ),
                 ("band", f"{first_hz:g} to {last_hz:g} Hz"),
                 (

@@ -28,7 +28,7 @@ _STATISTICS: Final = ("mean", "median", "std", "min", "max")
 _TABLE_3: Final = {"zeta": ("ζ (10⁻⁴)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (10⁻¹)", 10.0),
                    "lambda": ("λ", 1.0)}  # fmt: skip
 """Heading and factor of each parameter, the powers of ten of the paper's Table 3."""
-_ON_THE_EDGE: Final = "*n: in n sessions on the edge of the range searched."
+_ON_THE_EDGE: Final = "*n: at the limit of the search range in n sessions."
 _IN_PARENTHESES: Final = "In parentheses: the paper's."
 
 

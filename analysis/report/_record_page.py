@@ -147,8 +147,8 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
         ("beam density", f"{beam.density_kg_per_m:g} kg/m"),
         ("bending stiffness", f"{beam.bending_stiffness_n_m2:g} N·m²"),
         ("inertia of the clamp", f"{record.tool_inertia_kg_m2:g} kg·m²"),
-        ("age of the angle", f"{1e3 * record.angle_delay_s:g} ms"),
-        ("age of the torque", f"{1e3 * record.torque_delay_s:g} ms"),
+        ("measurement latency of the angle", f"{1e3 * record.angle_delay_s:g} ms"),
+        ("measurement latency of the torque", f"{1e3 * record.torque_delay_s:g} ms"),
         ("missing ticks", f"{gaps.missing_ticks}, {gaps.sweep_missing_ticks} of them in the sweep"),
         (
             "stale values in the sweep",
@@ -167,14 +167,14 @@ def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
     return [
         (
             "estimator",
-            "output error on the whole record: the torque that the exact model (Eq. 25) makes of "
-            "the measured angle against the measured one, whitened with the noise found; maximum "
+            "output error on the whole record: the torque that the exact model (Eq. 25) gives for "
+            "the measured angle minus the measured torque, whitened by the noise model; maximum "
             "likelihood for noise in the torque",
         ),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole.analysis.frequency_hz.size} bins"),
         ("types", ", ".join(whole.fits)),
         ("fixed at the file's values", ", ".join(whole.fixed) or "none"),
-        ("hum taken out", "; ".join(lines) or "none found"),
+        ("narrow-band disturbances removed", "; ".join(lines) or "none found"),
         (
             "intervals and bands",
             "95 %, from the covariance of the parameters at the minimum; curves by linearisation",

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _STRONG_CORRELATION: Final = 0.9
 _MARKED: Final = (
     f"{MARK} not a property of the antenna, for the reason in the remark: do not interpret. The "
-    "number belongs to the model's curve."
+    "number only describes the fitted curve."
 )
 
 
@@ -192,7 +192,7 @@ def correlations_table(whole: WholeRecord) -> Table:
                 zip(fit.determined, symbols, fit.correlation.tolist(), strict=True)
             )
         ),
-        ("Of ζ, γ, ρ/EI and EI the logarithms. Bold: 0.9 or more.",),
+        ("For ζ, γ, ρ/EI and EI, of their logarithms. Bold: 0.9 or more.",),
     )
 
 
@@ -276,7 +276,7 @@ def _correlation(own: bool, value: float) -> Cell:
 
 
 _DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
-_ON_THE_EDGE: Final = "* rests on the edge of the range searched: the data do not determine it."
+_ON_THE_EDGE: Final = "* at the limit of the search range: not determined by the data."
 
 
 def structures_table(whole: WholeRecord) -> Table:
@@ -325,11 +325,11 @@ def structures_table(whole: WholeRecord) -> Table:
         rows,
         (
             *footnotes(withheld),
-            "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. Fit: NRMSE "
+            "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
             "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
             "over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
-            "searched. The marked row is the one that the numbers are of. What the record excludes "
+            "searched. The marked row is the one reported. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
         selected=list(whole.fits).index(whole.headline.name),
@@ -544,10 +544,10 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     if any(not followed and mode.damping_ratio < 1 for mode, followed in shown):
         notes.append(
             f"{_LEFT} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the fit does "
-            "not follow this resonance. The number belongs to its curve, not to the antenna."
+            "not follow this resonance. The number only describes the fitted curve."
         )
     if not all(vibrates) or not all(model.modes for model in models):
-        notes.append(f"{ABSENT} damped so strongly by this fit that nothing vibrates.")
+        notes.append(f"{ABSENT} overdamped in this fit.")
     return Table.of(
         "welch_modes",
         "Modes of the fits to Welch's estimate",

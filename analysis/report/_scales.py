@@ -28,7 +28,7 @@ def scale_notes(whole: WholeRecord) -> Iterator[str]:
         held = ", ".join(QUANTITIES[name][0] for name in whole.fixed)
         yield (
             f"Intervals are statistical only: the file's values of {held}, which were held, the "
-            "torque scale and the length are taken for exact."
+            "torque scale and the length are assumed exact."
         )
         return
     stated = whole.record.uncertainty

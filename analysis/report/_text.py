@@ -202,7 +202,7 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
         if not shown:
             return ()
         return (
-            "Part of the record is unexplained. If that spoilt nothing, the antenna's damping "
+            "Part of the record is unexplained. If that causes no bias, the antenna's damping "
             f"ratio would be {_listed(shown)}.",
         )
     if shown:

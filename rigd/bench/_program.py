@@ -18,7 +18,7 @@ ROUNDS = 3
 ALONE = "loop alone"
 RECORDED = "with recorder"
 SHOWN = "with recorder and live view"
-LOADED = "… and a busy neighbour"
+LOADED = "… and load on other cores"
 HIGHEST_HZ = 16_000.0
 LOWEST_HZ = 100.0
 

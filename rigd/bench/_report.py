@@ -22,7 +22,7 @@ def report_lines(results: Results) -> Iterator[str]:
     results
         With at least one round, one session, and a search.
     """
-    spin = f", the last {results.spin_us:g} µs of each wait spun" if results.spin_us else ""
+    spin = f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
     yield (
         f"The control loop at {results.rate_hz:g} Hz, everything simulated, {results.seconds:g} s "
         f"each{spin}."
@@ -38,7 +38,7 @@ def report_lines(results: Results) -> Iterator[str]:
     yield ""
     yield from _peer_lines(results)
     yield ""
-    yield "Lateness:"
+    yield "Wake-up latency:"
     columns = [(one.name, one.lateness_us) for one in _rows(results)[:2]]
     yield from histogram_lines(columns)
     yield ""
@@ -62,7 +62,7 @@ def verdict(results: Results) -> str:
         )
     if between_hz is not None and between_hz != highest_hz:
         text += (
-            f" But for stalls of {STALL_US * 1e-3:g} ms and more, which no rate escapes, it would "
+            f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
             f"hold {between_hz:g} Hz."
         )
     refused = [name for name, text in results.granted.items() if text.startswith(REFUSED)]
@@ -72,7 +72,7 @@ def verdict(results: Results) -> str:
     if peer is not None and peer.held < HELD:
         text += (
             f" cyclictest alone would have missed {100 * (1 - peer.held):.2f} % at "
-            f"{peer.rate_hz:g} Hz: that much is the computer's, whatever runs on it."
+            f"{peer.rate_hz:g} Hz: this is due to the computer itself."
         )
     return text
 
@@ -133,7 +133,7 @@ def _table(rows: list[Measurement]) -> Iterator[str]:
 def _search_table(search: list[Measurement]) -> Iterator[str]:
     yield (
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
-        f"{'work p99, µs':>14}{'CPU, %':>8}"
+        f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
     for one in sorted(search, key=lambda one: one.rate_hz):
         cpu = "" if one.cpu_percent is None else f"{one.cpu_percent:8.1f}"

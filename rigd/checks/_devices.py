@@ -32,8 +32,8 @@ _IN_HEX = ("vendor_id", "product_code", "supported_modes")
 
 _WATCHDOG_DETAIL = {
     Watchdog.OWN: (
-        "Watchdog: its time is what the profile says (cia402.own_watchdog_s), which nothing here "
-        "can read back. Try it at a low torque: kill rigd, and see when the torque goes."
+        "Watchdog: its timeout is as stated in the profile (cia402.own_watchdog_s) and cannot be "
+        "read back. Test it at low torque: kill rigd and time how long the torque stays on."
     ),
     Watchdog.NONE: (
         "Watchdog: should this computer fail with the torque on, nothing but the wired stop (STO) "
@@ -90,7 +90,7 @@ def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
         "drive",
         "watchdog",
         f"{stands.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
-        "takes the torque off when this computer falls silent",
+        "switches the torque off if this computer stops communicating",
         Verdict.WARNING if unproven else Verdict.OK,
         _WATCHDOG_DETAIL.get(stands, ""),
     )
@@ -303,10 +303,10 @@ def exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Itera
 def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row:
     acquisition = profile.rig.acquisition
     median, late = np.percentile(waited_ms, [50, 99]).tolist()
-    found = f"median {median:.2f} ms, 99 % within {late:.2f} ms"
+    found = f"p50 {median:.2f} ms, p99 {late:.2f} ms"
     what = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
-        return Row(_GROUP, what, "a tick takes those of the tick before", "", Verdict.SKIPPED)
+        return Row(_GROUP, what, "replies of the previous tick are used", "", Verdict.SKIPPED)
     if moves is WhatMoves.LOCK_STEP:
         return Row(_GROUP, what, found, "any time (lock-step)", Verdict.OK)
     limit_ms = acquisition.deadline_us * 1e-3

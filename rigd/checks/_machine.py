@@ -186,10 +186,10 @@ def _virtual_row(root: Path) -> Row:
         _GROUP,
         "hardware",
         "virtual machine" if virtual else "no hypervisor seen",
-        "a computer of its own",
+        "a dedicated computer",
         grade(fail=False, warn=virtual),
-        "Hardware: the host takes the processor away for milliseconds and nothing in here can keep "
-        "it; run a real rig on a computer of its own."
+        "Hardware: the hypervisor can suspend this machine for milliseconds, which nothing inside "
+        "can prevent; run a real rig on a dedicated computer."
         if virtual
         else "",
     )

@@ -266,7 +266,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
             free = worst_travel(rig, limits, way.duration_s)
             detail = "" if unbounded else f"Travel: the worst is {way.what}. "
             detail += (
-                f"It counts on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
+                f"It relies on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
                 f"(object 6080); without it, it would be {_angle(free.total_rad)}."
                 if limited
                 else "The drive's own speed limit (object 6080) is not set; "
@@ -283,7 +283,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
             f"{worst}{way.what}",
             f"{_angle(travel.total_rad)}: {_angle(travel.driven_rad)} in the "
             f"{way.duration_s * 1e3:g} ms {way.ended_by}, {_angle(travel.coasting_rad)} "
-            "running out",
+            "coasting",
             bound,
             grade(fail=too_far),
             detail.strip(),

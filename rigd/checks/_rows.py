@@ -129,8 +129,8 @@ OF_A_RIG = {
 """What the verdict over all rows means to the operator."""
 OF_AN_EDS = {
     "failed": "this drive cannot be used",
-    "warnings": "as far as its file tells, this drive can be used; read the warnings",
-    "ok": "as far as its file tells, this drive can be used",
+    "warnings": "according to its EDS file, this drive can be used; read the warnings",
+    "ok": "according to its EDS file, this drive can be used",
 }
 
 

@@ -141,7 +141,7 @@ def _explained(error: OSError) -> str:
     """Say what the system refused, where no command has."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return (
-            f"Not enough files may be open at once ({error.strerror}); raise the limit (ulimit -n) "
+            f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "
             "or close other programs."
         )
     if error.filename is not None:

@@ -58,8 +58,8 @@ def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
     rig_profile = profile_named(profile)
     if rig_profile.rig.cia402 is None:
         fail(
-            f"{rig_profile.path}: has no section [cia402] that the file could be held against; "
-            "leave --profile away, or name a profile with such a drive.",
+            f"{rig_profile.path}: has no section [cia402] to check the file against; "
+            "omit --profile, or name a profile with a CiA 402 drive.",
             EXIT_WRONG_USE,
         )
     return list(eds_rows(eds, rig_profile.rig))
@@ -131,9 +131,7 @@ def bench(
     ] = 10.0,
     spin_us: Annotated[
         float,
-        typer.Option(
-            "--spin-us", min=0.0, max=200.0, help="Last part of each wait spent polling (µs)."
-        ),
+        typer.Option("--spin-us", min=0.0, max=200.0, help="Busy-wait before each deadline (µs)."),
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:

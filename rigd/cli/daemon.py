@@ -41,7 +41,7 @@ def serve(
     output: Output = SESSIONS,
     group: Annotated[
         str | None,
-        typer.Option("--group", help="Let members of this group control it too, over /run/rigd."),
+        typer.Option("--group", help="Also let this group control the daemon, via /run/rigd."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
@@ -133,7 +133,7 @@ def status(
     """
     if watch:
         if as_json:
-            fail("--watch and --json do not go together; ask for one.", EXIT_WRONG_USE)
+            fail("--watch and --json cannot be combined; choose one.", EXIT_WRONG_USE)
         if not sys.stdout.isatty():
             fail(
                 "--watch needs a terminal; without one, run rigd status repeatedly, or watch the "
@@ -161,7 +161,7 @@ def stop(
 ) -> None:
     """Stop the running session safely (any user); its file is kept.
 
-    Waits up to 10 s until the session was seen to have ended. It is no emergency stop.
+    Waits up to 10 s for the session to end. Not an emergency stop.
 
     Example: rigd stop
     """
@@ -175,7 +175,7 @@ def stop(
     status = await_end(path, _END_PATIENCE_S)
     if status is None:
         fail(
-            f"The daemon was asked to stop, and its session was not seen to end within "
+            f"The daemon was asked to stop, but its session did not end within "
             f"{_END_PATIENCE_S:g} s; look at rigd status and at the rig, and press the wired stop "
             "(STO) if anything moves.",
             EXIT_FAILED,
@@ -218,7 +218,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     """Set the zero of the angle where the motor stands.
 
-    The limits count from this zero. The torque stays off.
+    The angle limits are relative to this zero. The torque stays off.
 
     Example: rigd zero
     """
@@ -246,7 +246,7 @@ def reset_by_daemon(profile: str | None) -> bool:
         told = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
     if told["zero_lost"]:
-        typer.echo("The zero of the angle was lost: move the motor to its middle, run rigd zero.")
+        typer.echo("The zero of the angle was lost: move the motor to mid-travel; run rigd zero.")
     return True
 
 

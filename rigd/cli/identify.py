@@ -86,9 +86,9 @@ def motor(
     Each value comes with its uncertainty.
 
     Three sessions of 25, 60 and 75 s: the shaft goes to and fro at constant speed, with a small
-    multisine on it, with a larger one, then at four speeds. The first only serves to design the
+    multisine added, with a larger one, then at four speeds. The first only serves to design the
     controller of the others. Proposes lines for the profile and changes nothing itself. The torque
-    constant shows only with the antenna mounted.
+    constant is identifiable only with the antenna mounted.
 
     Example: rigd identify motor --profile sim --fast
     """

@@ -26,24 +26,24 @@ def list_sessions(
         list[Path] | None,
         typer.Argument(metavar="FOLDER", help="Folders of session files (default: sessions)."),
     ] = None,
-    specimen: Annotated[str, typer.Option("--specimen", help="Only of this specimen.")] = "",
-    operator: Annotated[str, typer.Option("--operator", help="Only by this operator.")] = "",
+    specimen: Annotated[str, typer.Option("--specimen", help="Sessions of this specimen.")] = "",
+    operator: Annotated[str, typer.Option("--operator", help="Sessions by this operator.")] = "",
     excitation: Annotated[
-        str, typer.Option("--excitation", help="Only with this excitation, such as chirp.")
+        str, typer.Option("--excitation", help="Sessions with this excitation, such as chirp.")
     ] = "",
     outcome: Annotated[
         str,
         typer.Option(
             "--outcome",
-            help="Only those that ended so: complete, stopped, fault, unknown, recording, "
+            help="Sessions with this outcome: complete, stopped, fault, unknown, recording, "
             "incomplete or unreadable.",
         ),
     ] = "",
     since: Annotated[
-        str, typer.Option("--since", metavar="DATE", help="Only from this day or time on.")
+        str, typer.Option("--since", metavar="DATE", help="Sessions from this day or time on.")
     ] = "",
     until: Annotated[
-        str, typer.Option("--until", metavar="DATE", help="Only up to this day or time.")
+        str, typer.Option("--until", metavar="DATE", help="Sessions up to this day or time.")
     ] = "",
     trend: Annotated[
         bool,
@@ -54,7 +54,7 @@ def list_sessions(
     """List recorded sessions with their modes, or a specimen's trend.
 
     The newest come first, with modes from the report or else from the quick look. Dates are local
-    (2026-11-20 or 2026-11-20T14:30). Torn and foreign files are listed with their problem. The
+    (2026-11-20 or 2026-11-20T14:30). Incomplete and foreign files are listed with the reason. The
     index library.sqlite in each folder only saves time, and may be removed.
 
     Example: rigd list --specimen "antenna 3" --trend
@@ -204,7 +204,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "beyond both intervals, ? is flagged in its report or quick look."
+        "significant at 95 %, ? is flagged in its report or quick look."
     )
 
 

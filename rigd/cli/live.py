@@ -95,7 +95,7 @@ def live(
         typer.echo(tunnel_advice(view), err=True)
         typer.echo(
             f"Every user and program of this computer can read the view, and write to it, on port "
-            f"{view.grpc_port}; the session files are not concerned.",
+            f"{view.grpc_port}; the session files are not affected.",
             err=True,
         )
     elif not has_screen():
@@ -131,7 +131,7 @@ def _only_one(rig: str | None) -> "LiveAddress | None":
 
 
 def _await(rig: str | None) -> "LiveAddress":
-    typer.echo("Waiting for a live view to begin; Ctrl-C ends.", err=True)
+    typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
     while (view := _only_one(rig)) is None:
         time.sleep(_LOOK_S)
     return view
@@ -195,7 +195,7 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
         if view is not None and view.server != shown.server:
             if not viewer.connect(view):
                 continue  # it is tried again
-            typer.echo(f"The live view of {view.rig} has begun anew.", err=True)
+            typer.echo(f"The live view of {view.rig} has restarted.", err=True)
             shown = view
         elif view is None and there:
             typer.echo(

@@ -124,7 +124,7 @@ Force = Annotated[
 NoLook = Annotated[
     bool,
     typer.Option(
-        "--no-look", envvar="RIGD_NO_LOOK", help="Make no quick look at a session after its end."
+        "--no-look", envvar="RIGD_NO_LOOK", help="Skip the quick look after each session."
     ),
 ]
 
@@ -138,12 +138,12 @@ def session_notes(
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():
         if not text.isprintable():
-            fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
+            fail(f"--{option} {text!r}: must be a single line of plain text.", EXIT_WRONG_USE)
     added: dict[str, str] = {}
     for given in meta or []:
         name, equals, value = given.partition("=")
         if not equals or name in added:
-            wrong = "is given twice" if equals else "is not NAME=VALUE, as temperature_c=21.4 is"
+            wrong = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
             fail(f"--meta {given!r}: {wrong}.", EXIT_WRONG_USE)
         added[name] = value
     return {name: text for name, text in notes.items() if text} | metadata_keys(added)

@@ -64,7 +64,7 @@ def list_profiles() -> None:
 
 @profiles_app.command()
 def show(name: NameOrFile) -> None:
-    """Print a profile as it stands in its file.
+    """Print the text of a profile.
 
     Example: rigd profiles show sim
     """
@@ -129,7 +129,7 @@ def new(
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
     motor are asked for on the terminal; Enter keeps the value shown, which stays "assumed". What
-    the drive lacks is accepted only by a yes. Without a terminal nothing is asked or accepted, and
+    the drive lacks needs your confirmation. Without a terminal nothing is asked or accepted, and
     what has to be filled in is listed. No file is ever overwritten.
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
@@ -175,7 +175,7 @@ def _asked(draft: "Draft") -> str:
             try:
                 draft.text()
             except ProfileError as error:
-                typer.echo(f"{error}\nOnce more:", err=True)
+                typer.echo(f"{error}\nTry again:", err=True)
                 continue
             _ask_for_acceptance(draft)
             return draft.text()

@@ -195,7 +195,7 @@ def step(
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
 ) -> "dict[str, Value]":
-    """Step the reference by an amplitude.
+    """Apply a step to the reference.
 
     Example: rigd run step --amplitude 0.01
     """
@@ -221,7 +221,7 @@ def multisine(
         int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
     ] = 0,
 ) -> "dict[str, Value]":
-    """Excite with equal sines of random phase.
+    """Excite with a multisine of equal amplitudes and random phases.
 
     The amplitude is the peak of their sum.
 
@@ -245,7 +245,7 @@ def file(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="CSV", readable=False, help="Columns time_s and angle_rad, or one of angles."
+            metavar="CSV", readable=False, help="Columns time_s and angle_rad, or angles only."
         ),
     ],
     rest: Rest = 1.0,
@@ -262,7 +262,7 @@ def file(
 def modes(
     path: Annotated[
         Path,
-        typer.Argument(metavar="JSON", readable=False, help="Modes as analyze --json writes them."),
+        typer.Argument(metavar="JSON", readable=False, help="Modes written by analyze --json."),
     ],
     amplitude: Annotated[
         float,
@@ -274,7 +274,7 @@ def modes(
         float, typer.Option("--stop-hz", help="Highest mode that is excited (Hz).")
     ] = 50.0,
     widths: Annotated[
-        float, typer.Option("--widths", help="Half of a band, in half-power widths of its mode.")
+        float, typer.Option("--widths", help="Band half-width, in half-power widths of its mode.")
     ] = 1.0,
     duration: Duration = 120.0,
     rest: Rest = 1.0,
@@ -285,7 +285,7 @@ def modes(
 ) -> "dict[str, Value]":
     """Sweep narrow bands around the modes of an analysis.
 
-    The damping parameters become less uncertain than with a broad sweep of the same length.
+    The damping parameters are more precise than from a broad sweep of the same length.
 
     Example: rigd run modes fits.json --repeat 5
     """

@@ -13,7 +13,7 @@ def simulate(
     lock_step: Annotated[
         bool,
         typer.Option(
-            "--lock-step", help="Advance one period per SYNC, as fast as they come (run --fast)."
+            "--lock-step", help="Advance one period per SYNC, not in real time (run --fast)."
         ),
     ] = False,
     log: Annotated[
@@ -75,7 +75,7 @@ def inject(
     reorder,from=...[,id=...][,frames=3]      frames are swapped
     freeze,device=drive|sensor[,for=0.5]      the device stops communicating
     emcy,code=0x8130[,register=1]             the drive reports an emergency
-    sto[,for=0.5]                             the drive's wired stop is dropped
+    sto[,for=0.5]                             the drive's STO is activated
     busoff[,for=0.5]                          the host's CAN controller is off the bus
     saturate,gauge=0..5[,for=0.5]             a strain gauge is at the end of its range
     status,bits=0x0080[,for=0.5]              the sensor reports errors
@@ -84,9 +84,9 @@ def inject(
     restart,device=drive|sensor               the device restarts by itself
     power_cycle,device=drive|sensor           the device is switched off and on
     lag,ms=3.2[,for=0.5]                      the drive's actual torque (6077) is late
-    no_bit_12[,for=0.5]                       the statusword never shows that the drive follows
+    no_bit_12[,for=0.5]                       statusword bit 12 (follows command) stays 0
     no_pre_operational[,for=0.5]              the drive ignores NMT pre-operational
-    no_watch[,for=0.5]                        the drive does not notice a silent host
+    no_watch[,for=0.5]                        the drive's watchdog does not act
     end[,fault=sto]                           end faults of one kind (release the STO), or all
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end

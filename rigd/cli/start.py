@@ -187,7 +187,7 @@ def _follow(
             if interrupts.count and not asked:
                 asked = True
                 client.send("stop")
-                line.say("Stopping; Ctrl-C again leaves the rest to the daemon.")
+                line.say("Stopping; press Ctrl-C again to leave while the daemon finishes.")
             if ended is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}

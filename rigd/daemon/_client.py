@@ -37,7 +37,7 @@ _END_PATIENCE_S = 3.0
 _PAUSE_S = 0.02
 _TIME = struct.Struct("@ll")
 _UNKNOWN = (
-    "Whether a session still runs is not known: look at the rig, and press the wired stop (STO) if "
+    "A session may still be running: check the rig, and press the wired stop (STO) if "
     "anything moves."
 )
 
@@ -255,7 +255,7 @@ class Client:
         except ValueError:
             message = None
         if not isinstance(message, dict):
-            raise DaemonGoneError("What answers on the socket is no daemon of this version.")
+            raise DaemonGoneError("The process on the socket is not a daemon of this version.")
         return message
 
     def _raise_what_was_said(self) -> None:

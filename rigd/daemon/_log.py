@@ -29,7 +29,7 @@ class _Dropping(logging.handlers.QueueHandler):
     def enqueue(self, record: logging.LogRecord) -> None:
         """Queue a record without waiting."""
         if self._dropped and not self._waiting.full():
-            text = f"{self._dropped} lines before this one were dropped: nobody read them"
+            text = f"{self._dropped} lines before this one were dropped (log not read)"
             self._waiting.put_nowait(
                 logging.LogRecord(NAME, logging.WARNING, "", 0, text, None, None)
             )

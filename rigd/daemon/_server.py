@@ -402,7 +402,7 @@ class _Client(asyncio.Protocol):
             return
         if request.command == "watch" and not self.watching:
             if not self._server.may_watch():
-                text = f"There are {MOST_WATCHERS} who watch already; ask for status instead."
+                text = f"{MOST_WATCHERS} clients are watching already; use status instead."
                 self.write(_line(_refusal(request.id, text, command="watch", wrong_use=False)))
                 return
             self.watching = True

@@ -485,7 +485,7 @@ class Service:
         if self._rig.zero_lost:
             raise CommandError(
                 "The zero of the angle was lost with the connection, and the limits with it; move "
-                "the motor to its middle and run rigd zero."
+                "the motor to mid-travel and run rigd zero."
             )
         self._count += 1
         last = self._series

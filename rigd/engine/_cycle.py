@@ -30,7 +30,7 @@ AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 
 
 REMEDY = (
-    "The zero of the angle is void, and the limits with it: look at encoder, its cable and shield, "
+    "The zero of the angle and its limits are invalid: check the encoder, its cable and shield, "
     "then reset the rig and set the zero again."
 )
 
@@ -128,7 +128,7 @@ class Standstill:
             ticks_taken = f"{ticks} ticks" if ticks > 1 else "one tick"
             raise DeviceError(
                 f"The encoder jumped by {jump_rad:.4g} rad within {ticks_taken} while the torque "
-                f"was off, and no more than {possible_rad:.2g} rad are possible ({key}). {REMEDY}"
+                f"was off; at most {possible_rad:.2g} rad is possible ({key}). {REMEDY}"
             )
 
 

@@ -30,8 +30,8 @@ _SUPERVISOR_PATIENCE_S = 2.0
 """Counts the time that this process has run itself: a stalled computer is no supervisor's fault."""
 _OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
 _AGAINST_TORQUE = (
-    "The shaft gets faster against the torque: angle and torque do not count in the same sense. "
-    "Look at the drive's own polarity (object 607E), cia402.direction and the wiring of motor and "
+    "The shaft accelerates against the torque: angle and torque have opposite signs. "
+    "Check the drive's polarity (object 607E), cia402.direction and the wiring of motor and "
     "encoder; a lower amplitude does not help."
 )
 _SWINGING = 2.0
@@ -153,7 +153,7 @@ class SessionSequence:
             self._say_what_is_near()
             if violation is not None:
                 raise SessionEnd(
-                    "fault", f"{violation} If all is well, rigd tare makes it the zero."
+                    "fault", f"{violation} If nothing is wrong, run rigd tare to set a new zero."
                 )
         watch.tared_nm = zero_nm
 
@@ -310,7 +310,7 @@ class SessionSequence:
         rest = self._rest(self._profile.session.tare_s)
         if rest.torque_spread_nm > _SWINGING * self._rest_spread_nm:
             self._say(
-                "info", "The beam still swings: the zero of the coupling torque was not checked."
+                "info", "The beam still vibrates: the zero of the coupling torque was not checked."
             )
             return
         zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
@@ -328,7 +328,7 @@ class SessionSequence:
         if missed > self._profile.limits.missed_ticks_in_a_row and not excused:
             raise SessionEnd(
                 "fault",
-                f"The loop stood still for {missed} ticks with the torque held, more than "
+                f"The loop stalled for {missed} ticks with the torque held, more than "
                 "limits.missed_ticks_in_a_row = "
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
             )
@@ -433,8 +433,8 @@ class SessionSequence:
             if suspended_s > SUSPENDED_S:
                 return SessionEnd(
                     "fault",
-                    f"The computer was suspended for {suspended_s:.1f} s, in which nobody "
-                    "controlled the motor; turn its power management off.",
+                    f"The computer was suspended for {suspended_s:.1f} s and the motor was not "
+                    "controlled; disable its power management.",
                 )
             beat = self._board[Word.SUPERVISOR_BEAT]
             self._looks_unanswered = (

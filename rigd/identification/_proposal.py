@@ -124,7 +124,7 @@ class Proposal:
         cells = [heads]
         for row in self.rows:
             if row.measured.std is None:
-                value, deviation = "not told", ""
+                value, deviation = "not identifiable", ""
             else:
                 value, deviation = _rounded(row.measured.value, row.measured.std)
             verdict = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
@@ -245,19 +245,19 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
         notes = [
             "The torque constant is not identifiable: the coupling torque is too small, or follows "
             "the shaft like a rigid inertia (no antenna mounted?). The torque is taken as the "
-            "drive states it, and inertia and friction count in that."
+            "drive states it, and inertia and friction refer to that."
         ]
     else:
         value, deviation = _rounded(scale.value, scale.std)
         notes = [
             f"The motor exerts {value} ± {deviation} times the torque commanded, against the "
-            "sensor; motor.rated_torque_nm is corrected by that. Inertia and friction count in the "
+            "sensor; motor.rated_torque_nm is corrected by that. Inertia and friction refer to the "
             "sensor's N·m: paste all lines together."
         ]
     notes.append(
-        "Only the delay from command to angle shows; actuation.delay_s is what encoder.delay_s = "
-        f"{profile.rig.encoder.delay_s:g} s leaves of it, and sensor.delay_s = "
-        f"{profile.rig.sensor.delay_s:g} s is taken for true."
+        "Only the sum of delays from command to angle is known: actuation.delay_s is this sum "
+        f"minus encoder.delay_s = {profile.rig.encoder.delay_s:g} s, and sensor.delay_s = "
+        f"{profile.rig.sensor.delay_s:g} s is assumed correct."
     )
     notes.append(
         "control.friction_compensation_nm switches the friction feed-forward on; 0 leaves it off."

@@ -227,7 +227,7 @@ def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
         time.sleep(_POLL_S)
         looks.attend()
     if looks.busy and not skipped:
-        _tell("The quick look takes too long and is left out.", err=True)
+        _tell("The quick look took too long and was skipped.", err=True)
     stop.requested = before  # what was skipped is no session
 
 

@@ -81,7 +81,7 @@ class LiveView:
         if self._lost:
             return f"No live view: {self._lost} The session goes on without it."
         if self.address is None:
-            return "The live view takes its time to start; rigd live shows it when it is there."
+            return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
 
     def look(self) -> None:
@@ -161,7 +161,7 @@ class LiveView:
         patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
         beat = self._crew.channels.board[Word.LIVE_BEAT]
         if self._pulse.look(beat, time.monotonic()) > patience_s:
-            self._restart(f"The live process has not moved for {patience_s:g} s and was killed.")
+            self._restart(f"The live process was killed: no response for {patience_s:g} s.")
 
     def _restart(self, why: str) -> None:
         self._restarts += 1

@@ -170,7 +170,7 @@ class QuickLooks:
     def _go_on(self) -> Iterator[QuickLook]:
         """Start the next look; yield those that cannot be."""
         while len(self._waiting) > _MOST_WAITING:
-            yield QuickLook.failed(self._waiting.popleft(), "later sessions came first.")
+            yield QuickLook.failed(self._waiting.popleft(), "skipped in favour of later sessions.")
         if self._held or self._process is not None or not self._waiting:
             return
         self._session = self._waiting.popleft()

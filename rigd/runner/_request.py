@@ -109,8 +109,8 @@ def load_rig(
     if seed is not None:
         if moving is not WhatMoves.SIMULATED:
             raise RefusedError(
-                f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
-                "the option out."
+                f"--seed: the noise of {moving.value} of {profile.path} is not made here; omit "
+                "the option."
             )
         assert profile.rig.simulation is not None
         simulation = replace(profile.rig.simulation, seed=seed)
@@ -183,12 +183,11 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise NoRoomError(
-            f"{folder} cannot be made a folder ({error.strerror}); choose another (--output)."
+            f"{folder} cannot be created ({error.strerror}); choose another (--output)."
         ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise NoRoomError(
-            f"{folder}: you may not write there; have its owner open it, or choose another folder "
-            "(--output)."
+            f"{folder}: no write permission; ask its owner, or choose another folder (--output)."
         )
 
 
@@ -214,15 +213,15 @@ def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         raise NoRoomError(
-            f"{folder}: how much room there is cannot be told ({error.strerror}); see whether its "
-            "disk is there."
+            f"{folder}: free disk space is unknown ({error.strerror}); check that the "
+            "disk is mounted."
         ) from error
     needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
     if free - needed < limits.disk_free_mb * 1e6:
         raise NoRoomError(
-            f"{folder}: {free / 1e6:.1f} MB are free on its disk, of which the session may take "
-            f"{needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB have to "
-            "be left; make room or choose another folder (--output)."
+            f"{folder}: {free / 1e6:.1f} MB free, of which the session may need "
+            f"{needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB must "
+            "remain free; free up space or choose another folder (--output)."
         )
 
 

@@ -170,7 +170,7 @@ class Rig:
         if self.zero_lost:
             raise RigError(
                 "The zero of the angle was lost with the connection, and the limits with it; move "
-                "the motor to its middle and run rigd zero."
+                "the motor to mid-travel and run rigd zero."
             )
         if self._precedence is not None:
             self._precedence.cover()
@@ -268,7 +268,7 @@ class Rig:
         if message is None and still_s > CONTROL.hung_after_s:
             crew.control.kill()
             message = Ended(
-                f"The control process has not moved for {still_s:.1f} s. Check CPU load."
+                f"The control process has not responded for {still_s:.1f} s. Check CPU load."
             )
         if message is not None:
             self.disconnect()
@@ -382,6 +382,6 @@ def _lay_out(crew: ProcessGroup, rate_hz: float, *, fast: bool) -> None:
         crew.lay_out(rate_hz, fast=fast)
     except OSError as error:
         raise RigError(
-            f"The processes of a session get no shared memory ({error.strerror}); look at the "
+            f"No shared memory for the session processes ({error.strerror}); check the "
             "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
         ) from error

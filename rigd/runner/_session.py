@@ -276,7 +276,7 @@ class Session:
             )
         except OSError as error:
             raise SessionFailedError(
-                f"A session of this length gets no shared memory ({error.strerror}); look at the "
+                f"No shared memory for a session this long ({error.strerror}); check the "
                 "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
             ) from None
         self._open_file()
@@ -345,7 +345,7 @@ class Session:
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
             still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
-                return self._kill_control(f"has not moved for {hung_after_s:g} s (check CPU load)")
+                return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
                 return self._understood(answer)
             if self._recorder_lost is None:
@@ -378,7 +378,7 @@ class Session:
         self._crew.control.kill()
         return self._control_died(
             f"The control process {why} and was killed: without its heartbeat the drive switches "
-            "itself off. See that it has."
+            "itself off. Check that it is off."
         )
 
     def _control_died(self, reason: str) -> Finished:

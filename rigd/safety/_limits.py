@@ -218,7 +218,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "No motor moves like this: look at encoder, its cable and shield, and set the zero anew.",
+        "Implausible motion: check the encoder, its cable and shield, and set the zero again.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -240,7 +240,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.LOOK,
         Action.FAULT,
-        "Let the motor cool down for a minute, then ask for less.",
+        "Let the motor cool down for a minute, then lower the amplitude.",
     ),
     Interlock(
         "wrench range",

@@ -48,7 +48,7 @@ RETURNING: Final = State("RETURNING", ORANGE, "The record is over.")
 SUPERVISOR_SILENT: Final = State(
     "SUPERVISOR NOT RESPONDING",
     RED,
-    "Nobody could stop the session now; it is aborted after 2 s. Check CPU load.",
+    "The session cannot be stopped now; it is aborted after 2 s. Check CPU load.",
 )
 SUPERVISOR_SILENT_TORQUE_OFF: Final = State(
     "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."

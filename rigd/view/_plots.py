@@ -211,10 +211,10 @@ TORQUES = Plot(
 )
 LOOP = Plot(
     "loop_us",
-    "Lateness and work time of the loop (µs)",
+    "Wake-up latency and execution time of the loop (µs)",
     (
-        Curve("wake-up after schedule (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
-        Curve("work of the tick (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
+        Curve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
+        Curve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
     ),
     least_span=100.0,
 )
@@ -248,10 +248,10 @@ FAULTY_TICKS = Plot(
 )
 BACKLOG = Plot(
     "backlog_samples",
-    "Recorder's lag and not shown (samples)",
+    "Recorder backlog and samples dropped by the viewer",
     (
         Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
-        Curve("dropped by the view (samples)", GREY, lambda r: r["view_dropped"]),
+        Curve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
     ),
     least_span=100.0,
 )
@@ -269,7 +269,7 @@ BUS_ERRORS = Plot(
 )
 SENSOR_STATUS = Plot(
     "sensor_status",
-    "Status word of the sensor (0: well)",
+    "Status word of the sensor (0: OK)",
     (Curve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
 )
 DISK = Plot(

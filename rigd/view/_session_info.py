@@ -292,7 +292,7 @@ def _number(value: float | None, form: str = "{:.0f}") -> str:
 def _status(word: float | None) -> str:
     if word is None:
         return ""
-    return f"0x{int(word):04x}" if word else "well"
+    return f"0x{int(word):04x}" if word else "OK"
 
 
 def _disk(free_mb: float | None) -> str:

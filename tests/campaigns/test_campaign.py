@@ -157,7 +157,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
         assert order.interval[0] < 1 < order.interval[1]
     assert verdict.dissent == ()
     stated, structure, *_ = verdict.sentences
-    assert stated.startswith("The files are not of one specimen, they state 2: beam_length_m 0.98")
+    assert stated.startswith("The files state 2 different specimens: beam_length_m 0.98")
     assert structure.startswith(
         "The numbers are those of type VI: internal damping (alpha free) and external"
     )

@@ -93,7 +93,7 @@ def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
     monkeypatch.setattr("time.sleep", lambda _: announce(address))  # while it waits
     done = rigd_here("live", "--web", "--wait")
     assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")
-    assert "Waiting for a live view to begin; Ctrl-C ends." in done.stderr
+    assert "Waiting for a live view to start; Ctrl-C quits." in done.stderr
 
 
 def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
@@ -164,7 +164,7 @@ def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkey
     assert window.connected == [2, 3, 3]
     said = capsys.readouterr().err
     assert said.count("has ended; the window stays, and shows the next one") == 1
-    assert said.count("The live view of sim has begun anew.") == 2
+    assert said.count("The live view of sim has restarted.") == 2
 
 
 def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(

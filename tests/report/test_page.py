@@ -237,7 +237,7 @@ def test_what_is_shown_is_the_number_rounded(record_result):
 
 
 def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold):
-    reason = "the record does not tell the order"
+    reason = "the record does not determine the order"
     careful = retold(
         record_result,
         headline=of_fit("VI", record_result.whole.fit, (1, 2, 3), {"alpha": reason}),
@@ -256,7 +256,7 @@ def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold)
 
 def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result):
     fit = record_result.whole.fits["VII"]
-    flagged = of_fit("VII", fit, (1, 2, 3), {"alpha": "the record does not tell the order"})
+    flagged = of_fit("VII", fit, (1, 2, 3), {"alpha": "the record does not determine the order"})
     told = " ".join(damping_sentences(flagged))
     assert "internal damping" not in told
     assert "The external damping has a loss factor of" in told

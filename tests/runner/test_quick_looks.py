@@ -117,8 +117,8 @@ def test_of_too_many_the_oldest_are_left_out(looks, tmp_path):
     for name in names:
         looks.begin(tmp_path / f"{name}.mcap")
     assert [(each.session.stem, each.error) for each in looks.told] == [
-        ("a", "later sessions came first."),
-        ("b", "later sessions came first."),
+        ("a", "skipped in favour of later sessions."),
+        ("b", "skipped in favour of later sessions."),
     ]
     (tmp_path / "waits.go").touch()
     assert [each.session.stem for each in done(looks)] == ["a", "b", "waits", "c", "d", "e"]

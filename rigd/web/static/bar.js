@@ -18,7 +18,7 @@ export class Bar {
   #link;
   #status = null;
   #progress = null;
-  #gone = "The page connects to its server.";
+  #gone = "Connecting to the server …";
   #connected = false;
   #stopped = "";
 
@@ -106,7 +106,7 @@ export class Bar {
     if (this.#status === null) return "";
     const { doing, reason, zero_lost: zeroLost } = this.#status;
     const busy = doing && word !== "CONNECTING" ? `Busy: ${doing}. ` : "";
-    const zero = zeroLost ? "The zero is lost: move the motor to its middle and press Zero. " : "";
+    const zero = zeroLost ? "The zero is lost: move the motor to mid-travel and press Zero. " : "";
     return `${busy}${zero}${sentence(reason)}`;
   }
 

@@ -68,7 +68,7 @@ const RESULTS = {
   reset: ({ zero_lost: lost }) => [
     make("p", {}, `${at()}Fault reset.`),
     ...(lost ? [make("p", { class: "refused" },
-      "The zero is lost: move the motor to its middle and press Zero.")] : [])],
+      "The zero is lost: move the motor to mid-travel and press Zero.")] : [])],
   tare: ({ mean, std, torque_std_nm: torque }) => [
     make("p", {}, `${at()}Tare; s.d. of the coupling torque ${withUnit(torque, "N·m")}.`),
     make("table", {}, make("thead", {}, make("tr", {}, ...["Axis", "Mean", "S.d."].map((text) =>
@@ -98,5 +98,5 @@ function calibrationText(calibration) {
   const { serial, age: made } = calibration;
   const date = Date.parse(made);  // some sensors tell a date, others whatever was typed in
   const old = Number.isFinite(date) ? ` (${age(date * 1e6)})` : "";
-  return [serial, made && `${made}${old}`].filter(Boolean).join(", ") || "not told by the sensor";
+  return [serial, made && `${made}${old}`].filter(Boolean).join(", ") || "not stated by the sensor";
 }

@@ -161,7 +161,7 @@ export class Sessions {
 
   #count() {
     const count = this.#ticked.size;
-    setText(byId("ticked"), count ? `${count} ticked` : "Tick sessions to compare them");
+    setText(byId("ticked"), count ? `${count} selected` : "Select sessions to compare");
     byId("overlay").disabled = count < 1 || count > MOST_CURVES;
     byId("overlay").title = count > MOST_CURVES ? `At most ${MOST_CURVES} responses` : "";
     byId("campaign").disabled = count < 2 || !this.#link.token;
@@ -169,7 +169,7 @@ export class Sessions {
 
   async #compare() {
     const ids = [...this.#ticked.keys()];
-    this.#say("The responses are computed …");
+    this.#say("Computing the responses …");
     const found = await this.#link.get(`/api/frf?ids=${ids.map(encodeURIComponent).join(",")}`);
     if (found === null) {
       this.#say("The responses cannot be computed at the moment.");
