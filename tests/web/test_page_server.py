@@ -56,7 +56,10 @@ async def command(session, headers=ACTING, **request):
         return answer.status, await answer.json()
 
 
-def test_a_page_that_opens_is_told_of_rig_state_and_model(pages):
+def test_a_page_that_opens_is_told_of_rig_state_and_model(served, pages):
+    # After a standstill of the computer the daemon may not have been heard again yet.
+    assert eventually(lambda: served.server._status is not None, within_s=30.0)
+
     async def scenario(session):
         async with session.ws_connect("/api/live") as socket:
             _, before = await until(socket, "nominal")
@@ -72,6 +75,21 @@ def test_a_page_that_opens_is_told_of_rig_state_and_model(pages):
     }  # fmt: skip
     assert all(option["help"] for kind in hello["excitations"].values() for option in kind)
     assert set(hello["excitations"]) == {"chirp", "hold", "step", "multisine", "file", "modes"}
+
+
+def test_specimens_that_have_a_file_are_offered(served, pages, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "specimens" / "long one.toml"
+    file.parent.mkdir()
+    file.touch()
+    finding = served.server._find_specimens()
+    asyncio.run_coroutine_threadsafe(finding, served.loop).result(30.0)
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            return (await until(socket, "hello"))[0]
+
+    assert "long one" in pages.run(scenario)["specimens"]
 
 
 @pytest.mark.parametrize(
