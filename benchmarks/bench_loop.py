@@ -5,8 +5,8 @@
 In each round, 10 s each at 1 kHz, same core and policy: cyclictest (package rt-tests), the loop
 alone, the loop with the last 100 µs of each wait busy-polled, and a whole session with recorder,
 live view and a stranger that computes on the other cores. Ratios are medians over the rounds. Then
-the highest rate that holds 99.9 % of its ticks, with the recorder: of all, and of those that did not
-pass while the computer stood still for 2 ms or more, as virtual machines do.
+the highest rate that holds 99.9 % of its ticks, with the recorder: of all, and of those that did
+not pass while the computer stood still for 2 ms or more, as virtual machines do.
 """
 
 import os
