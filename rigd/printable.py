@@ -55,6 +55,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     counts
         ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
         ``stale_wrenches``, as numbers or as texts; of the last three only what occurred is told.
+        None: it is not known, as of a file that nobody could read.
 
     Examples
     --------
@@ -64,12 +65,16 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     """
     rare = ("lost", "stale_angles", "stale_wrenches")
     told = [
-        f"{grouped(int(counts['recorded']))} of {grouped(int(counts['scheduled']))} samples",
-        *(f"{grouped(int(counts[name]))} {name}" for name in ("missed", "late")),
+        f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
+        *(f"{_count_text(counts[name])} {name}" for name in ("missed", "late")),
         *(
-            f"{grouped(int(counts[name]))} {name.replace('_', ' ')}"
+            f"{_count_text(counts[name])} {name.replace('_', ' ')}"
             for name in rare
             if int(counts.get(name) or 0)
         ),
     ]
     return ", ".join(told)
+
+
+def _count_text(count: int | str | None) -> str:
+    return "unknown" if count is None else grouped(int(count))

@@ -139,7 +139,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
         note=_text(metadata, "note"),
         outcome=ended,
         reason=_text(outcome, "reason"),
-        duration_s=ticks / rate_hz if ticks is not None and rate_hz > 0 else None,
+        duration_s=_finite(ticks / rate_hz) if ticks is not None and rate_hz > 0 else None,
         scheduled=scheduled,
         recorded=summary.samples,
         missed=_count(outcome, "missed"),

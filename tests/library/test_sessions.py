@@ -32,6 +32,12 @@ def test_what_file_look_and_report_say_stands_in_the_row(
     assert row.modes[0]["damping_ratio"]["interval_95"] == pytest.approx([0.0045, 0.0055])
 
 
+def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path):
+    record_briefly("first", rate_hz="1e-310")
+    (row,) = list_sessions(tmp_path)
+    assert row.duration_s is None
+
+
 def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_look, tmp_path):
     modes = [mode(2.5) | {"shown": True}, mode(16.3) | {"shown": False}]
     write_look(record_briefly("first"), *modes)
