@@ -572,7 +572,10 @@ def _play(case: Case, scene: Scene) -> Verdict:
 def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
     """Wait until the last process of the session is gone, and look for what it leaves."""
     ended_s = time.monotonic()
-    while (left := scene.processes()) and time.monotonic() - ended_s < _ENDED_S:
+    # A killed process is seen to be gone before the last of its threads has let its locks go.
+    while (left := scene.processes()) or scene.locks_held:
+        if time.monotonic() - ended_s > _ENDED_S:
+            break
         time.sleep(0.02)
     verdict.gone_s = verdict.gone_s or time.monotonic() - from_s
     for command in left.values():

@@ -236,8 +236,8 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     assert session.board[Word.STALE_ANGLES] == len(stale)
     # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
-    assert warning.startswith("The share of ticks without a new angle of 5 %")
-    assert "its limit is 10 % (limits.stale_percent)" in warning
+    assert warning.startswith("Share of ticks without a new angle 5 % above warning level")
+    assert "limit 10, limits.stale_percent" in warning
 
 
 def test_two_of_three_angles_may_not_be_old(make_session):
@@ -500,7 +500,7 @@ def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
     )
     session.run()
     assert session.finished.outcome == "complete"
-    assert any("still swings" in event.message for event in session.events)
+    assert any("still vibrates" in event.message for event in session.events)
     assert not any(event.level == "warning" for event in session.events)
     assert "tare_drift_nm" not in session.finished.results
 
@@ -574,7 +574,7 @@ def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
     session = make_session(clock=clock)
     clock.board = session.board
     finished = session.run().finished
-    assert "stood still for 60 ticks" in finished.reason
+    assert "stalled for 60 ticks" in finished.reason
     session.assert_safe()
 
 

@@ -106,7 +106,7 @@ def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
 
 
 def complete(done: Done) -> str:
-    return "ok" if done.code == 0 and "complete" in done.said else f"{done.code}: {done.last}"
+    return "ok" if done.code == 0 and "Complete: " in done.said else f"{done.code}: {done.last}"
 
 
 def play_session_with_fault(scene: Scene) -> str:
