@@ -57,8 +57,12 @@ def test_session_fault_reset_session(trial, eds_file):
 
 @pytest.mark.parametrize(
     ("without", "accepted"),
-    [((*SPARSE, "6072"), ["torque_limit"]), (("1016",), [])],
-    ids=["sparse", "deadline of the RPDO for a heartbeat"],
+    [
+        pytest.param((*SPARSE, "6072"), ["torque_limit"], id="sparse"),
+        pytest.param(
+            *(("1016",), []), id="deadline of the RPDO for a heartbeat", marks=pytest.mark.slow
+        ),
+    ],
 )
 def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepted):
     path = eds_file(without=without)

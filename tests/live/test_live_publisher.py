@@ -131,6 +131,7 @@ def test_ends_with_its_input_and_takes_the_server_along(publisher):
     assert not own & listeners()
 
 
+@pytest.mark.slow
 def test_stays_open_for_as_long_as_asked(start_publisher):
     publisher = start_publisher(linger_s=2.5)
     began_s = time.monotonic()
@@ -206,6 +207,7 @@ def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher
     assert producer.refused == 0
 
 
+@pytest.mark.slow
 def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher, receive, own_port):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
@@ -225,7 +227,7 @@ def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher,
     assert producer.refused == 0
 
 
-@pytest.mark.parametrize("frozen_first", [False, True])
+@pytest.mark.parametrize("frozen_first", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_killed_server_is_replaced_where_viewers_find_it(
     start_producer, start_publisher, receive, own_port, frozen_first
 ):
@@ -258,6 +260,7 @@ def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, star
     assert producer.refused == 0
 
 
+@pytest.mark.slow
 def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, start_publisher):
     producer = start_producer(capacity=4000)
     first = start_publisher(producer)

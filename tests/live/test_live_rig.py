@@ -168,6 +168,7 @@ def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run):
     assert (result.outcome, result.live_dropped) == ("complete", 0)
 
 
+@pytest.mark.slow
 def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig, run):
     killed = set()
     stop = StopRequest()

@@ -5,6 +5,7 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
 from processes import eventually
 
 
@@ -71,6 +72,7 @@ def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receiv
     assert columns("/signals", "angle_mrad")[0].size > 100
 
 
+@pytest.mark.slow
 def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
     start_producer, start_publisher, receive
 ):

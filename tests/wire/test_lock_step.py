@@ -84,6 +84,7 @@ def test_samples_equal_those_of_the_direct_simulation(
     assert command.std() < 0.05 * theirs["torque_command_nm"].std()
 
 
+@pytest.mark.slow
 def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator, load, tmp_path):
     """For longer than the simulated drive waits for a host, which is 5 s; then its STO is told."""
     profile = load(quiet_profile("antenna_can", {"cia402.enable_timeout_s": "0.1"}))

@@ -147,7 +147,9 @@ def test_real_time_cannot_be_skipped_unless_in_lock_step(
     assert "--seed: the noise of rigd simulate" in done.stderr
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
+)
 def test_without_the_loop_the_drive_goes_off_by_itself(
     how, quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
 ):
