@@ -248,7 +248,7 @@ FAULTY_TICKS = Plot(
 )
 BACKLOG = Plot(
     "backlog_samples",
-    "Recorder backlog and samples dropped by the viewer",
+    "Backlog of the recorder, dropped by the viewer (samples)",
     (
         Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
         Curve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),

@@ -117,7 +117,7 @@ def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
     first, second = stated_specimens(stated, one)
     assert (first.paths, second.paths) == ((Path("a"), Path("c")), (Path("b"),))
     (said,) = specimen_sentences.specimens(Homogeneity((first, second), ()))
-    assert "they state 2: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 " in said
+    assert "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 " in said
     assert "1e-05 kg·m² in 1 file (b)" in said
 
 
@@ -144,16 +144,16 @@ def mixture(
 
 def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     stated, differing, where, structure, *_ = mixture.verdict.sentences
-    assert "they state 2: beam_length_m 0.98 m in 4 files (0.mcap, 1.mcap" in stated
+    assert "2 different specimens: beam_length_m 0.98 m in 4 files (0.mcap, 1.mcap" in stated
     assert "beam_length_m 1 m in 1 file (longer.mcap)" in stated
-    assert "all that follows is of beam_length_m 0.98 m" in stated
+    assert "all results below are for beam_length_m 0.98 m" in stated
     assert differing.startswith("The sessions are not of one specimen in one state: frequency of")
     assert "in 2 files (0.mcap, 1.mcap)" in where
     assert "in 2 files (stiff20.mcap, stiff21.mcap)" in where
     assert structure.startswith("The numbers are those of type VI")
     assert "Type III has the lowest BIC" in structure
     assert not any("No between-session variance" in each for each in mixture.verdict.sentences)
-    assert campaign_text(mixture).startswith("The files are not of one specimen")
+    assert campaign_text(mixture).startswith("The files state 2 different specimens")
 
 
 def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
@@ -193,7 +193,7 @@ def test_page_and_json_tell_it_too(mixture):
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
     page = campaign_page(mixture, (), datetime.now(UTC), with_paper=False)
-    assert page.index("The files are not of one specimen") < page.index("type VI: internal damping")
+    assert page.index("The files state") < page.index("type VI: internal damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page
         assert content[name]

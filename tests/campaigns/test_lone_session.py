@@ -33,7 +33,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
     assert result.returncode == 1
     (error,) = errors(result)
     assert "nosuch.mcap cannot be read: No such file" in error
-    assert "ok.mcap is reported by itself" in result.stderr
+    assert "ok.mcap is reported alone" in result.stderr
     assert "Warning" not in result.stderr
     assert "Report of ok.mcap: ok.report/report.html" in result.stdout
     assert (tmp_path / "ok.report" / "report.html").exists()

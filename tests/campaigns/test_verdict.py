@@ -63,7 +63,7 @@ def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_o
     [
         (101.5, said(), "open", None),  # an integer explains as much: 6 in BIC, less one ln 400
         (150.0, said(adequate=False), "open", "unexplained"),
-        (150.0, said(modes=(1,)), "not identifiable", "one mode alone"),
+        (150.0, said(modes=(1,)), "not identifiable", "a single mode determines"),
     ],
 )
 def test_an_order_is_not_called_fractional(estimates_of, rival, verdict, status, reason):

@@ -100,7 +100,7 @@ def test_specimens_are_listed_with_their_beams_and_problems(listed, tmp_path):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--meta", "temperature_c"], "--meta 'temperature_c': is not NAME=VALUE"),
+        (["--meta", "temperature_c"], "--meta 'temperature_c': must be NAME=VALUE"),
         (["--meta", "batch=1", "--meta", "batch=2"], "--meta 'batch=2': is given twice"),
         (["--meta", "temperature_c=21,4"], "temperature_c = '21,4' is not a finite number"),
     ],

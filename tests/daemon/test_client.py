@@ -94,7 +94,7 @@ def test_a_full_queue_is_not_waited_for_for_ever(path):
         listener.bind(str(path))
         listener.listen(0)
         first.connect(str(path))
-        with pytest.raises(DaemonGoneError, match=r"suspended.*not known.*STO"):
+        with pytest.raises(DaemonGoneError, match=r"suspended.*may still be running.*STO"):
             Client(path, connect_s=0.05)
 
 
@@ -141,7 +141,7 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     said = raised.value.told()
     assert f"process {process.pid}" in said
     assert STOP_SIGNAL.name in said
-    assert "not known" in said
+    assert "may still be running" in said
     assert "STO" in said
 
 
@@ -182,7 +182,7 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     finally:
         control.kill()
         control.communicate()
-    assert "not known" in what_is_left(os.getpid(), os.getuid())
+    assert "may still be running" in what_is_left(os.getpid(), os.getuid())
 
 
 def test_a_process_that_is_dead_but_not_buried_is_gone():
@@ -243,7 +243,7 @@ def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypa
     began_s = time.monotonic()
     assert await_end(path, 0.3) is None
     crowded.clear()
-    with pytest.raises(DaemonGoneError, match="not known"):
+    with pytest.raises(DaemonGoneError, match="may still be running"):
         await_end(path, 0.3)
     assert time.monotonic() - began_s < 30.0  # and not the minute of other answers
     listener.close()

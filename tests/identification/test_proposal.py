@@ -50,7 +50,7 @@ def test_what_cannot_be_negative_is_proposed_as_zero(profile):
 def test_a_scale_that_is_not_told_is_not_proposed(profile):
     proposal = propose(replace(ESTIMATE, torque_scale=Quantity(1.0, None)), profile)
     assert "rated_torque_nm" not in "\n".join(proposal.toml())
-    assert any("not told" in line for line in proposal.table())
+    assert any("not identifiable" in line for line in proposal.table())
     assert "is not identifiable" in proposal.notes[0]
     assert proposal.as_dict()["torque_scale"] == {"value": 1.0, "std": None}
     assert proposal.as_dict()["parameters"]["motor.rated_torque_nm"]["differs"] is None

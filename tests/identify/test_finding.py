@@ -24,7 +24,7 @@ from analysis.identify._finding import SEEN, Finding, doubted
 )
 def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
     found = doubted(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."), "it rains")
-    assert found.sentence == f"No fact while it rains: {bare}"
+    assert found.sentence == f"Not established, because it rains: {bare}"
     assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
 
 

@@ -188,7 +188,7 @@ def test_one_mode_tells_no_order(one_mode):
         assert any(name in said and "not identifiable" in said for said in one_mode.sentences)
         assert name not in one_mode.parameters
     for name in told.parameters.keys() & {"zeta", "alpha", "gamma", "lambda"}:
-        assert "one mode alone" in told.parameters[name].flag
+        assert "a single mode determines" in told.parameters[name].flag
     assert all("one mode alone" in each.size.flag for each in told.sizes)
     (mode,) = told.modes
     assert mode.damping_ratio.flag is None

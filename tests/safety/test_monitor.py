@@ -218,7 +218,7 @@ def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
     assert (tmp_path / "sessions").is_dir()
     monkeypatch.setattr("shutil.disk_usage", usage(75.0))
     with pytest.raises(
-        RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
+        RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* free up space"
     ):
         make_room(tmp_path / "sessions", excitation, LIMITS)
 

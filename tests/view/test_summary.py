@@ -27,7 +27,7 @@ def test_a_session_that_goes_well(subject):
         "dropped by the viewer": "0 samples",
         "bus load": "31 %",
         "bus errors": "0",
-        "sensor status": "well",
+        "sensor status": "OK",
         "free on the disk": "51.2 GB",
     }
 

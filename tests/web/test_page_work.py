@@ -281,7 +281,7 @@ def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
     assert page.is_disabled("#overlay")
     for row in (1, 3):
         page.check(f"#rows tr:nth-child({row}) input")
-    says(page, "#ticked", "2 ticked")
+    says(page, "#ticked", "2 selected")
     page.click("#overlay")
     page.wait_for_selector("#comparison", state="visible")
     assert page.locator("#comparison-keys .key").count() == 2
