@@ -24,14 +24,16 @@ MOST_JOBS: Final = 16
 _PROGRAM: Final = (sys.executable, "-P", "-m", "analysis")
 _MORTAL: Final = """
 import os, signal, sys
-from rigd.runtime import signal_when_orphaned
+from rigd.runtime import killed_first, signal_when_orphaned
 
+killed_first()
 signal_when_orphaned(signal.SIGKILL)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
 if os.getppid() == int(sys.argv[1]):
     os.execv(sys.argv[2], sys.argv[2:])
 """
-"""Program that becomes another one, which ends with the process that is named first."""
+"""Program that becomes another one, which ends with the process that is named first, or if memory
+runs out."""
 _LOOK_S: Final = 0.2
 _MOST_SAID: Final = 1000
 _MOST_LINES: Final = 3

@@ -134,6 +134,7 @@ def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
         jobs.paused = False
         await wait_for(lambda: state_of(pid) == "S")
         assert job.state == "running"
+        assert Path(f"/proc/{pid}/oom_score_adj").read_text() == "1000\n"
         return pid, niceness
 
     pid, niceness = run(jobs, scenario)
