@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.runtime import raise_on, signal_when_orphaned, use_one_thread
+from rigd.runtime import killed_first, raise_on, signal_when_orphaned, use_one_thread
 from rigd.session import LOOK_SUFFIX, SessionError, look_path
 from rigd.units import decimals
 
@@ -535,6 +535,7 @@ def main() -> None:
         signal_when_orphaned(signal.SIGKILL)
         if os.getppid() != asked.parent:  # it was gone before
             sys.exit(1)
+    killed_first()
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     use_one_thread()

@@ -115,26 +115,32 @@ def start_sessions(
         "notes": notes,
         "force": force,
     }
-    with daemon_of(profile) as client, _Interrupts.caught() as interrupts:
+    with daemon_of(profile) as client:
         daemon = client.ask("status")["daemon"]
         typer.echo(daemon["what_moves"], err=True)
         if not detach:
             client.ask("watch")
-        told = client.ask("start", **request)
-        if detach and interrupts.count:
-            client.ask("stop")
-            raise typer.Exit(EXIT_INTERRUPTED)
-        if detach:
-            if as_json:
-                typer.echo(json.dumps({"series": told["series"]}))
-            else:
-                _tell_plan(told["plan"], err=False)
-                typer.echo("Running; rigd status shows the progress, rigd stop ends the session.")
-            return
-        _tell_plan(told["plan"], err=as_json)
-        # A daemon of before an update makes none.
-        looks = daemon.get("quick_looks", False)
-        series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
+        with _Interrupts.caught() as interrupts:
+            told = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
+            if told["reply"] == "stop":
+                typer.echo("Stopped before the session began.", err=True)
+                raise typer.Exit(EXIT_INTERRUPTED)
+            if detach and interrupts.count:
+                client.ask("stop")
+                raise typer.Exit(EXIT_INTERRUPTED)
+            if detach:
+                if as_json:
+                    typer.echo(json.dumps({"series": told["series"]}))
+                else:
+                    _tell_plan(told["plan"], err=False)
+                    typer.echo(
+                        "Running; rigd status shows the progress, rigd stop ends the session."
+                    )
+                return
+            _tell_plan(told["plan"], err=as_json)
+            # A daemon of before an update makes none.
+            looks = daemon.get("quick_looks", False)
+            series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:

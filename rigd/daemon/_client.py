@@ -7,7 +7,7 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -35,6 +35,7 @@ _SIGNAL_AFTER_S = 0.3
 _END_PATIENCE_S = 3.0
 """Time in which what a dead daemon has left ends by itself."""
 _PAUSE_S = 0.02
+_LOOK_S = 0.1
 _TIME = struct.Struct("@ll")
 _UNKNOWN = (
     "A session may still be running: check the rig, and press the wired stop (STO) if "
@@ -166,6 +167,11 @@ class Client:
         **fields
             Its further fields.
 
+        Returns
+        -------
+        dict
+            The reply.
+
         Raises
         ------
         RefusedByDaemonError
@@ -173,10 +179,41 @@ class Client:
         DaemonGoneError
             If there is none.
         """
+        return self._ask(command, fields, lambda: False)
+
+    def ask_unless(self, stopped: Callable[[], bool], command: str, **fields: object) -> Document:
+        """Ask as :meth:`ask` does, and cancel the request once a stop is wanted.
+
+        Parameters
+        ----------
+        stopped
+            Whether a stop is wanted; asked some times a second until there is a reply.
+        command
+            A request of docs/control_socket.md that a `stop` cancels.
+        **fields
+            Its further fields.
+
+        Returns
+        -------
+        dict
+            The reply, or that to the `stop` (``reply`` says which): the request is cancelled then.
+
+        Raises
+        ------
+        RefusedByDaemonError
+            If the reply is a refusal.
+        DaemonGoneError
+            If there is none.
+        """
+        return self._ask(command, fields, stopped)
+
+    def _ask(
+        self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
+    ) -> Document:
         deadline_s = time.monotonic() + min(_CROWD_PATIENCE_S, self._answer_s)
         while True:
             try:
-                return self._ask_once(command, fields)
+                return self._ask_once(command, fields, stopped)
             except _CrowdedError:
                 if time.monotonic() > deadline_s:
                     raise
@@ -184,11 +221,19 @@ class Client:
                 self.close()
                 self._connect()
 
-    def _ask_once(self, command: str, fields: dict[str, object]) -> Document:
+    def _ask_once(
+        self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
+    ) -> Document:
         self.send(command, **fields)
+        stopping = False
         deadline_s = time.monotonic() + self._answer_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
-            message = self._next(left_s)
+            if stopped() and not stopping:
+                # On this connection: on another one it might be obeyed before the request.
+                self.send("stop")
+                stopping = True
+                deadline_s = min(deadline_s, time.monotonic() + _STOP_PATIENCE_S)
+            message = self._next(min(left_s, _LOOK_S))
             if message is None:
                 continue
             if "event" in message:

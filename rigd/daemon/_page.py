@@ -11,6 +11,7 @@ import secrets
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 PAGE_PORT: Final = 8720
 """Port of the page unless another is asked for."""
 _MOST_STARTS: Final = 5
+"""Starts in a row of which none has lasted."""
+_LASTING_S: Final = 60.0
 _PAUSE_S: Final = 1.0
 _GRACE_S: Final = 3.0
 
@@ -93,11 +96,16 @@ class PageProcess:
 
     def _attend(self) -> None:
         """Keep it running; in a thread of its own."""
-        for _ in range(_MOST_STARTS):
+        starts = 0
+        while starts < _MOST_STARTS:
+            starts += 1
+            began_s = time.monotonic()
             try:
                 self._run()
             except OSError as error:
                 _log.warning("page: its process cannot be started (%s)", error.strerror)
+            if time.monotonic() - began_s >= _LASTING_S:
+                starts = 0
             self._on_address(None)
             if self._closing.wait(_PAUSE_S):
                 return

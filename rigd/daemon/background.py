@@ -2,7 +2,7 @@
 
 They take processor time, and anybody may ask for a prediction while a session runs. In the daemon's
 own process they would hold the interpreter that supervises the session; theirs has the lowest
-priority of an ordinary program.
+priority of an ordinary program, and a part of the free memory.
 """
 
 import asyncio
@@ -14,15 +14,20 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile
-from rigd.runtime import SINGLE_THREADED
+from rigd.runtime import SINGLE_THREADED, killed_first
 
 _PATIENCE_S: Final = 60.0
 _MOST_BYTES: Final = 4 << 30
+_LEAST_BYTES: Final = 256 << 20
+"""A session of two minutes takes 180 MiB, of which 120 MiB are the program."""
+_SHARE: Final = 0.25
+"""Part of the available memory: of the processes of a session only control locks its own."""
 _LOWEST_PRIORITY: Final = 19
 
 
@@ -147,15 +152,28 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
 def main() -> None:
     """Do the job that standard input brings; the result goes to standard output as JSON."""
     os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
-    resource.setrlimit(resource.RLIMIT_AS, (_MOST_BYTES, _MOST_BYTES))
+    killed_first()
+    most_bytes = _memory_limit()
+    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
     job = pickle.load(sys.stdin.buffer)
     try:
         answer = job.perform()
     except RigdError as error:
         answer = {"error": str(error), "wrong_use": error.wrong_use}
     except MemoryError:
-        answer = {"error": "There is not enough memory for such a session.", "wrong_use": True}
+        answer = {
+            "error": "There is not enough free memory to predict such a session; shorten it, or "
+            "close other programs.",
+            "wrong_use": True,
+        }
     sys.stdout.write(json.dumps(answer, allow_nan=False))
+
+
+def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:
+    """Return how many bytes of address space a job may have."""
+    text = meminfo.read_text()
+    available = int(text.partition("MemAvailable:")[2].split()[0]) * 1024
+    return int(min(max(_SHARE * available, _LEAST_BYTES), _MOST_BYTES))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,8 @@ from rigd.session import look_path
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0
 """Time in which a look has to be done, without that for which it was suspended."""
+_END_S: Final = 0.5
+"""Longest wait, when this process ends, for a look that was killed."""
 _MOST_WAITING: Final = 3
 """Looks that wait; of more, the oldest is left out. Only sessions on each other's heels need it."""
 _MOST_BYTES: Final = 1_000_000
@@ -142,7 +144,9 @@ class QuickLooks:
             self._held = True
             self._waiting.clear()
             if self._process is not None:
-                self._end(self._process)
+                self._process.kill()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.communicate(timeout=_END_S)
                 self._process = None
 
     def _see(self) -> Iterator[QuickLook]:
@@ -152,12 +156,15 @@ class QuickLooks:
         now_s = time.monotonic()
         self._left_s -= now_s - self._looked_s
         self._looked_s = now_s
-        if self._process.poll() is None and self._left_s > 0.0:
+        slow = self._left_s <= 0.0
+        if self._process.poll() is None:
+            if slow:
+                # Not waited for: at the lowest priority it ends when others leave it the time.
+                self._process.kill()
             return
-        slow = self._process.returncode is None
-        said = self._end(self._process)
+        said = self._process.communicate()[1]
         code, self._process = self._process.returncode, None
-        if slow:
+        if slow and code == -signal.SIGKILL:
             yield QuickLook.failed(self._session, f"it took longer than {_LONGEST_S:g} s.")
         elif code != 0:
             words = said.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MOST_SAID]
@@ -209,10 +216,3 @@ class QuickLooks:
     def _signal(self, number: signal.Signals) -> None:
         if self._process is not None:
             self._process.send_signal(number)
-
-    @staticmethod
-    def _end(process: "subprocess.Popen[str]") -> str:
-        """End a process, be it suspended, and return what it said on standard error."""
-        process.kill()  # nothing is sent to one that has ended
-        said = process.communicate()[1]
-        return str(said)

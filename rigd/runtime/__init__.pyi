@@ -14,6 +14,7 @@ from ._locks import RigLock as RigLock
 from ._signals import StopRequest as StopRequest
 from ._signals import held_back as held_back
 from ._signals import ignore as ignore
+from ._signals import killed_first as killed_first
 from ._signals import let_pass as let_pass
 from ._signals import raise_on as raise_on
 from ._signals import signal_when_orphaned as signal_when_orphaned

@@ -1,6 +1,6 @@
 """Jobs of the page: reports, campaigns and exports by `analyze`, at idle priority.
 
-They stand still while a session runs.
+They stand still while a session runs, and end with the page however that ends.
 """
 
 import asyncio
@@ -20,7 +20,20 @@ Document = dict[str, Any]
 
 MOST_JOBS: Final = 16
 """Jobs that may wait."""
-_PROGRAM: Final = (sys.executable, "-m", "analysis")
+# -P: a folder of that name among the sessions is another one.
+_PROGRAM: Final = (sys.executable, "-P", "-m", "analysis")
+_MORTAL: Final = """
+import os, signal, sys
+from rigd.runtime import killed_first, signal_when_orphaned
+
+killed_first()
+signal_when_orphaned(signal.SIGKILL)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
+if os.getppid() == int(sys.argv[1]):
+    os.execv(sys.argv[2], sys.argv[2:])
+"""
+"""Program that becomes another one, which ends with the process that is named first, or if memory
+runs out."""
 _LOOK_S: Final = 0.2
 _MOST_SAID: Final = 1000
 _MOST_LINES: Final = 3
@@ -129,13 +142,16 @@ class Jobs:
 
     async def _perform(self, job: Job) -> None:
         process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-c", _MORTAL, str(os.getpid())),
             *(*_PROGRAM, *job.arguments),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env=os.environ | SINGLE_THREADED,
-            start_new_session=True,  # with its workers it is suspended and ended as one
+            # With its workers it is suspended and ended as one; no session of its own, for if the
+            # page ends the system wakes and ends (SIGHUP) suspended groups of the same one only.
+            process_group=0,
         )
         _give_way(process.pid)
         ending = asyncio.create_task(process.communicate())

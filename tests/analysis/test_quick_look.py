@@ -253,6 +253,7 @@ def test_it_runs_at_the_lowest_priority_and_ends_with_its_parent(short_chirps, t
     )
     parent = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
+    assert Path(f"/proc/{pid}/oom_score_adj").read_text() == "1000\n"
     parent.kill()
     parent.communicate()
     assert eventually(lambda: has_ended(pid))

@@ -1,9 +1,18 @@
 """`rigd start` as it follows a series, by the events of a daemon that is none."""
 
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
 import pytest
 import typer
 
 from rigd.cli import start
+from rigd.daemon._address import peer_of, socket_path
 
 DONE = {
     "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,
@@ -107,3 +116,50 @@ def test_ctrl_c_skips_the_quick_look(follow, interrupts):
 def test_a_second_ctrl_c_in_a_session_leaves_it_to_the_daemon(follow):
     ended, _, sent = follow(1, 1)
     assert (ended, sent) == (130, ["stop"])
+
+
+@pytest.fixture
+def interrupting_daemon(runtime_folder):
+    """A daemon that keeps a start waiting, and presses Ctrl-C once it has it; what it heard."""
+    path = socket_path("sim")
+    path.parent.mkdir(exist_ok=True)
+    heard = []
+    listener = socket.create_server(str(path), family=socket.AF_UNIX)
+
+    def serve():
+        while True:
+            try:
+                link, _ = listener.accept()
+            except OSError:  # the test is over
+                return
+            with link, link.makefile("rw") as file:
+                for line in file:
+                    command = json.loads(line)["command"]
+                    heard.append(command)
+                    if command == "start":
+                        os.kill(peer_of(link)[0], signal.SIGINT)
+                        continue
+                    told = {"daemon": {"what_moves": "No hardware."}, "stopping": False}
+                    file.write(json.dumps({"reply": command, "ok": True, **told}) + "\n")
+                    file.flush()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    yield heard
+    listener.shutdown(socket.SHUT_RDWR)  # which wakes the thread
+    thread.join(10.0)
+    listener.close()
+
+
+@pytest.mark.parametrize("options", [(), ("--detach",)])
+def test_ctrl_c_cancels_a_start_that_waits(interrupting_daemon, options):
+    done = subprocess.run(
+        [sys.executable, "-m", "rigd", "start", "hold", "--profile", "sim", *options],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=50.0,
+    )
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "No hardware.\nStopped before the session began.\n"
+    assert interrupting_daemon[-2:] == ["start", "stop"]

@@ -1,12 +1,25 @@
 """Predictions and checks of the daemon, made in a process of their own, whatever else is done."""
 
 import asyncio
+import json
+import pickle
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from processes import eventually
 
 from rigd.daemon import background
 from rigd.daemon._service import CommandError
 from rigd.runner import excitation_for, plan_session
 
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
+LITTLE_MEMORY = """
+from rigd.daemon import background
+background._memory_limit = lambda: background._LEAST_BYTES
+background.main()
+"""
 
 
 def loud(amplitude_rad):
@@ -57,6 +70,40 @@ def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
     told = operate().ask("predict", **CHIRP)
     assert isinstance(told, CommandError)
     assert "exit code 0" in str(told)
+
+
+def test_of_the_free_memory_a_job_may_have_a_part(tmp_path):
+    def limit(available_kib):
+        (tmp_path / "meminfo").write_text(f"MemFree: 1 kB\nMemAvailable:   {available_kib} kB\n")
+        return background._memory_limit(tmp_path / "meminfo")
+
+    assert limit(2_000_000) == 500_000 * 1024
+    assert limit(100_000_000) == 4 << 30
+    assert limit(100_000) == 256 << 20
+
+
+def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
+    with subprocess.Popen(
+        [sys.executable, "-m", "rigd.daemon.background"],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as job:
+        score = Path(f"/proc/{job.pid}/oom_score_adj")
+        assert eventually(lambda: score.read_text() == "1000\n", within_s=30.0)
+        assert eventually(lambda: resource.prlimit(job.pid, resource.RLIMIT_AS)[1] <= 4 << 30)
+
+
+def test_a_prediction_without_the_memory_is_refused(profile):
+    job = background.PredictionJob(profile, "chirp", {"duration_s": 7000.0}, False, "")
+    told = subprocess.run(
+        [sys.executable, "-c", LITTLE_MEMORY],
+        input=pickle.dumps(job),
+        capture_output=True,
+        check=True,
+    )
+    answer = json.loads(told.stdout)
+    assert "not enough free memory" in answer["error"]
+    assert answer["wrong_use"]
 
 
 def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):

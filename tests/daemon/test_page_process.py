@@ -89,6 +89,28 @@ def test_a_page_that_is_killed_comes_back_at_its_place_and_is_given_up_at_last(s
     assert page.told[-1] is None
 
 
+def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
+    class Clock:
+        now_s = 0.0
+
+        def monotonic(self):
+            return self.now_s
+
+    def run(_):
+        clock.now_s += next(lasted_s, 1.0)
+        ran.append(clock.now_s)
+
+    clock, ran = Clock(), []
+    lasted_s = iter([1.0, 1.0, 1.0, 1.0, 60.0, 1.0, 3600.0])
+    monkeypatch.setattr(_page, "time", clock)
+    monkeypatch.setattr(_page, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(PageProcess, "_run", run)
+    page = serve()
+    page._thread.join(30.0)
+    assert not page._thread.is_alive()
+    assert len(ran) == 7 + 5
+
+
 def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, caplog):
     monkeypatch.setattr(_page, "_MOST_STARTS", 1)
     with socket.create_server(("127.0.0.1", 0)) as taken:

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -110,6 +112,31 @@ def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_p
     assert looks.told == []
     (told,) = done(looks)
     assert told.error == "it took longer than 0.4 s."
+
+
+def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
+    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
+    monkeypatch.setattr(quick_looks, "_END_S", 0.05)
+    # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
+    monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)
+    for end in (looks.attend, looks.close):
+        looks.begin(tmp_path / "hangs.mcap")
+        process = looks._process
+        late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
+        late.start()
+        time.sleep(0.1)
+        end()
+        assert looks.told == []
+        assert process.poll() is None
+        late.cancel()
+        process.send_signal(signal.SIGKILL)
+        if end == looks.attend:
+            with looks.held():  # nor does a session
+                looks.attend()
+            (told,) = done(looks)
+            assert told.error == "it took longer than 0.05 s."
+            looks.told.clear()
+    process.communicate()
 
 
 def test_of_too_many_the_oldest_are_left_out(looks, tmp_path):

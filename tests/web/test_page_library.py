@@ -2,7 +2,11 @@
 
 import asyncio
 import json
+import os
+import signal
+import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -130,11 +134,70 @@ def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
         jobs.paused = False
         await wait_for(lambda: state_of(pid) == "S")
         assert job.state == "running"
+        assert Path(f"/proc/{pid}/oom_score_adj").read_text() == "1000\n"
         return pid, niceness
 
     pid, niceness = run(jobs, scenario)
     assert niceness == 19
     assert eventually(lambda: state_of(pid) in ("Z", "gone"))  # it has ended with the server
+
+
+PAGE = """
+import asyncio, os, pathlib, sys
+from rigd.runtime import ignore
+from rigd.web import _jobs
+
+ignore()
+_jobs._PROGRAM = (sys.executable, "-c")
+_jobs._LOOK_S = 0.02
+
+async def work():
+    jobs = _jobs.Jobs(pathlib.Path(), lambda _: None)
+    jobs.put("report", [sys.argv[1]])
+    jobs.paused = False
+    asyncio.create_task(jobs.run())
+    while not pathlib.Path("pids").exists():
+        await asyncio.sleep(0.01)
+    jobs.paused = sys.argv[2] == "suspended"
+    await asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
+    os._exit(0)
+
+asyncio.run(work())
+"""
+WORKING = """
+import os, pathlib, subprocess, time
+
+pids = [os.getpid(), subprocess.Popen(["sleep", "600"]).pid]
+pathlib.Path("new").write_text(" ".join(map(str, pids)))
+os.rename("new", "pids")
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("end", ["killed", "ended"])
+@pytest.mark.parametrize("state", ["suspended", "running"])
+def test_a_job_ends_with_the_page(tmp_path, state, end):
+    page = subprocess.Popen(
+        [sys.executable, "-c", PAGE, WORKING, state], cwd=tmp_path, stdin=subprocess.PIPE
+    )
+    pids = []
+    try:
+        assert eventually((tmp_path / "pids").exists)
+        pids = list(map(int, (tmp_path / "pids").read_text().split()))
+        stands = "T" if state == "suspended" else "S"
+        assert eventually(lambda: {state_of(pid) for pid in pids} == {stands})
+        if end == "killed":
+            page.kill()
+        page.communicate(timeout=60.0)
+        # Workers that run see for themselves that their parent has gone.
+        gone = pids if state == "suspended" else pids[:1]
+        assert eventually(lambda: {state_of(pid) for pid in gone} <= {"Z", "gone"}, within_s=10.0)
+    finally:
+        page.kill()
+        page.wait()
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
 
 def test_what_became_of_a_job_is_told(jobs):
