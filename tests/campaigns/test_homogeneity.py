@@ -117,7 +117,10 @@ def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
     first, second = stated_specimens(stated, one)
     assert (first.paths, second.paths) == ((Path("a"), Path("c")), (Path("b"),))
     (said,) = specimen_sentences.specimens(Homogeneity((first, second), ()))
-    assert "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 " in said
+    assert (
+        "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
+        in said
+    )
     assert "1e-05 kg·m² in 1 file (b)" in said
 
 

@@ -47,7 +47,13 @@ def test_a_good_computer_has_no_advice(rows):
 @pytest.mark.parametrize(
     ("what", "path", "text", "found", "remedy"),
     [
-        ("hardware", "proc/cpuinfo", "flags : fpu hypervisor", "virtual machine", "a dedicated computer"),
+        (
+            "hardware",
+            "proc/cpuinfo",
+            "flags : fpu hypervisor",
+            "virtual machine",
+            "a dedicated computer",
+        ),
         ("hardware", "sys/hypervisor/type", "xen", "virtual machine", "a dedicated computer"),
         ("isolated core", f"{CPU}/isolated", "", "none", "isol"),
         (
