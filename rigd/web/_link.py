@@ -30,6 +30,10 @@ class DaemonError(Exception):
     """The daemon cannot be asked; the message is for the operator."""
 
 
+class BusyError(Exception):
+    """A request was not sent; the message is for the operator."""
+
+
 class DaemonLink:
     """Follows one daemon, and passes requests on.
 
@@ -52,6 +56,7 @@ class DaemonLink:
         self._asking = asyncio.Event()
         self._held: _Connection | None = None
         self._commanding = asyncio.Lock()
+        self._stops = 0
         self._heard_s = 0.0
         self._silent = False
         self._told_signals = False
@@ -70,6 +75,10 @@ class DaemonLink:
         """Have the status come soon: something has changed."""
         self._asking.set()
 
+    def note_stop(self) -> None:
+        """Take note of a stop: what has not been sent yet will not be."""
+        self._stops += 1
+
     async def ask(self, request: Document) -> Document:
         """Pass a request on and return the reply.
 
@@ -83,11 +92,16 @@ class DaemonLink:
 
         Raises
         ------
+        BusyError
+            If another request is being answered, or a stop came before this one was sent.
         DaemonError
             If there is no reply.
         """
         if request.get("command") == "predict":
             return await self._ask_anew(request)
+        # A start that waited here would begin after a stop, of which the daemon would know nothing.
+        if self._commanding.locked():
+            raise BusyError("Another request is being answered; try again in a moment.")
         async with self._commanding:
             if self._held is not None:
                 with suppress(DaemonError):
@@ -97,6 +111,7 @@ class DaemonLink:
 
     async def _ask_anew(self, request: Document) -> Document:
         """Ask over a new connection; a daemon that has too many clients is asked again."""
+        stops = self._stops
         for attempt in range(_CROWD_TRIES):
             if attempt:
                 await asyncio.sleep(_CROWD_PAUSE_S)
@@ -105,6 +120,8 @@ class DaemonLink:
             except (OSError, TimeoutError):
                 raise DaemonError(_GONE) from None
             try:
+                if self._stops != stops and request.get("command") != "predict":
+                    raise BusyError("It was stopped before it began.")
                 reply = await _exchange(link, request)
                 if request.get("command") == "start" and reply.get("ok"):
                     self._held = link

@@ -26,7 +26,7 @@ from rigd.view import Subject
 from rigd.web._access import Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
-from rigd.web._link import DaemonError, DaemonLink
+from rigd.web._link import BusyError, DaemonError, DaemonLink
 from rigd.web._live import Pages
 from rigd.web._signals import Block, SessionResponse, Strips, nominal_document
 
@@ -151,13 +151,14 @@ class PageServer:
             return refused(403, "The token is missing or wrong: open the address of rigd status.")
         try:
             if command == "stop":
+                self._link.note_stop()
                 # Asks again and again, and then by a signal.
                 reply = await asyncio.to_thread(stop_session, self._socket)
             else:
                 reply = await self._link.ask(given)
         except (DaemonError, DaemonGoneError) as error:
             return refused(503, str(error))
-        except RefusedByDaemonError as error:
+        except (BusyError, RefusedByDaemonError) as error:
             return refused(409, str(error))
         finally:
             self._link.ask_for_status()

@@ -125,6 +125,70 @@ def test_a_stop_and_a_prediction_need_no_token(served, pages):
     assert told["stopping"]
 
 
+async def seen(daemon, name, count=1):
+    """Wait until a daemon has been asked something."""
+    while sum(each["command"] == name for each in daemon.asked) < count:
+        await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+def delayed(served):
+    """Have the daemon answer a command only when the function that is returned is called."""
+
+    def delay(name):
+        served.daemon.delays[name] = event = asyncio.Event()
+        return lambda: served.call(event.set)
+
+    yield delay
+    for event in served.daemon.delays.values():
+        served.call(event.set)
+    served.daemon.delays.clear()
+
+
+@pytest.fixture
+def asked_before(served):
+    """Forget what the daemon was asked before."""
+    served.daemon.asked.clear()
+    served.daemon.replies.clear()
+    yield
+    served.daemon.replies.clear()
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_start_does_not_wait_for_another_request_and_begin_after_a_stop(served, pages, delayed):
+    go_on = delayed("check")
+
+    async def scenario(session):
+        checking = asyncio.create_task(command(session, command="check"))
+        await seen(served.daemon, "check")
+        starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+        await asyncio.sleep(0.05)
+        stopped, _ = await command(session, command="stop")
+        go_on()
+        return (await checking)[0], stopped, await starting
+
+    checked, stopped, (status, told) = pages.run(scenario)
+    assert (checked, stopped, status) == (200, 200, 409)
+    assert "try again" in told["error"]
+    assert [each["command"] for each in served.daemon.acted] == ["check"]
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_start_that_a_crowd_holds_back_is_cancelled_by_a_stop(served, pages):
+    served.daemon.replies["start"] = {"ok": False, "crowded": True, "error": "Too many clients."}
+
+    async def scenario(session):
+        starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+        await seen(served.daemon, "start")
+        await command(session, command="stop")
+        del served.daemon.replies["start"]
+        return await starting
+
+    status, told = pages.run(scenario)
+    assert status == 409
+    assert "stopped before it began" in told["error"]
+
+
 def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served, pages):
     angle = base64.b64encode(np.full(100, 0.5, dtype="<f4").tobytes()).decode()
     gauges = {"angle": {"value": 0.5, "limit": 1.0, "unit": "rad", "fraction": 0.5}}
