@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -55,6 +56,9 @@ class DaemonLink:
         self._on_lost = on_lost
         self._asking = asyncio.Event()
         self._held: _Connection | None = None
+        self._held_series: float = 0
+        self._ended: float = 0
+        """The last series that has ended; infinite where its end may not have been heard."""
         self._commanding = asyncio.Lock()
         self._stops = 0
         self._heard_s = 0.0
@@ -67,7 +71,7 @@ class DaemonLink:
             try:
                 await self._follow()
             except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
-                self._let_go()
+                self._note_end(math.inf)
                 self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
             await asyncio.sleep(_RETRY_S)
 
@@ -103,11 +107,24 @@ class DaemonLink:
         if self._commanding.locked():
             raise BusyError("Another request is being answered; try again in a moment.")
         async with self._commanding:
-            if self._held is not None:
-                with suppress(DaemonError):
-                    return await _exchange(self._held, request)
+            held = self._held
+            if held is not None and (held[0].at_eof() or held[1].is_closing()):
                 self._let_go()
-            return await self._ask_anew(request)
+            try:
+                if self._held is None:
+                    reply = await self._ask_anew(request)
+                else:
+                    reply = await _exchange(self._held, request)
+                if request.get("command") == "start" and reply.get("ok"):
+                    self._held_series = reply["series"]
+            except DaemonError:
+                # Not sent again: it may have been obeyed.
+                self._let_go()
+                raise
+            finally:
+                if self._held_series <= self._ended:
+                    self._let_go()
+            return reply
 
     async def _ask_anew(self, request: Document) -> Document:
         """Ask over a new connection; a daemon that has too many clients is asked again."""
@@ -139,7 +156,7 @@ class DaemonLink:
     async def _follow(self) -> None:
         """Read what one connection brings, to its end."""
         reader, writer = await self._connect()
-        self._heard_s = time.monotonic()
+        self._heard_s, self._ended = time.monotonic(), 0  # a new daemon counts anew
         beside = [
             asyncio.create_task(self._keep_asking(writer)),
             asyncio.create_task(self._note_silence()),
@@ -163,7 +180,7 @@ class DaemonLink:
         if message.get("event") == "signals":
             self._told_signals = True
         elif message.get("event") == "series":
-            self._let_go()
+            self._note_end(message["series"])
         if "event" in message or message.get("reply") == "status":
             self._on_message(message)
 
@@ -184,6 +201,12 @@ class DaemonLink:
             self._told_signals = False
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._asking.wait(), pause_s)
+
+    def _note_end(self, series: float) -> None:
+        """Give control back after a series, but not under a request that is being answered."""
+        self._ended = series
+        if not self._commanding.locked():
+            self._let_go()
 
     def _let_go(self) -> None:
         """Give control back."""

@@ -291,6 +291,7 @@ def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
     assert pages.run(scenario) == 503
 
 
+@pytest.mark.usefixtures("asked_before")
 def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
     held = []
 
@@ -298,6 +299,7 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
         async with session.ws_connect("/api/live") as socket:
             await until(socket, "nominal")
             (following,) = served.daemon.connected
+            served.daemon.replies["start"] = {"series": 1}
             await command(session, command="start", excitation="chirp")
             await command(session, command="reset")
             held.append(served.daemon.connected - {following})
@@ -310,4 +312,80 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
 
     following = pages.run(scenario)
     assert [len(each) for each in held] == [1]
+    assert eventually(lambda: served.daemon.connected == {following})
+
+
+def ends(served, series):
+    served.call(served.daemon.publish, {"event": "series", "series": series})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_request_is_sent_once_although_a_series_ends_meanwhile(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            await command(session, command="start", excitation="chirp")
+            served.daemon.replies["start"] = {"series": 2}
+            go_on = delayed("start")
+            starting = asyncio.create_task(command(session, command="start", excitation="hold"))
+            await seen(served.daemon, "start", 2)
+            ends(served, 1)
+            await until(socket, "series")
+            go_on()
+            answer = await starting
+            # The new series keeps control, until it ends.
+            holding = served.daemon.connected - {following}
+            ends(served, 2)
+            await until(socket, "series")
+            return answer, holding, following
+
+    (status, told), holding, following = pages.run(scenario)
+    assert (status, told["series"], len(holding)) == (200, 2, 1)
+    assert [each["command"] for each in served.daemon.acted] == ["start", "start"]
+    assert eventually(lambda: served.daemon.connected == {following})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_request_whose_reply_is_lost_is_not_sent_again(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            await command(session, command="start", excitation="chirp")
+            delayed("zero")
+            zeroing = asyncio.create_task(command(session, command="zero"))
+            await seen(served.daemon, "zero")
+            (holding,) = served.daemon.connected - {following}
+            served.call(holding.close)
+            lost, _ = await zeroing
+            # What has been found closed before anything was sent is no reason to refuse.
+            return lost, (await command(session, command="tare"))[0]
+
+    assert pages.run(scenario) == (503, 200)
+    assert [each["command"] for each in served.daemon.acted] == ["start", "zero", "tare"]
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            go_on = delayed("start")
+            starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+            await seen(served.daemon, "start")
+            ends(served, 1)
+            await until(socket, "series")
+            go_on()
+            assert (await starting)[0] == 200
+            return following
+
+    following = pages.run(scenario)
     assert eventually(lambda: served.daemon.connected == {following})
