@@ -48,6 +48,8 @@ class Library:
         self._access = access
         self._jobs = jobs
         self._exporting = asyncio.Lock()
+        self._listing = asyncio.Lock()
+        """Lists are made one at a time: they may be slow, and many may be asked for."""
 
     def routes(self) -> list[web.RouteDef]:
         """Return the addresses that are served."""
@@ -72,7 +74,8 @@ class Library:
         **filters
             As of `rigd.library.list_sessions`.
         """
-        return await asyncio.to_thread(list_sessions, self._folder, **filters)
+        async with self._listing:
+            return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
         """Return the specimens of all sessions, the last one first."""
@@ -161,7 +164,7 @@ class Library:
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
         path = self._session(request)
-        found = await asyncio.to_thread(_row_of, self._folder, path.stem)
+        found = next((row for row in await self.rows() if row.id == path.stem), None)
         if found is None or found.report is None:
             return refused(404, "There is no report of it.")
         return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
@@ -261,10 +264,6 @@ class Library:
                 look = json.loads(path.read_bytes(), parse_constant=lambda _: None)
                 return look if isinstance(look, dict) else None
         return None
-
-
-def _row_of(folder: Path, name: str) -> SessionRow | None:
-    return next((row for row in list_sessions(folder) if row.id == name), None)
 
 
 def _download_headers(name: str) -> dict[str, str]:

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Awaitable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from inspect import Parameter, cleandoc, signature
@@ -34,6 +35,8 @@ Document = dict[str, Any]
 
 _LOOPBACK: Final = "127.0.0.1"
 _COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
+_STOPS: Final = 4
+"""Stops that are passed on at a time; no other work takes their threads."""
 _LONGEST_REQUEST: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
@@ -67,6 +70,7 @@ class PageServer:
         self.pages = Pages()
         self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
+        self._stopping = ThreadPoolExecutor(_STOPS, "stop")
         self._link = DaemonLink(self._socket, self._take, self._lose)
         self._excitations = dict(_excitations())
         self._nominal = self._nominal_of(job)
@@ -151,9 +155,7 @@ class PageServer:
             return refused(403, "The token is missing or wrong: open the address of rigd status.")
         try:
             if command == "stop":
-                self._link.note_stop()
-                # Asks again and again, and then by a signal.
-                reply = await asyncio.to_thread(stop_session, self._socket)
+                reply = await self._stop()
             else:
                 reply = await self._link.ask(given)
         except (DaemonError, DaemonGoneError) as error:
@@ -164,6 +166,12 @@ class PageServer:
             self._link.ask_for_status()
         status = 200 if reply.get("ok") else 400 if reply.get("wrong_use") else 409
         return web.json_response(reply, status=status)
+
+    async def _stop(self) -> Document:
+        """Have the daemon stop: it is asked again and again, and then sent a signal."""
+        self._link.note_stop()
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._stopping, stop_session, self._socket)
 
     # What the daemon tells
 

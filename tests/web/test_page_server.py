@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import json
+import threading
 import time
 
 import aiohttp
@@ -11,7 +12,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
-from rigd.web import _live
+from rigd.web import _library, _live
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -389,3 +390,32 @@ def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served,
 
     following = pages.run(scenario)
     assert eventually(lambda: served.daemon.connected == {following})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, monkeypatch):
+    began, go_on, at_once = threading.Event(), threading.Event(), []
+
+    def list_slowly(_):
+        at_once.append(None)
+        began.set()
+        go_on.wait(20.0)
+        at_once.pop()
+        return []
+
+    monkeypatch.setattr(_library, "list_sessions", list_slowly)
+
+    async def scenario(session):
+        listings = [asyncio.create_task(session.get("/api/sessions")) for _ in range(40)]
+        await asyncio.to_thread(began.wait, 20.0)
+        await asyncio.sleep(0.2)
+        try:
+            stopping = command(session, command="stop")
+            return len(at_once), await asyncio.wait_for(stopping, 10.0)
+        finally:
+            go_on.set()
+            for answer in await asyncio.gather(*listings):
+                answer.release()
+
+    together, (status, _) = pages.run(scenario)
+    assert (together, status) == (1, 200)
