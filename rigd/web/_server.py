@@ -143,7 +143,7 @@ class PageServer:
             *(hello, self._lost, self._status, self._gauges, self._strips.last()),
             *(self._nominal, self._last, self._shown),
         )
-        return await self.pages.follow(request, filter(None, known))
+        return await self.pages.follow(request, filter(None, known), self._stop_for_page)
 
     async def _command(self, request: web.Request) -> web.Response:
         """Pass a request on to the daemon."""
@@ -172,6 +172,15 @@ class PageServer:
         self._link.note_stop()
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._stopping, stop_session, self._socket)
+
+    async def _stop_for_page(self) -> Document:
+        """Have the daemon stop; a failure is a refusal."""
+        try:
+            return await self._stop()
+        except (DaemonGoneError, RefusedByDaemonError) as error:
+            return {"ok": False, "error": str(error)}
+        finally:
+            self._link.ask_for_status()
 
     # What the daemon tells
 

@@ -419,3 +419,22 @@ def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, monkeypatch):
 
     together, (status, _) = pages.run(scenario)
     assert (together, status) == (1, 200)
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_page_stops_over_its_websocket(served, pages):
+    served.daemon.replies["stop"] = {"stopping": True}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            await socket.send_str("stop")
+            stopped, _ = await until(socket, "stop")
+            served.daemon.replies["stop"] = {"ok": False, "error": "Not now."}
+            await socket.send_str("stop")
+            return stopped, (await until(socket, "stop"))[0]
+
+    stopped, refused = pages.run(scenario)
+    assert stopped["stopping"]
+    assert (refused["ok"], refused["error"]) == (False, "Not now.")
+    assert [each["command"] for each in served.daemon.asked].count("stop") == 2
