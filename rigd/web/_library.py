@@ -27,6 +27,7 @@ _MOST_LOOK: Final = 4 << 20
 _FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
 _EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
 _REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_SESSION_RUNS: Final = "A session runs; files are converted when it has ended."
 _PAGE: Final = "report.html"
 
 
@@ -145,7 +146,10 @@ class Library:
         if ending not in _EXPORTS:
             return refused(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
-            return refused(409, "A session runs; files are converted when it has ended.")
+            return refused(409, _SESSION_RUNS)
+        # A browser has few connections to a server: none is to wait here for others.
+        if self._exporting.locked():
+            return refused(409, "Another file is being converted; try again when it is done.")
         async with self._exporting:
             with tempfile.TemporaryDirectory(prefix="rigd-page-") as folder:
                 out = Path(folder) / f"{path.stem}{_EXPORTS[ending]}"
@@ -154,7 +158,9 @@ class Library:
                     job = self._jobs.put("export", arguments, path.stem)
                 except JobError as error:
                     return refused(409, str(error))
-                await job.done.wait()
+                await self._jobs.await_or_drop(job)
+                if job.dropped:
+                    return refused(409, _SESSION_RUNS)
                 if job.error:
                     return refused(409, job.error)
                 # It is open, and may be sent after the folder has gone.

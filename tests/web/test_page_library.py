@@ -3,6 +3,7 @@
 import asyncio
 import json
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,39 @@ def test_another_format_is_made_and_sent(served, two):
     status, head, body = get(served, "/api/sessions/first/file.mat")
     assert (status, body[:6]) == (200, b"MATLAB"), body
     assert 'filename="first.mat"' in head
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize("begun", [True, False], ids=["running", "behind another job"])
+def test_a_session_ends_the_wait_for_another_format(served, monkeypatch, tmp_path, begun):
+    assert eventually(lambda: not served.server._jobs.paused)
+    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", PATIENT, str(tmp_path)))
+    if not begun:
+        assert served.ask("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
+    try:
+        with ThreadPoolExecutor(1) as other:
+            waiting = other.submit(get, served, "/api/sessions/first/file.mat")
+            assert eventually((tmp_path / "begun").exists)
+            assert eventually(served.server._library._exporting.locked)
+            status, _, told = get(served, "/api/sessions/second/file.uff")
+            assert (status, "being converted" in told["error"]) == (409, True)
+            served.daemon.status["state"] = "running"
+            status, _, told = waiting.result(30.0)
+            assert (status, "A session runs" in told["error"]) == (409, True)
+            # A report goes on after the session, when it may end here.
+            (tmp_path / "end").touch()
+    finally:
+        served.daemon.status["state"] = "ready"
+    assert eventually(lambda: not served.server._jobs.paused)
+
+
+PATIENT = """
+import pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+(folder / "begun").touch()
+while not (folder / "end").exists():
+    time.sleep(0.01)
+"""
 
 
 @pytest.fixture
