@@ -16,6 +16,8 @@ from urllib.parse import urlsplit
 
 from aiohttp import web
 
+from rigd.errors import UserError
+
 if TYPE_CHECKING:
     from aiohttp.web_protocol import RequestHandler
 
@@ -84,6 +86,10 @@ class Access:
             response = await handler(request) if refusal is None else refusal
         except web.HTTPException as error:
             response = refused(error.status, error.reason)
+        except UserError as error:
+            response = refused(400, str(error))
+        except Exception as error:  # told to who asked, not to the terminal
+            response = refused(500, f"The page's server failed: {error!r}")
         return response
 
     @staticmethod

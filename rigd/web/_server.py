@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 import os
 import re
 import sys
@@ -335,6 +336,9 @@ def run_page() -> None:
     Standard output gets one line: the port, or why there is no page.
     """
     ignore()
+    # A terminal that is held (Ctrl-S) would hold all pages with it, and anybody who sends nonsense
+    # would fill the journal.
+    logging.disable()
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
         asyncio.run(_run(job))

@@ -10,7 +10,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
-from rigd.web import _jobs
+from rigd.web import _jobs, _library
 from rigd.web._jobs import JobError, Jobs
 
 ACTING = {
@@ -51,6 +51,16 @@ def test_the_rows_are_the_librarys(served, two):
     assert found["sessions"][0]["missed"] == 7
     _, _, found = get(served, "/api/sessions?limit=1&offset=1")
     assert (found["total"], [row["id"] for row in found["sessions"]]) == (2, ["first"])
+
+
+def test_a_list_that_cannot_be_made_is_refused_in_words(served, monkeypatch):
+    status, _, told = get(served, "/api/sessions?since=abc")
+    assert status == 400
+    assert "abc" in told["error"]
+    monkeypatch.setattr(_library, "list_sessions", {}.popitem)
+    status, _, told = get(served, "/api/sessions")
+    assert status == 500
+    assert "The page's server failed: " in told["error"]
 
 
 def test_files_looks_reports_and_responses_are_served(served, two):

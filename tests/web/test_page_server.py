@@ -3,6 +3,9 @@
 import asyncio
 import base64
 import json
+import socket
+import subprocess
+import sys
 import threading
 import time
 
@@ -438,3 +441,22 @@ def test_a_page_stops_over_its_websocket(served, pages):
     assert stopped["stopping"]
     assert (refused["ok"], refused["error"]) == (False, "Not now.")
     assert [each["command"] for each in served.daemon.asked].count("stop") == 2
+
+
+def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
+    with subprocess.Popen(
+        [sys.executable, "-m", "rigd.web"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            process.stdin.write(json.dumps(served._job).encode() + b"\n")
+            process.stdin.flush()
+            port = json.loads(process.stdout.readline())["port"]
+            for nonsense in (bytes(range(256)), b"GET / HTTP/1.1\r\nHost: [\r\nX\r\n\r\n"):
+                with socket.create_connection(("127.0.0.1", port), 30.0) as link:
+                    link.sendall(nonsense)
+                    assert link.recv(100).split()[1] == b"400"
+            process.stdin.close()
+            assert process.stderr.read() == b""
+        finally:
+            process.kill()
