@@ -25,7 +25,7 @@ from rigd.runner import QuickLook, result_line
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject
-from rigd.web._access import Access, Connections, object_of, refused
+from rigd.web._access import LIVE, Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
@@ -98,7 +98,7 @@ class PageServer:
                 web.get("/", self._static),
                 web.get("/static/{name}", self._static),
                 web.get("/favicon.ico", self._static),
-                web.get("/api/live", self._live),
+                web.get(LIVE, self._live),
                 web.post("/api/command", self._command),
                 *self._library.routes(),
             ]
