@@ -16,11 +16,15 @@ from urllib.parse import urlsplit
 
 from aiohttp import web
 
+from rigd.errors import UserError
+
 if TYPE_CHECKING:
     from aiohttp.web_protocol import RequestHandler
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+LIVE: Final = "/api/live"
+"""Address of what happens; there is a limit to the pages that are open there."""
 _OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost"})
 _OWN_HEADER: Final = "X-Rigd"
 _FREE_COMMANDS: Final = frozenset({"stop", "predict"})
@@ -84,6 +88,10 @@ class Access:
             response = await handler(request) if refusal is None else refusal
         except web.HTTPException as error:
             response = refused(error.status, error.reason)
+        except UserError as error:
+            response = refused(400, str(error))
+        except Exception as error:  # told to who asked, not to the terminal
+            response = refused(500, f"The page's server failed: {error!r}")
         return response
 
     @staticmethod
@@ -202,6 +210,7 @@ class Connections:
     def __init__(self) -> None:
         self._silent: dict[RequestHandler, float] = {}
         """Connections without a request so far, and until when each has to make one."""
+        self._pages: set[RequestHandler] = set()
 
     def look_after(self) -> None:
         """Close those that say nothing, from now on."""
@@ -213,23 +222,28 @@ class Connections:
         asyncio.get_running_loop().call_later(_LOOK_S, self.look_after)
 
     def welcome(self) -> asyncio.Protocol:
-        """Make the protocol of a new connection, or turn it away."""
-        if len(self.serving.connections) >= _MOST_CONNECTIONS:
-            return _TurnedAway()
+        """Make the protocol of a new connection; the oldest that is no open page makes room."""
+        open_now = [
+            (each, each.transport)
+            for each in self.serving.connections
+            if each.transport is not None and not each.transport.is_closing()
+        ]
+        too_many = max(0, len(open_now) - _MOST_CONNECTIONS + 1)
+        # Whoever comes last may want to stop the rig.
+        for transport in [each[1] for each in open_now if each[0] not in self._pages][:too_many]:
+            transport.abort()
         protocol = self.serving()
         self._silent[protocol] = time.monotonic() + _SILENT_S
         return protocol
 
     @web.middleware
     async def heard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Take note that a connection has made a request."""
+        """Take note that a connection has made a request, and of those that are open pages."""
         self._silent.pop(request.protocol, None)
-        return await handler(request)
-
-
-class _TurnedAway(asyncio.Protocol):
-    """A connection too many."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Close it."""
-        transport.close()
+        if request.path != LIVE:
+            return await handler(request)
+        self._pages.add(request.protocol)
+        try:
+            return await handler(request)
+        finally:
+            self._pages.discard(request.protocol)

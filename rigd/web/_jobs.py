@@ -59,6 +59,8 @@ class Job:
     """Where its result is served."""
     state: str = "waiting"
     error: str = ""
+    dropped: bool = False
+    """A session has begun, and nobody waits for it any more."""
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
     def document(self) -> Document:
@@ -119,12 +121,30 @@ class Jobs:
         self._say(job)
         return job
 
+    async def await_or_drop(self, job: Job) -> None:
+        """Wait for the end of a job; a session that begins ends it.
+
+        Parameters
+        ----------
+        job
+            One that is queued; ``dropped`` says that it was ended.
+        """
+        while not job.done.is_set():
+            if self.paused:
+                job.dropped = True
+                if job.state == "waiting":
+                    return
+            with suppress(TimeoutError):
+                await asyncio.wait_for(job.done.wait(), _LOOK_S)
+
     async def run(self) -> None:
         """Do what is queued, until cancelled."""
         while True:
             job = await self._waiting.get()
             while self.paused:
                 await asyncio.sleep(_LOOK_S)
+            if job.dropped:
+                continue
             job.state = "running"
             self._say(job)
             try:
@@ -158,6 +178,8 @@ class Jobs:
         stopped = False
         try:
             while not ending.done():
+                if job.dropped:
+                    raise JobError("A session has begun.")
                 if self.paused is not stopped:
                     stopped = self.paused
                     _signal(process.pid, signal.SIGSTOP if stopped else signal.SIGCONT)

@@ -27,6 +27,7 @@ _MOST_LOOK: Final = 4 << 20
 _FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
 _EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
 _REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_SESSION_RUNS: Final = "A session runs; files are converted when it has ended."
 _PAGE: Final = "report.html"
 
 
@@ -48,6 +49,8 @@ class Library:
         self._access = access
         self._jobs = jobs
         self._exporting = asyncio.Lock()
+        self._listing = asyncio.Lock()
+        """Lists are made one at a time: they may be slow, and many may be asked for."""
 
     def routes(self) -> list[web.RouteDef]:
         """Return the addresses that are served."""
@@ -72,7 +75,8 @@ class Library:
         **filters
             As of `rigd.library.list_sessions`.
         """
-        return await asyncio.to_thread(list_sessions, self._folder, **filters)
+        async with self._listing:
+            return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
         """Return the specimens of all sessions, the last one first."""
@@ -142,7 +146,10 @@ class Library:
         if ending not in _EXPORTS:
             return refused(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
-            return refused(409, "A session runs; files are converted when it has ended.")
+            return refused(409, _SESSION_RUNS)
+        # A browser has few connections to a server: none is to wait here for others.
+        if self._exporting.locked():
+            return refused(409, "Another file is being converted; try again when it is done.")
         async with self._exporting:
             with tempfile.TemporaryDirectory(prefix="rigd-page-") as folder:
                 out = Path(folder) / f"{path.stem}{_EXPORTS[ending]}"
@@ -151,7 +158,9 @@ class Library:
                     job = self._jobs.put("export", arguments, path.stem)
                 except JobError as error:
                     return refused(409, str(error))
-                await job.done.wait()
+                await self._jobs.await_or_drop(job)
+                if job.dropped:
+                    return refused(409, _SESSION_RUNS)
                 if job.error:
                     return refused(409, job.error)
                 # It is open, and may be sent after the folder has gone.
@@ -161,7 +170,7 @@ class Library:
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
         path = self._session(request)
-        found = await asyncio.to_thread(_row_of, self._folder, path.stem)
+        found = next((row for row in await self.rows() if row.id == path.stem), None)
         if found is None or found.report is None:
             return refused(404, "There is no report of it.")
         return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
@@ -261,10 +270,6 @@ class Library:
                 look = json.loads(path.read_bytes(), parse_constant=lambda _: None)
                 return look if isinstance(look, dict) else None
         return None
-
-
-def _row_of(folder: Path, name: str) -> SessionRow | None:
-    return next((row for row in list_sessions(folder) if row.id == name), None)
 
 
 def _download_headers(name: str) -> dict[str, str]:

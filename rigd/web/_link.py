@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -30,6 +31,10 @@ class DaemonError(Exception):
     """The daemon cannot be asked; the message is for the operator."""
 
 
+class BusyError(Exception):
+    """A request was not sent; the message is for the operator."""
+
+
 class DaemonLink:
     """Follows one daemon, and passes requests on.
 
@@ -51,7 +56,11 @@ class DaemonLink:
         self._on_lost = on_lost
         self._asking = asyncio.Event()
         self._held: _Connection | None = None
+        self._held_series: float = 0
+        self._ended: float = 0
+        """The last series that has ended; infinite where its end may not have been heard."""
         self._commanding = asyncio.Lock()
+        self._stops = 0
         self._heard_s = 0.0
         self._silent = False
         self._told_signals = False
@@ -62,13 +71,17 @@ class DaemonLink:
             try:
                 await self._follow()
             except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
-                self._let_go()
+                self._note_end(math.inf)
                 self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
             await asyncio.sleep(_RETRY_S)
 
     def ask_for_status(self) -> None:
         """Have the status come soon: something has changed."""
         self._asking.set()
+
+    def note_stop(self) -> None:
+        """Take note of a stop: what has not been sent yet will not be."""
+        self._stops += 1
 
     async def ask(self, request: Document) -> Document:
         """Pass a request on and return the reply.
@@ -83,20 +96,39 @@ class DaemonLink:
 
         Raises
         ------
+        BusyError
+            If another request is being answered, or a stop came before this one was sent.
         DaemonError
             If there is no reply.
         """
         if request.get("command") == "predict":
             return await self._ask_anew(request)
+        # A start that waited here would begin after a stop, of which the daemon would know nothing.
+        if self._commanding.locked():
+            raise BusyError("Another request is being answered; try again in a moment.")
         async with self._commanding:
-            if self._held is not None:
-                with suppress(DaemonError):
-                    return await _exchange(self._held, request)
+            held = self._held
+            if held is not None and (held[0].at_eof() or held[1].is_closing()):
                 self._let_go()
-            return await self._ask_anew(request)
+            try:
+                if self._held is None:
+                    reply = await self._ask_anew(request)
+                else:
+                    reply = await _exchange(self._held, request)
+                if request.get("command") == "start" and reply.get("ok"):
+                    self._held_series = reply["series"]
+            except DaemonError:
+                # Not sent again: it may have been obeyed.
+                self._let_go()
+                raise
+            finally:
+                if self._held_series <= self._ended:
+                    self._let_go()
+            return reply
 
     async def _ask_anew(self, request: Document) -> Document:
         """Ask over a new connection; a daemon that has too many clients is asked again."""
+        stops = self._stops
         for attempt in range(_CROWD_TRIES):
             if attempt:
                 await asyncio.sleep(_CROWD_PAUSE_S)
@@ -105,6 +137,8 @@ class DaemonLink:
             except (OSError, TimeoutError):
                 raise DaemonError(_GONE) from None
             try:
+                if self._stops != stops and request.get("command") != "predict":
+                    raise BusyError("It was stopped before it began.")
                 reply = await _exchange(link, request)
                 if request.get("command") == "start" and reply.get("ok"):
                     self._held = link
@@ -122,7 +156,7 @@ class DaemonLink:
     async def _follow(self) -> None:
         """Read what one connection brings, to its end."""
         reader, writer = await self._connect()
-        self._heard_s = time.monotonic()
+        self._heard_s, self._ended = time.monotonic(), 0  # a new daemon counts anew
         beside = [
             asyncio.create_task(self._keep_asking(writer)),
             asyncio.create_task(self._note_silence()),
@@ -146,7 +180,7 @@ class DaemonLink:
         if message.get("event") == "signals":
             self._told_signals = True
         elif message.get("event") == "series":
-            self._let_go()
+            self._note_end(message["series"])
         if "event" in message or message.get("reply") == "status":
             self._on_message(message)
 
@@ -167,6 +201,12 @@ class DaemonLink:
             self._told_signals = False
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._asking.wait(), pause_s)
+
+    def _note_end(self, series: float) -> None:
+        """Give control back after a series, but not under a request that is being answered."""
+        self._ended = series
+        if not self._commanding.locked():
+            self._let_go()
 
     def _let_go(self) -> None:
         """Give control back."""

@@ -4,11 +4,11 @@ import asyncio
 import json
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from typing import Any, Final
 
-from aiohttp import web
+from aiohttp import WSMsgType, web
 
 Document = dict[str, Any]
 
@@ -60,6 +60,15 @@ class Page:
                 while self._waiting:
                     await self._socket.send_str(self._waiting.popleft())
 
+    async def stop_when(
+        self, asked: asyncio.Event, stop: Callable[[], Awaitable[Document]]
+    ) -> None:
+        """Stop each time that it is asked for, one at a time, and tell the page what came of it."""
+        while True:
+            await asked.wait()
+            asked.clear()
+            self.put(_text({"type": "stop", **await stop()}))
+
 
 class Pages:
     """All open pages, and what one that is opened now has to know."""
@@ -84,7 +93,12 @@ class Pages:
         self._events.append(event)
         self.send(event)
 
-    async def follow(self, request: web.Request, first: Iterable[Document]) -> web.StreamResponse:
+    async def follow(
+        self,
+        request: web.Request,
+        first: Iterable[Document],
+        stop: Callable[[], Awaitable[Document]],
+    ) -> web.StreamResponse:
         """Serve a page until it is closed.
 
         Parameters
@@ -93,6 +107,8 @@ class Pages:
             Request for a WebSocket.
         first
             Messages that it gets at once.
+        stop
+            What its message ``stop`` has done; the result is sent to it as ``stop``.
         """
         if len(self._pages) >= MOST_PAGES:
             raise web.HTTPServiceUnavailable(reason=f"There are {MOST_PAGES} open pages already.")
@@ -104,13 +120,20 @@ class Pages:
         for document in (*first, *self._events):
             page.put(_text(document))
         self._pages.add(page)
-        writing = asyncio.create_task(page.write())
+        asked = asyncio.Event()
+        beside = [
+            asyncio.create_task(page.write()),
+            asyncio.create_task(page.stop_when(asked, stop)),
+        ]
         try:
-            # A page has nothing to say here: whatever comes is the end.
-            await socket.receive()
+            # A browser's requests may wait behind its downloads; this does not. Whatever else
+            # comes is the end.
+            while (said := await socket.receive()).type is WSMsgType.TEXT and said.data == "stop":
+                asked.set()
         finally:
             self._pages.discard(page)
-            writing.cancel()
+            for task in beside:
+                task.cancel()
             page.drop()
         return socket
 

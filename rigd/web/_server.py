@@ -2,11 +2,13 @@
 
 import asyncio
 import json
+import logging
 import os
 import re
 import sys
 import time
 from collections.abc import Awaitable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from inspect import Parameter, cleandoc, signature
@@ -23,10 +25,10 @@ from rigd.runner import QuickLook, result_line
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject
-from rigd.web._access import Access, Connections, object_of, refused
+from rigd.web._access import LIVE, Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
-from rigd.web._link import DaemonError, DaemonLink
+from rigd.web._link import BusyError, DaemonError, DaemonLink
 from rigd.web._live import Pages
 from rigd.web._signals import Block, SessionResponse, Strips, nominal_document
 
@@ -34,6 +36,8 @@ Document = dict[str, Any]
 
 _LOOPBACK: Final = "127.0.0.1"
 _COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
+_STOPS: Final = 4
+"""Stops that are passed on at a time; no other work takes their threads."""
 _LONGEST_REQUEST: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
@@ -67,6 +71,7 @@ class PageServer:
         self.pages = Pages()
         self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
+        self._stopping = ThreadPoolExecutor(_STOPS, "stop")
         self._link = DaemonLink(self._socket, self._take, self._lose)
         self._excitations = dict(_excitations())
         self._nominal = self._nominal_of(job)
@@ -93,7 +98,7 @@ class PageServer:
                 web.get("/", self._static),
                 web.get("/static/{name}", self._static),
                 web.get("/favicon.ico", self._static),
-                web.get("/api/live", self._live),
+                web.get(LIVE, self._live),
                 web.post("/api/command", self._command),
                 *self._library.routes(),
             ]
@@ -139,7 +144,7 @@ class PageServer:
             *(hello, self._lost, self._status, self._gauges, self._strips.last()),
             *(self._nominal, self._last, self._shown),
         )
-        return await self.pages.follow(request, filter(None, known))
+        return await self.pages.follow(request, filter(None, known), self._stop_for_page)
 
     async def _command(self, request: web.Request) -> web.Response:
         """Pass a request on to the daemon."""
@@ -151,18 +156,32 @@ class PageServer:
             return refused(403, "The token is missing or wrong: open the address of rigd status.")
         try:
             if command == "stop":
-                # Asks again and again, and then by a signal.
-                reply = await asyncio.to_thread(stop_session, self._socket)
+                reply = await self._stop()
             else:
                 reply = await self._link.ask(given)
         except (DaemonError, DaemonGoneError) as error:
             return refused(503, str(error))
-        except RefusedByDaemonError as error:
+        except (BusyError, RefusedByDaemonError) as error:
             return refused(409, str(error))
         finally:
             self._link.ask_for_status()
         status = 200 if reply.get("ok") else 400 if reply.get("wrong_use") else 409
         return web.json_response(reply, status=status)
+
+    async def _stop(self) -> Document:
+        """Have the daemon stop: it is asked again and again, and then sent a signal."""
+        self._link.note_stop()
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._stopping, stop_session, self._socket)
+
+    async def _stop_for_page(self) -> Document:
+        """Have the daemon stop; a failure is a refusal."""
+        try:
+            return await self._stop()
+        except (DaemonGoneError, RefusedByDaemonError) as error:
+            return {"ok": False, "error": str(error)}
+        finally:
+            self._link.ask_for_status()
 
     # What the daemon tells
 
@@ -317,6 +336,9 @@ def run_page() -> None:
     Standard output gets one line: the port, or why there is no page.
     """
     ignore()
+    # A terminal that is held (Ctrl-S) would hold all pages with it, and anybody who sends nonsense
+    # would fill the journal.
+    logging.disable()
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
         asyncio.run(_run(job))

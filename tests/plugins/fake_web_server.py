@@ -202,7 +202,7 @@ class FakeWebServer:
     greeting
         Messages that every page gets when it connects.
     replies
-        Answers to commands by their names; others are granted.
+        Answers to commands by their names; others are granted. None: there is no answer.
     asked
         Requests that came: name of the command, and whether the token was right.
     """
@@ -261,6 +261,7 @@ class FakeWebServer:
         app.router.add_post("/api/command", self._command)
         app.router.add_get("/api/sessions", self._list)
         app.router.add_get("/api/sessions/{id}/look", self._look)
+        app.router.add_get("/api/sessions/{id}/file.mat", self._never)
         app.router.add_post("/api/sessions/{id}/report", self._job)
         app.router.add_post("/api/campaign", self._job)
         app.router.add_get("/api/frf", self._frf)
@@ -284,8 +285,10 @@ class FakeWebServer:
         for message in self.greeting:
             await page.send_json(message)
         self._pages.add(page)
-        async for _ in page:
-            pass
+        async for said in page:
+            self.asked.append((said.data, False))
+            if said.data in self.replies and self.replies[said.data] is not None:
+                await page.send_json({"type": said.data, "ok": True, **self.replies[said.data]})
         self._pages.discard(page)
         return page
 
@@ -306,6 +309,11 @@ class FakeWebServer:
 
     async def _look(self, request):
         return web.json_response(LOOK)
+
+    async def _never(self, request):
+        self.asked.append(("file", False))
+        await self._ending.wait()
+        return web.Response()
 
     async def _job(self, request):
         self.asked.append((request.path, "Authorization" in request.headers))

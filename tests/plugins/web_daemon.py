@@ -35,6 +35,8 @@ class FakeDaemon:
         self.asked = []
         self.status = dict(STATUS)
         self.replies = {}
+        self.delays = {}
+        """Commands that are answered only after an event, by name."""
         self.watchers = []
         self.connected = set()
         self.silent = False
@@ -54,6 +56,8 @@ class FakeDaemon:
                     self.watchers.append(writer)
                 if self.silent:
                     continue
+                if command in self.delays:
+                    await self.delays[command].wait()
                 reply = {"reply": command, "ok": True} | self.replies.get(command, {})
                 self.say(writer, self.status | reply if command == "status" else reply)
         self.connected.discard(writer)

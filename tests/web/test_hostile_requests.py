@@ -1,6 +1,7 @@
 """Hostile requests to the page's server: none acts, none reads what is not the sessions'."""
 
 import base64
+import contextlib
 import json
 import os
 import time
@@ -8,6 +9,8 @@ import zlib
 
 import pytest
 from web_daemon import TOKEN
+
+from rigd.web import _access
 
 START = json.dumps({"command": "start", "excitation": "chirp"}).encode()
 RIGHT = {
@@ -281,6 +284,22 @@ def test_who_says_nothing_or_half_is_let_go(served, hurried):
             assert link.recv(1) == b""
     body = half + b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
     assert b" 408 " in served.send(body)
+
+
+def test_connections_of_others_shut_nobody_out(served, monkeypatch):
+    monkeypatch.setattr(_access, "_MOST_CONNECTIONS", 8)
+    host = f"Host: 127.0.0.1:{served.port}"
+    opening = "\r\n".join(f"{name}: {value}" for name, value in handshake().items())
+    with contextlib.ExitStack() as ending:
+        page = ending.enter_context(served.connect())
+        page.sendall(f"GET /api/live HTTP/1.1\r\n{host}\r\n{opening}\r\n\r\n".encode())
+        assert b" 101 " in page.recv(1000)
+        for _ in range(20):
+            link = ending.enter_context(served.connect())
+            link.sendall(f"GET / HTTP/1.1\r\n{host}\r\n\r\n".encode())
+            assert b" 200 " in link.recv(1000)
+        assert served.ask("GET", "/")[0] == 200
+        assert len(served.server.pages) == 1
 
 
 def test_more_connections_than_are_served_are_turned_away(served, hurried):

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
-from rigd.web import _jobs
+from rigd.web import _jobs, _library
 from rigd.web._jobs import JobError, Jobs
 
 ACTING = {
@@ -56,6 +57,16 @@ def test_the_rows_are_the_librarys(served, two):
     assert (found["total"], [row["id"] for row in found["sessions"]]) == (2, ["first"])
 
 
+def test_a_list_that_cannot_be_made_is_refused_in_words(served, monkeypatch):
+    status, _, told = get(served, "/api/sessions?since=abc")
+    assert status == 400
+    assert "abc" in told["error"]
+    monkeypatch.setattr(_library, "list_sessions", {}.popitem)
+    status, _, told = get(served, "/api/sessions")
+    assert status == 500
+    assert "The page's server failed: " in told["error"]
+
+
 def test_files_looks_reports_and_responses_are_served(served, two):
     status, head, body = get(served, "/api/sessions/first/file.mcap")
     assert (status, body) == (200, (served.folder / "first.mcap").read_bytes())
@@ -78,6 +89,39 @@ def test_another_format_is_made_and_sent(served, two):
     status, head, body = get(served, "/api/sessions/first/file.mat")
     assert (status, body[:6]) == (200, b"MATLAB"), body
     assert 'filename="first.mat"' in head
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize("begun", [True, False], ids=["running", "behind another job"])
+def test_a_session_ends_the_wait_for_another_format(served, monkeypatch, tmp_path, begun):
+    assert eventually(lambda: not served.server._jobs.paused)
+    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", PATIENT, str(tmp_path)))
+    if not begun:
+        assert served.ask("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
+    try:
+        with ThreadPoolExecutor(1) as other:
+            waiting = other.submit(get, served, "/api/sessions/first/file.mat")
+            assert eventually((tmp_path / "begun").exists)
+            assert eventually(served.server._library._exporting.locked)
+            status, _, told = get(served, "/api/sessions/second/file.uff")
+            assert (status, "being converted" in told["error"]) == (409, True)
+            served.daemon.status["state"] = "running"
+            status, _, told = waiting.result(30.0)
+            assert (status, "A session runs" in told["error"]) == (409, True)
+            # A report goes on after the session, when it may end here.
+            (tmp_path / "end").touch()
+    finally:
+        served.daemon.status["state"] = "ready"
+    assert eventually(lambda: not served.server._jobs.paused)
+
+
+PATIENT = """
+import pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+(folder / "begun").touch()
+while not (folder / "end").exists():
+    time.sleep(0.01)
+"""
 
 
 @pytest.fixture

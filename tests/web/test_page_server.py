@@ -3,6 +3,10 @@
 import asyncio
 import base64
 import json
+import socket
+import subprocess
+import sys
+import threading
 import time
 
 import aiohttp
@@ -11,7 +15,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
-from rigd.web import _live
+from rigd.web import _library, _live
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -125,6 +129,70 @@ def test_a_stop_and_a_prediction_need_no_token(served, pages):
     assert told["stopping"]
 
 
+async def seen(daemon, name, count=1):
+    """Wait until a daemon has been asked something."""
+    while sum(each["command"] == name for each in daemon.asked) < count:
+        await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+def delayed(served):
+    """Have the daemon answer a command only when the function that is returned is called."""
+
+    def delay(name):
+        served.daemon.delays[name] = event = asyncio.Event()
+        return lambda: served.call(event.set)
+
+    yield delay
+    for event in served.daemon.delays.values():
+        served.call(event.set)
+    served.daemon.delays.clear()
+
+
+@pytest.fixture
+def asked_before(served):
+    """Forget what the daemon was asked before."""
+    served.daemon.asked.clear()
+    served.daemon.replies.clear()
+    yield
+    served.daemon.replies.clear()
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_start_does_not_wait_for_another_request_and_begin_after_a_stop(served, pages, delayed):
+    go_on = delayed("check")
+
+    async def scenario(session):
+        checking = asyncio.create_task(command(session, command="check"))
+        await seen(served.daemon, "check")
+        starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+        await asyncio.sleep(0.05)
+        stopped, _ = await command(session, command="stop")
+        go_on()
+        return (await checking)[0], stopped, await starting
+
+    checked, stopped, (status, told) = pages.run(scenario)
+    assert (checked, stopped, status) == (200, 200, 409)
+    assert "try again" in told["error"]
+    assert [each["command"] for each in served.daemon.acted] == ["check"]
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_start_that_a_crowd_holds_back_is_cancelled_by_a_stop(served, pages):
+    served.daemon.replies["start"] = {"ok": False, "crowded": True, "error": "Too many clients."}
+
+    async def scenario(session):
+        starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+        await seen(served.daemon, "start")
+        await command(session, command="stop")
+        del served.daemon.replies["start"]
+        return await starting
+
+    status, told = pages.run(scenario)
+    assert status == 409
+    assert "stopped before it began" in told["error"]
+
+
 def test_the_signals_come_as_strips_and_gauges_and_events_with_their_time(served, pages):
     angle = base64.b64encode(np.full(100, 0.5, dtype="<f4").tobytes()).decode()
     gauges = {"angle": {"value": 0.5, "limit": 1.0, "unit": "rad", "fraction": 0.5}}
@@ -227,6 +295,7 @@ def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
     assert pages.run(scenario) == 503
 
 
+@pytest.mark.usefixtures("asked_before")
 def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
     held = []
 
@@ -234,6 +303,7 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
         async with session.ws_connect("/api/live") as socket:
             await until(socket, "nominal")
             (following,) = served.daemon.connected
+            served.daemon.replies["start"] = {"series": 1}
             await command(session, command="start", excitation="chirp")
             await command(session, command="reset")
             held.append(served.daemon.connected - {following})
@@ -247,3 +317,146 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
     following = pages.run(scenario)
     assert [len(each) for each in held] == [1]
     assert eventually(lambda: served.daemon.connected == {following})
+
+
+def ends(served, series):
+    served.call(served.daemon.publish, {"event": "series", "series": series})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_request_is_sent_once_although_a_series_ends_meanwhile(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            await command(session, command="start", excitation="chirp")
+            served.daemon.replies["start"] = {"series": 2}
+            go_on = delayed("start")
+            starting = asyncio.create_task(command(session, command="start", excitation="hold"))
+            await seen(served.daemon, "start", 2)
+            ends(served, 1)
+            await until(socket, "series")
+            go_on()
+            answer = await starting
+            # The new series keeps control, until it ends.
+            holding = served.daemon.connected - {following}
+            ends(served, 2)
+            await until(socket, "series")
+            return answer, holding, following
+
+    (status, told), holding, following = pages.run(scenario)
+    assert (status, told["series"], len(holding)) == (200, 2, 1)
+    assert [each["command"] for each in served.daemon.acted] == ["start", "start"]
+    assert eventually(lambda: served.daemon.connected == {following})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_request_whose_reply_is_lost_is_not_sent_again(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            await command(session, command="start", excitation="chirp")
+            delayed("zero")
+            zeroing = asyncio.create_task(command(session, command="zero"))
+            await seen(served.daemon, "zero")
+            (holding,) = served.daemon.connected - {following}
+            served.call(holding.close)
+            lost, _ = await zeroing
+            # What has been found closed before anything was sent is no reason to refuse.
+            return lost, (await command(session, command="tare"))[0]
+
+    assert pages.run(scenario) == (503, 200)
+    assert [each["command"] for each in served.daemon.acted] == ["start", "zero", "tare"]
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served, pages, delayed):
+    served.daemon.replies["start"] = {"series": 1}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            (following,) = served.daemon.connected
+            go_on = delayed("start")
+            starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
+            await seen(served.daemon, "start")
+            ends(served, 1)
+            await until(socket, "series")
+            go_on()
+            assert (await starting)[0] == 200
+            return following
+
+    following = pages.run(scenario)
+    assert eventually(lambda: served.daemon.connected == {following})
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, monkeypatch):
+    began, go_on, at_once = threading.Event(), threading.Event(), []
+
+    def list_slowly(_):
+        at_once.append(None)
+        began.set()
+        go_on.wait(20.0)
+        at_once.pop()
+        return []
+
+    monkeypatch.setattr(_library, "list_sessions", list_slowly)
+
+    async def scenario(session):
+        listings = [asyncio.create_task(session.get("/api/sessions")) for _ in range(40)]
+        await asyncio.to_thread(began.wait, 20.0)
+        await asyncio.sleep(0.2)
+        try:
+            stopping = command(session, command="stop")
+            return len(at_once), await asyncio.wait_for(stopping, 10.0)
+        finally:
+            go_on.set()
+            for answer in await asyncio.gather(*listings):
+                answer.release()
+
+    together, (status, _) = pages.run(scenario)
+    assert (together, status) == (1, 200)
+
+
+@pytest.mark.usefixtures("asked_before")
+def test_a_page_stops_over_its_websocket(served, pages):
+    served.daemon.replies["stop"] = {"stopping": True}
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            await socket.send_str("stop")
+            stopped, _ = await until(socket, "stop")
+            served.daemon.replies["stop"] = {"ok": False, "error": "Not now."}
+            await socket.send_str("stop")
+            return stopped, (await until(socket, "stop"))[0]
+
+    stopped, refused = pages.run(scenario)
+    assert stopped["stopping"]
+    assert (refused["ok"], refused["error"]) == (False, "Not now.")
+    assert [each["command"] for each in served.daemon.asked].count("stop") == 2
+
+
+def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
+    with subprocess.Popen(
+        [sys.executable, "-m", "rigd.web"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            process.stdin.write(json.dumps(served._job).encode() + b"\n")
+            process.stdin.flush()
+            port = json.loads(process.stdout.readline())["port"]
+            for nonsense in (bytes(range(256)), b"GET / HTTP/1.1\r\nHost: [\r\nX\r\n\r\n"):
+                with socket.create_connection(("127.0.0.1", port), 30.0) as link:
+                    link.sendall(nonsense)
+                    assert link.recv(100).split()[1] == b"400"
+            process.stdin.close()
+            assert process.stderr.read() == b""
+        finally:
+            process.kill()

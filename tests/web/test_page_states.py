@@ -5,6 +5,7 @@ import re
 import pytest
 from fake_web_server import STATIC, TOKEN, UTC_NS, fake_web_server, gauges, progress, status, strip
 from playwright.sync_api import expect
+from processes import eventually
 
 TELL_S = 1.0
 """Within this time the page has to say what has happened."""
@@ -109,7 +110,7 @@ def test_stop_is_for_everybody_and_says_what_came_of_it(server, open_page, token
     page.focus("#stop")
     page.keyboard.press("Enter")
     says(page, "#state-reason", "Stop requested.")
-    assert server.asked == [("stop", bool(token))]
+    assert server.asked == [("stop", False)]
     assert "not an emergency stop" in page.inner_text(".stop")
 
 
@@ -119,6 +120,24 @@ def test_a_stop_that_fails_says_what_to_do(server, page):
     says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
     page.wait_for_timeout(100)
     assert page.inner_text("#state-word") == "READY"
+
+
+def test_a_stop_does_not_wait_behind_downloads(server, page):
+    server.replies["stop"] = {"stopping": True}
+    page.evaluate("() => { for (let k = 0; k < 8; k++) fetch(`/api/sessions/${k}/file.mat`); }")
+    # As many as a browser has connections to one server.
+    assert eventually(lambda: server.asked.count(("file", False)) == 6)
+    page.click("#stop")
+    says(page, "#state-reason", "Stop requested.")
+    assert ("stop", False) in server.asked
+
+
+def test_a_stop_that_is_not_answered_in_time_is_told(server, page):
+    server.replies["stop"] = None
+    page.click("#stop")
+    told = page.locator("#state-reason")
+    expect(told).to_contain_text("Not stopped: No answer within 3 s.", timeout=10_000)
+    assert not page.get_attribute("#stop", "aria-busy")
 
 
 def test_stop_works_where_the_server_answers_no_more(server, page, open_page):

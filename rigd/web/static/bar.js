@@ -75,7 +75,7 @@ export class Bar {
   async #stop() {
     const button = byId("stop");
     button.setAttribute("aria-busy", "true");
-    const reply = await this.#link.command("stop");
+    const reply = await this.#link.stop();
     button.removeAttribute("aria-busy");
     if (reply.ok) {
       this.#stopped = reply.stopping ? "Stop requested." : "No session is running.";

@@ -2,6 +2,7 @@
 
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 2000;
+const STOP_MS = 3000;
 const KEPT = "rigd-token";
 
 /** The right to act: taken from the address once, kept for this tab, and hidden from the address. */
@@ -17,6 +18,9 @@ function takeToken() {
 export class Link {
   #listeners = new Map();
   #wait = FIRST_WAIT_MS;
+  #socket = null;
+  /** Ends the wait for the replies to stops, each with the reply or null. */
+  #stops = new Set();
 
   constructor() {
     this.token = takeToken();
@@ -40,13 +44,16 @@ export class Link {
   connect() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}/api/live`);
+    this.#socket = socket;
     socket.addEventListener("message", ({ data }) => {
       const message = JSON.parse(data);
       this.heard = performance.now();
       this.#wait = FIRST_WAIT_MS;
+      if (message.type === "stop") this.#endStops(message);
       this.#tell(message.type, message);
     });
     socket.addEventListener("close", () => {
+      this.#endStops(null);
       this.#tell("closed", {});
       setTimeout(() => this.connect(), this.#wait);
       this.#wait = Math.min(2 * this.#wait, LONGEST_WAIT_MS);
@@ -61,13 +68,37 @@ export class Link {
     return this.post("/api/command", { command: name, ...members });
   }
 
+  #endStops(reply) {
+    for (const end of this.#stops) end(reply);
+    this.#stops.clear();
+  }
+
+  /**
+   * Have the session stopped: over the WebSocket, for a request may wait behind six downloads.
+   * @returns {Promise<object>} the reply, after STOP_MS at the latest
+   */
+  async stop() {
+    const limit = AbortSignal.timeout(STOP_MS);
+    const late = { ok: false, error: `No answer within ${STOP_MS / 1e3} s.` };
+    if (this.#socket?.readyState === WebSocket.OPEN) {
+      const reply = await new Promise((resolve) => {
+        this.#stops.add(resolve);
+        limit.addEventListener("abort", () => resolve(late));
+        this.#socket.send("stop");
+      });
+      if (reply !== null) return reply;
+    }
+    const reply = await this.post("/api/command", { command: "stop" }, limit);
+    return limit.aborted && !reply.ok ? late : reply;
+  }
+
   /** Send a request that acts; whatever fails comes as a refusal, with a sentence in `error`. */
-  async post(address, body = {}) {
+  async post(address, body = {}, signal = undefined) {
     const headers = { "Content-Type": "application/json", "X-Rigd": "1" };
     if (this.token) headers.Authorization = `Bearer ${this.token}`;
     let answer;
     try {
-      answer = await fetch(address, { method: "POST", headers, body: JSON.stringify(body) });
+      answer = await fetch(address, { method: "POST", headers, body: JSON.stringify(body), signal });
     } catch {
       return { ok: false, error: "The page's server does not answer." };
     }
