@@ -42,7 +42,7 @@ def profile_with(tmp_path):
 def test_a_drive_with_torque_mode_can_be_used(rigd, name):
     done = rigd("check", "--eds", eds_path(name))
     assert done.returncode == 0, done.stdout
-    assert "as far as its file tells, this drive can be used" in " ".join(done.stdout.split())
+    assert "according to its EDS file, this drive can be used" in " ".join(done.stdout.split())
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORQUE)

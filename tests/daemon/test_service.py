@@ -333,7 +333,7 @@ def test_only_plain_files_are_read(operated, tmp_path, name):
 def test_a_disk_without_room_for_a_file_is_refused(operated, tmp_path):
     (tmp_path / "out").write_text("in the way")
     refusal = operated.ask("start", **SHORT)
-    assert "cannot be made a folder" in str(refusal)
+    assert "cannot be created" in str(refusal)
     assert not refusal.wrong_use  # the same request may succeed later
     assert operated.state is State.READY
 

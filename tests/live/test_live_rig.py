@@ -99,7 +99,7 @@ def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
     told = rig.show(order("held up"), stop)
     assert stop.requested
     assert time.monotonic() - began_s < live_view._PATIENCE_S
-    assert told.startswith("The live view takes its time to start")
+    assert told.startswith("The live view is still starting")
 
 
 def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):

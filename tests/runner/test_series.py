@@ -98,7 +98,7 @@ def test_a_disk_that_fills_up_keeps_what_there_is(make_series, tmp_path):
             (tmp_path / "out").touch()
             return super().run(*order)
 
-    with pytest.raises(NoRoomError, match="cannot be made a folder"):
+    with pytest.raises(NoRoomError, match="cannot be created"):
         series.run(Full(WELL), StopRequest(), Watcher(), live=False)
     assert series.results == [WELL]
 
