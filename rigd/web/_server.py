@@ -125,7 +125,9 @@ class PageServer:
         path = Path(str(files("rigd.web") / "static" / name))
         if not _STATIC_NAME.fullmatch(name) or not path.is_file():
             return refused(404, "There is no such file.")
-        return web.FileResponse(path)
+        # A browser asks for it from a report, too, whose sandbox makes it a page of another origin.
+        shared = {"Cross-Origin-Resource-Policy": "cross-origin"}
+        return web.FileResponse(path, headers=shared if request.path == "/favicon.ico" else None)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         """Serve a page that is open."""
