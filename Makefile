@@ -15,15 +15,17 @@ demo: $(VENV)/ready
 	@echo "The operator's page on the simulated rig: $(BIN)/rigd serve --profile sim --web --output demo"
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser"
 
 # Without what starts processes or fits models: a minute, for every edit.
 test-fast: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not process and not fit"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser and not process and not fit"
 
-# With what is shown once more at full length, or over another transport.
+# With what is shown once more at full length, or over another transport; and with the operator's
+# page in a browser, whose driver's event loop wants a process of its own.
 test-all: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not browser"
+	$(BIN)/python -m pytest -m browser
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .

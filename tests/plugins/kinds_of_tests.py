@@ -27,6 +27,7 @@ FITS = {
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "process: starts processes (set by plugins/kinds_of_tests)")
     config.addinivalue_line("markers", "fit: fits models (set by plugins/kinds_of_tests)")
+    config.addinivalue_line("markers", "browser: drives a browser (set by plugins/kinds_of_tests)")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -34,6 +35,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         assert isinstance(item, pytest.Function)
         fixtures = item._fixtureinfo.name2fixturedefs
+        if "browser" in fixtures:
+            item.add_marker("browser")
         functions = [item.obj, *(each.func for defs in fixtures.values() for each in defs)]
         names = frozenset(fixtures).union(*(names_in(each, known) for each in functions))
         for mark, telling in (("process", STARTS), ("fit", FITS)):
