@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library import change_between
-from rigd.runtime import killed_first, raise_on, signal_when_orphaned, use_one_thread
+from rigd.runtime import end_with, give_way, killed_first, raise_on, use_one_thread
 from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, read_look
 from rigd.units import decimals, with_half_width
 
@@ -432,12 +432,9 @@ def main() -> None:
     parser.add_argument("--parent", type=int, help="End with the process of this number.")
     asked = parser.parse_args()
     if asked.parent is not None:
-        signal_when_orphaned(signal.SIGKILL)
-        if os.getppid() != asked.parent:  # it was gone before
-            sys.exit(1)
+        end_with(asked.parent)
     killed_first()
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    give_way()
     use_one_thread()
     try:
         document = look_at(asked.file, asked.last)
