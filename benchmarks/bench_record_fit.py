@@ -97,7 +97,7 @@ def session(plant: Plant, *, ringing: bool = False) -> Session:
 
 
 class Peer:
-    """The same sum of squares, put together anew, for a search that knows nothing of it."""
+    """The same sum of squares, assembled again, for a search that knows nothing of it."""
 
     def __init__(self, measurement: Measurement, name: str, analysis: RecordAnalysis) -> None:
         self.comparison = Comparison.of(measurement, (0.0, 50.0))

@@ -242,7 +242,7 @@ def _begin() -> None:
 _CONNECT_S: Final = 5.0
 _WORKERS_S: Final = 10.0
 _GONE_S: Final = 30.0
-"""How long a cluster may be without any worker: its nannies start them anew in seconds."""
+"""How long a cluster may be without any worker: its nannies restart them in seconds."""
 
 
 @contextmanager

@@ -123,7 +123,7 @@ def fit_record(
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:
-    """Compute anew what follows no reference: it was, with a beam that the hum had spoilt."""
+    """Recompute the part that follows no reference: the first one was biased by the hum."""
     hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
     for _ in range(_REPEATS):
         comparison = whole.following_reference(clean.plant).without_hum(hum)

@@ -91,7 +91,7 @@ class Change:
 
 
 def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
-    """Find what changes along the record; fit all anew beside it if nothing explains it as well.
+    """Find what changes along the record; refit all with it if nothing else explains it as well.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ STOP_SIGNAL = signal.SIGUSR1
 """Asks the daemon's process for what `stop` asks for."""
 
 _ANSWER_PATIENCE_S = 60.0
-"""Connecting the devices anew takes up to half of it."""
+"""Reconnecting the devices takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
 """Time to go on trying a daemon that turns clients away, or accepts nobody."""

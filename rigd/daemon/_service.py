@@ -531,7 +531,7 @@ class Service:
                 try:
                     await self._call(self._rig.watch)
                 except RigError:
-                    pass  # it is connected anew
+                    pass  # it is reconnected
                 else:
                     self._states.move(State.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}

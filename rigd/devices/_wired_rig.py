@@ -107,7 +107,7 @@ def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
     """
     drive = open_devices(rig, moving).drive
     if not isinstance(drive, ResettableDrive):
-        return "The drive is simulated in each session anew: there is no fault to reset."
+        return "Each session simulates a new drive: there is no fault to reset."
     try:
         fault = drive.reset_fault()
     finally:

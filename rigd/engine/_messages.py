@@ -171,7 +171,7 @@ class Close:
     """Close the file with its outcome."""
 
     outcome: Mapping[str, str]
-    """Metadata ``outcome`` of docs/session_format.md; the recorder counts the samples anew."""
+    """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
 
 
 @dataclass(frozen=True, slots=True)

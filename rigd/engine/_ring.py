@@ -123,7 +123,7 @@ class Ring:
         return block
 
     def discard(self) -> None:
-        """Release all records unseen; for a consumer that begins anew."""
+        """Release all records unseen; for a consumer that starts over."""
         self._counters[_READ] = self._counters[_WRITTEN]
 
     def close(self) -> None:

@@ -46,7 +46,7 @@ class SessionEnd(Exception):
     outcome, reason
         Outcome and reason, for the file and the operator.
     device_failed
-        A device did not do what it was asked: it must be connected anew.
+        A device did not do what it was asked: it must be reconnected.
     """
 
     def __init__(self, outcome: str, reason: str, *, device_failed: bool = False) -> None:

@@ -1,7 +1,7 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on.
 
 It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
-the supervisor requests, one after the other. A device that fails ends it: connecting anew is the
+the supervisor requests, one after the other. A device that fails ends it: reconnecting is the
 operator's decision.
 """
 

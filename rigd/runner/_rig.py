@@ -287,7 +287,7 @@ class Rig:
     def signals(self) -> list[SignalBlock]:
         """Return what has come of the record since the last call, from any thread.
 
-        It begins with the first call, or anew where the last one is more than 1 s ago.
+        It begins with the first call, and again if the last one is more than 1 s ago.
         """
         with self._looking:
             crew = self._crew

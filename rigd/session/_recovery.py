@@ -601,7 +601,7 @@ class _Copy:
         return self._digest
 
     def _flush(self) -> None:
-        """Write a chunk, with an index made anew."""
+        """Write a chunk, with a rebuilt index."""
         if not self._runs:
             return
         data = b"".join(self._pieces)

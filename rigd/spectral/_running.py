@@ -393,7 +393,7 @@ class LowBins:
         kernel[:bins] = self._chirp[:bins].conj()
         kernel[size - length + 1 :] = self._chirp[length - 1 : 0 : -1].conj()
         self._kernel = np.fft.fft(kernel)
-        # Held, because memory of this size is dear to get anew.
+        # Kept, because allocating this much memory again is slow.
         self._work = np.empty(size, dtype=np.complex128)
         self._transform = np.empty(size, dtype=np.complex128)
 

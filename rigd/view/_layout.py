@@ -401,7 +401,7 @@ class _Axis:
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
         below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
-        # When either extreme leaves, it is seen anew what is missing.
+        # When either extreme leaves, what is missing is determined again.
         earlier_ns = min(low_ns, high_ns)
         added = []
         if above is not None and self._lacks(self._above, above, t_ns):

@@ -308,7 +308,7 @@ class AtiCanSensor:
         return DeviceError(
             f"{self._name}: {how}; it is back at calibration 0, and what it measures since is not "
             f"measured with calibration {self._settings.calibration} (ati_can.calibration). "
-            "Connecting anew (rigd reset, or another rigd run) selects it again. Look at the box's "
+            "Reconnecting (rigd reset, or another rigd run) selects it again. Look at the box's "
             "supply and cable; if it happens again, have the box replaced."
         )
 

@@ -233,7 +233,7 @@ class AtiSerialSensor:
         return (
             f"{self._name}: {missing} records did not come, or all come later by {late_ms:.2g} ms "
             "since, and nothing on the line tells which: the wrench may be older than the file "
-            "states. Look at cable and adapter; connecting anew (rigd reset, or another rigd run) "
+            "states. Look at cable and adapter; reconnecting (rigd reset, or another rigd run) "
             "ends it."
         )
 

@@ -82,7 +82,7 @@ class ReplyPairing:
         self.start()
 
     def start(self) -> None:
-        """Begin anew, with nothing on its way."""
+        """Start over, with nothing on its way."""
         self._inbox.replies = 0
         self._asked = self._alone = True
         self._heard = 0

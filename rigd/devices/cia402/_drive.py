@@ -349,7 +349,7 @@ class Cia402Drive:
         node.resume()
 
     def reset_fault(self) -> str | None:
-        """Switch off and reset a fault, for the operator; the drive has to be connected anew.
+        """Switch off and reset a fault, for the operator; the drive must then be reconnected.
 
         Returns
         -------

@@ -328,7 +328,7 @@ class Node:
             self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
 
     def resume(self) -> None:
-        """Go on with the ticks after a time that they have not seen: both heartbeats start anew."""
+        """Resume the ticks after a gap: both heartbeats restart."""
         self._next_heartbeat_ns = _LONG_AGO_NS
         self.inbox.heard = True
 

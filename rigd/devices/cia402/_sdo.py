@@ -350,7 +350,7 @@ def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int
         theirs = read_eds(Path(eds), node_id)
     except EdsError as error:
         raise DeviceError(
-            f"{error} Get it anew from the maker, or remove cia402.eds from the profile."
+            f"{error} Get it again from the maker, or remove cia402.eds from the profile."
         ) from None
     for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
         entry, mine = theirs.get(*place), own.get_variable(*place)

@@ -157,7 +157,7 @@ class AtiSerialDevice:
             self._log("sensor", "stream stopped")
 
     def reset(self) -> None:
-        """Start anew by itself: it streams no more, and remembers no set-up."""
+        """Restart by itself: it streams no more, and remembers no set-up."""
         self.streaming = self._unlocked = False
         self._holding = dict(self._at_power_up)
         self._unset = list(range(6))

@@ -149,7 +149,7 @@ class Node(Protocol):
     frozen: bool
 
     def reset(self) -> None:
-        """Start anew by itself."""
+        """Restart by itself."""
 
     def power_cycle(self) -> None:
         """Start as when its power comes back."""
@@ -167,7 +167,7 @@ class SerialDevice(Protocol):
     frozen: bool
 
     def reset(self) -> None:
-        """Start anew by itself."""
+        """Restart by itself."""
 
     def power_cycle(self) -> None:
         """Start as when its power comes back."""

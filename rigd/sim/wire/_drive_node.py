@@ -272,7 +272,7 @@ class DriveNode:
         self._fail(code, register, vendor)
 
     def reset(self) -> None:
-        """Start anew by itself: it boots, and remembers nothing."""
+        """Restart by itself: it boots, and remembers nothing."""
         self._boot()
 
     def power_cycle(self) -> None:
