@@ -323,7 +323,7 @@ def determines_damping(estimate: RecordEstimate) -> bool:
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     """Pool one structure; None if fewer than two sessions determine its damping.
 
-    A setting of rig or specimen (the tool's inertia, mostly) that rests on its bound in some
+    A setting of rig or specimen (the tool inertia, mostly) that rests on its bound in some
     session has no place in the common covariance; the plant gets its plain mean.
     """
     used = list(filter(determines_damping, estimates))

@@ -347,7 +347,7 @@ class _DaskWorkers(Workers):
 
     def _gone(self, what: str) -> str:
         return (
-            f"The Dask scheduler at {self._address} {what}; look at its log and the workers', and "
+            f"The Dask scheduler at {self._address} {what}; check its log and the workers', and "
             "start the campaign again, or leave --dask out."
         )
 

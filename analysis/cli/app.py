@@ -116,7 +116,7 @@ _OF_WELCH: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
 """Options of the Welch fits alone."""
 
 _TYPED: Final = "COMMANDLINE"
-"""What click calls the source of an option's value that is no default."""
+"""What click calls the source of an option's value that is not a default."""
 
 # Plain messages of one or two sentences, not boxes: they end up in logs.
 app = typer.Typer(

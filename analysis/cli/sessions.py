@@ -53,7 +53,7 @@ class Outputs:
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:
-        """Return where people's text goes, in the report's width where that is no terminal."""
+        """Return where people's text goes, in the report's width where that is not a terminal."""
         from rich.console import Console
 
         console = Console(stderr=self.json_to_stdout, highlight=False)

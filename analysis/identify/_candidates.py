@@ -260,7 +260,7 @@ class CandidateSet:
         )
 
     def _without_leakage(self) -> CandidateSet:
-        """Leave out what hum beyond the band spoils."""
+        """Leave out the bins that a disturbance beyond the band leaks into."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 

@@ -110,7 +110,7 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
     if not title:
         return figure
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
-    # A file name may hold dollar signs, which are not mathematics, and bytes that are no text.
+    # A file name may hold dollar signs, which are not mathematics, and bytes that are not text.
     common: dict[str, Any] = {"va": "top", "parse_math": False}
     title, subtitle = (each.encode("utf-8", "replace").decode() for each in (title, subtitle))
     for text in (

@@ -176,7 +176,7 @@ def stop(
     if status is None:
         fail(
             f"The daemon was asked to stop, but its session did not end within "
-            f"{_END_PATIENCE_S:g} s; look at rigd status and at the rig, and press the wired stop "
+            f"{_END_PATIENCE_S:g} s; check rigd status and the rig, and press the wired stop "
             "(STO) if anything moves.",
             EXIT_FAILED,
         )

@@ -238,7 +238,7 @@ def replay(
             _save(path, save, web=web)
         return
     if not web and not has_screen():
-        _check_shown(path)  # what is no file for a window is none elsewhere, either
+        _check_shown(path)  # what is not a file for a window is not one elsewhere either
         elsewhere = (
             "the file can be looked at elsewhere as it is"
             if path.suffix == SUFFIX

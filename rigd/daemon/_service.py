@@ -56,7 +56,7 @@ from rigd.runner import (
 from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
-"""Time from one look at the rig to the next."""
+"""Time between two checks of the rig."""
 _SIGNALS_S = 0.05
 """Time from one block of a record's signals to the next."""
 _MOST_PREDICTIONS = 4
@@ -101,7 +101,7 @@ class RigControl(SessionRig, Protocol):
         """Make the present angle the zero."""
 
     def watch(self) -> None:
-        """See whether all is well between sessions."""
+        """Check whether all is well between sessions."""
 
     def status(self) -> RigStatus | None:
         """Read the status from shared memory, from any thread."""
@@ -403,7 +403,7 @@ class Service:
             self._publish({"event": "progress", **progress})
 
     async def watch(self) -> None:
-        """See whether the rig is well between sessions."""
+        """Check whether the rig is well between sessions."""
         # A check asks nothing of the rig, and the thread of its calls is free.
         busy = self._doing not in ("", "check")
         if busy or not self._rig.connected or self.state not in (State.READY, State.FAULT):
@@ -578,7 +578,7 @@ class Service:
     # Series
 
     def _plan(self, request: protocol.Start) -> Series:
-        """Make the excitation and see that it may be run; in the second thread."""
+        """Make the excitation and check that it may be run; in the second thread."""
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))

@@ -189,7 +189,7 @@ def _text(path: Path) -> str:
         if stat.S_ISDIR(found.st_mode):
             raise EdsError(f"{path}: is a folder; name the EDS file in it.")
         if not stat.S_ISREG(found.st_mode):
-            raise EdsError(f"{path}: is no ordinary file; name the drive's EDS file.")
+            raise EdsError(f"{path}: is not an ordinary file; name the drive's EDS file.")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except EdsError:  # a ValueError too
@@ -231,7 +231,7 @@ def _sections(text: str, path: Path) -> Sections:
             continue
         if line[0] == "[":
             title, bracket, _ = line[1:].partition("]")
-            # Without its end it is no section, and what follows belongs to none.
+            # Without its end it is not a section, and what follows belongs to none.
             keys = sections.setdefault(title.strip().lower(), {}) if bracket else {}
             if len(sections) > MAX_ENTRIES:
                 raise _too_many(path)

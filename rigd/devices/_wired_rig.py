@@ -77,7 +77,7 @@ class ResettableDrive(Protocol):
     """A drive that can be in fault; simulated ones in this process cannot."""
 
     def reset_fault(self) -> str | None:
-        """Switch off, reset a fault, see that it would get ready; return the fault, or None.
+        """Switch off, reset a fault, check that it would get ready; return the fault, or None.
 
         Raises
         ------

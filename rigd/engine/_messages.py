@@ -243,7 +243,7 @@ class MessageReader:
         EOFError
             If the other end is gone and no whole message is left.
         ValueError
-            If what comes is no message.
+            If what comes is not a message.
         """
         while (message := self._whole()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):

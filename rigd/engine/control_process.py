@@ -230,7 +230,7 @@ class _Attendance:
             self._silent = self._silent + 1 if cycle.stale else 0
         if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; see whether the device "
+                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; check that the device "
                 "is on and connected."
             )
 

@@ -144,7 +144,7 @@ def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) 
     Raises
     ------
     ExcitationError
-        If it is no such file.
+        If the file is not of that kind.
     OSError
         If it cannot be opened.
     """

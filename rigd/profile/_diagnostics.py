@@ -35,7 +35,7 @@ _JUMP_FACTOR = 100.0
 _NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 
 _FIRST_MODE_HZ = 0.1, 100.0
-"""First mode of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+"""First mode of the undamped beam: outside it a unit is wrong or the antenna unsuitable."""
 
 
 _PER_MILLE_LIMIT = 32.767

@@ -296,7 +296,7 @@ class Draft:
             "  paper      printed in the paper (antenna, damping, encoder)",
             "  datasheet  told by the drive's file, or typed in from a data sheet",
             "  measured   on a rig or a computer, as said beside it",
-            "  assumed    of the profile started from: look at those marked TO FILL IN first",
+            "  assumed    of the profile started from: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(
                 ["", "Of this drive:", *(f"* {doubt}" for doubt in self.doubts)]

@@ -79,7 +79,7 @@ def check_new(path: Path) -> None:
     Raises
     ------
     ProfileError
-        If there is a file, no folder for it, or its name is no profile's.
+        If there is a file, no folder for it, or its name is not a profile's.
     """
     if path.suffix != ".toml":
         raise ProfileError(f"{path}: the name of a profile ends in .toml.")
@@ -129,7 +129,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
     Raises
     ------
     ProfileError
-        If there is such a file, it cannot be written, or the name is no profile's.
+        If there is such a file, it cannot be written, or the name is not a profile's.
     """
     settings = [] if name is None else [Setting("name", name)]
     drive = profile.rig.cia402

@@ -355,7 +355,7 @@ _KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class _Limited:
-    """A predicted peak and its limit; a peak that is no number violates it."""
+    """A predicted peak and its limit; a peak that is not a number violates it."""
 
     name: str
     value: float
@@ -410,7 +410,7 @@ def _limited(
 
 
 def _share(channels: tuple[_Limited, ...]) -> float:
-    """Return the largest share of a limit that a predicted peak takes; NaN if one is no number."""
+    """Return the largest predicted peak as a share of its limit; NaN if one is not a number."""
     shares = [channel.value / channel.limit for channel in channels]
     return math.nan if any(map(math.isnan, shares)) else max(shares)
 

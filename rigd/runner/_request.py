@@ -137,7 +137,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
 
 
 def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
-    """See that a session is given all that its profile requires.
+    """Check that a session is given all that its profile requires.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
-    """Make the folder, and see that a session fits on its disk and leaves room there.
+    """Make the folder, and check that a session fits on its disk and leaves room there.
 
     Parameters
     ----------
@@ -390,7 +390,7 @@ def software_commit() -> dict[str, str]:
 
 
 def _text(value: float | str) -> str:
-    # A file's name may be no text; nothing of it may keep the session from being written.
+    # A file's name may not be text; nothing of it may keep the session from being written.
     return (
         value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
     )

@@ -247,7 +247,7 @@ class Rig:
         return answer
 
     def watch(self) -> None:
-        """See whether the control process is well; call it some times a second between sessions.
+        """Check whether the control process is well; call it some times a second between sessions.
 
         Raises
         ------
@@ -355,7 +355,7 @@ class Rig:
         answer = self._crew.control.poll(patience_s)
         if answer is None:
             raise RigError(
-                f"The control process does not answer within {patience_s:g} s; see whether the "
+                f"The control process does not answer within {patience_s:g} s; check whether the "
                 "devices are on, and check CPU load."
             )
         if isinstance(answer, Ended):

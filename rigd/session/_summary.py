@@ -55,7 +55,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     Raises
     ------
     SessionError
-        If the file cannot be read, or is no session.
+        If the file cannot be read, or is not a session.
 
     Examples
     --------

@@ -27,7 +27,7 @@ class MetadataError(UserError, ValueError):
 
 
 def check_name(name: str) -> None:
-    """See that metadata may have a name.
+    """Check that metadata may have a name.
 
     Raises
     ------

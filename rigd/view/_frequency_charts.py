@@ -59,7 +59,7 @@ class SweepResponse:
             self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
             self._at_rest = []
         swept = samples[before:]
-        # What is held from an earlier tick is no measurement: the gap is filled like any other.
+        # What is held from an earlier tick is not a measurement: the gap is filled like any other.
         known = np.where(swept["status"] & _HELD, np.nan, 1.0)
         self._running.feed(
             ticks[before:],
@@ -447,7 +447,7 @@ class SpectrogramChart:
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
             left=width - _BAR - 24.0,
         )
-        # Row 0 is on top. Without the mean of the torque, which is no motion.
+        # Row 0 is on top. Without the mean of the torque, which is not a motion.
         self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
         self._filled = 0
         self._t_ns = 0

@@ -298,7 +298,7 @@ def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
 
 
 def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(operated):
-    doubt = "Drive: it does not show that it is off; see that it is, by its STO if need be."
+    doubt = "Drive: it does not show that it is off; check that it is, by its STO if need be."
 
     def fail_both(drive):
         drive.off_doubt = doubt

@@ -1,4 +1,4 @@
-"""Files that are no session, cut off, damaged or hostile: one error, and never a wrong number."""
+"""Files that are not sessions, cut off, damaged or hostile: one error, and never a wrong number."""
 
 import os
 import random
@@ -53,7 +53,7 @@ def test_a_file_that_is_no_mcap(tmp_path, data):
 def test_an_mcap_file_without_samples_channel(kit, tmp_path):
     messages = kit.fixed_messages(kit.make_samples(3))
     path = kit.write_foreign(tmp_path / "a.mcap", messages, topic="/other")
-    refused(path, "without the channel /rig/sample, so it is no session")
+    refused(path, "without the channel /rig/sample, so it is not a session")
 
 
 def test_samples_that_are_no_protobuf(kit, tmp_path):

@@ -165,7 +165,7 @@ class SerialLine:
 
     def _gone(self, why: str | None) -> DeviceError:
         return DeviceError(
-            f"{self._device}: the serial port {self._serial.port} has failed ({why}); look at "
+            f"{self._device}: the serial port {self._serial.port} has failed ({why}); check "
             "adapter and cable, then connect again."
         )
 

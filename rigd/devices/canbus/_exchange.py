@@ -307,17 +307,17 @@ class CanExchange:
         if kind & BUS_OFF:
             self._trouble = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
-                "many errors; look at cable, termination and bit rate, then bring it up again."
+                "many errors; check cable, termination and bit rate, then bring it up again."
             )
         elif kind & _NO_ACKNOWLEDGE:
             self._trouble = (
-                f"CAN bus {self.port.name}: nobody acknowledges our frames; look at cable, "
+                f"CAN bus {self.port.name}: nobody acknowledges our frames; check cable, "
                 "termination, power and bit rate."
             )
         elif kind & _CONTROLLER and data[_CONTROLLER_STATE] & _PASSIVE:
             self._trouble = (
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
-                "disturbed; look at cable and termination."
+                "disturbed; check cable and termination."
             )
 
 

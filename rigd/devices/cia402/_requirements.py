@@ -147,7 +147,7 @@ class Requirement:
 
 
 _R, _W = Access.READ, Access.WRITE
-_NOT_USABLE: Final = "Without it the drive cannot be used: see whether its firmware offers it."
+_NOT_USABLE: Final = "Without it the drive cannot be used: check whether its firmware offers it."
 _DYNAMIC: Final = (
     "Its PDOs have to be mapped as rigd needs them, or be mapped so already: RPDO1 with "
     "controlword and target torque, TPDO1 with statusword, position and actual torque."
@@ -555,8 +555,8 @@ def sync_period_us(rate_hz: float) -> int:
         from rigd.devices import DeviceError  # which loads numpy
 
         raise DeviceError(
-            f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
-            "a CANopen drive needs; choose another rate, such as 1000 Hz."
+            f"rig.rate_hz = {rate_hz:g} Hz: the period of a CANopen drive must be a whole "
+            "number of microseconds; choose another rate, such as 1000 Hz."
         )
     return round(period_us)
 

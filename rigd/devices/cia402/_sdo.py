@@ -163,7 +163,7 @@ class SdoAccess:
             others = sorted(set(self._network.scanner.nodes) - {self._node.id})
             heard = f"; heard of node {', '.join(map(str, others))}" if others else ""
             raise DeviceError(
-                f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
+                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{heard}."
             ) from None
 
     def use_eds(self, path: str) -> tuple[int, int]:

@@ -166,7 +166,7 @@ class AtiSerialDevice:
         self._log("sensor", "restart")
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which is no different here."""
+        """Take its power away and give it back, which makes no difference here."""
         self.reset()
 
     def tick(self, now_s: float) -> None:

@@ -532,7 +532,7 @@ def test_an_adapter_unplugged_while_waiting(open_sensor, digital_ft, unhurried, 
         original(timeout_s)
 
     sensor._line.wait = wait
-    with pytest.raises(DeviceError, match="look at adapter and cable"):
+    with pytest.raises(DeviceError, match="check adapter and cable"):
         sensor.read_wrench()
 
 

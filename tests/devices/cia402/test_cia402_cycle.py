@@ -346,7 +346,7 @@ def falls_silent(scripted):
                 "this computer did not give (a corrupt frame, a second master)",
                 'left "operation enabled"',
                 "bit 4 says that the supply is there",
-                "reset the rig. If nobody pressed it, look at the cable of the bus",
+                "reset the rig. If nobody pressed it, check the bus cable",
             ],
         ),
         (

@@ -302,7 +302,7 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
     assert done.stdout == "jump,counts=-500\ndrop,from=host,id=0x77f,frames=1\n"
     wrong = rigd_here("inject", "--profile", "antenna_can", "dorp")
     assert wrong.returncode == 2
-    assert "'dorp' is no fault; choose drop" in wrong.stderr
+    assert "unknown fault 'dorp'; choose drop" in wrong.stderr
     standing = rigd_here("inject", "--profile", "antenna_can")
     assert "clients: 1\n" in standing.stdout
     assert "disturbed: ['host']\n" in standing.stdout
