@@ -104,9 +104,9 @@ Example: analyze session.mcap --types III,VI --json fits.json
 Figures, tables and JSON go to session.report/ beside the file (session.report-2/ if that exists).
 Several files are a campaign: statistics, nominal models, pooled estimate and validation go to
 campaign.report/ beside the first. Sessions that do not suit Welch's method (steps, multisines,
-narrow sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
+narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
-Exit code: 0 done; 1 a file could not be analysed; 2 wrong use; 130 stopped by Ctrl-C."""
+Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""
 
 
 _METHODS: Final = ("welch", "record", "all")
@@ -224,7 +224,7 @@ def analyze(
         ),
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print all tables, not the main results alone.")
+        bool, typer.Option("--verbose", help="Print all tables, not only the main results.")
     ] = False,
     each: Annotated[
         bool,

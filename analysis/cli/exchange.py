@@ -34,9 +34,9 @@ IMPORT_EPILOG = """\
 Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "Rig/Tz:mN.m"
 --rate-hz 1000 --profile rig.toml --rest 0,1 --sweep 1,121
 
-Exit code: 0 done, 1 the file cannot be imported, 2 wrong use, 130 stopped by Ctrl-C."""
+Exit code: 0 done, 1 the file cannot be imported, 2 usage error, 130 stopped by Ctrl-C."""
 
-_EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 wrong use, 130 stopped by Ctrl-C."
+_EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."
 
 _Session = Annotated[
     Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")

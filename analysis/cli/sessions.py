@@ -63,7 +63,7 @@ class Outputs:
 
 
 def session_files(paths: Sequence[Path]) -> list[Path]:
-    """Put in the place of each folder the sessions in it, by name; torn ones are left out.
+    """Put in the place of each folder the sessions in it, by name; incomplete ones are left out.
 
     Parameters
     ----------

@@ -124,7 +124,9 @@ def rig_name(profile: str | None) -> str | None:
 
 def status(
     profile: DaemonOf = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Update it until Ctrl-C.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Update continuously until Ctrl-C.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the status of daemon, rig and session.
@@ -216,7 +218,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Set the zero of the angle where the motor stands.
+    """Set the present motor angle as zero.
 
     The angle limits are relative to this zero. The torque stays off.
 

@@ -42,8 +42,8 @@ def list_sessions(
     """List the sessions of a folder, the newest first.
 
     Files are read where they are new or have changed, by their size and time, and the index of the
-    folder is brought up to date if it can be written. Torn and foreign files are listed with their
-    problem. Folders inside the folder are not looked into.
+    folder is updated if it can be written. Incomplete and foreign files are listed with the
+    reason. Subfolders are not searched.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Recovery of damaged session files: what is intact of a torn one, made into a sound one.
+"""Recovery of damaged session files: the intact part of one is written to a valid file.
 
 Nothing is taken that is not proven: messages, channels and schemas stand in chunks with a checksum
 each, the records ``session`` and ``segments`` are taken from the copy in such a chunk, attachments
@@ -141,7 +141,7 @@ def recover(
 
     Parameters
     ----------
-    path : a torn ``.part`` or a damaged session file
+    path : an incomplete ``.part`` or a damaged session file
     on_progress : called now and then with the share of the work that is done
 
     Raises

@@ -38,7 +38,7 @@ class SessionSummary:
     """Metadata and counts of a session file."""
 
     metadata: dict[str, str]
-    """The record ``session``; empty if a torn file has lost it."""
+    """The record ``session``; empty if an incomplete file has lost it."""
     outcome: dict[str, str] | None
     """How the session ended; None if the file does not tell."""
     samples: int | None
