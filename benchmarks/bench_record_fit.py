@@ -10,7 +10,7 @@ N sessions of each plant and prints, parameter by parameter, mean errors and the
 begins. The last row is the tool inertia once more, from a descent in which it may be negative:
 the estimate itself never is, which shifts it by 0.40 standard deviations where the truth is 0.
 
-The sessions are made in the frequency domain on a grid of their own: chirp 0.025 rad, 0.05-50 Hz in
+The sessions are made in the frequency domain on a separate grid: chirp 0.025 rad, 0.05-50 Hz in
 120 s behind a motor loop of 20 Hz, at 1 kHz, 1 s of rest before and 15 s after; encoder steps of
 7e-5 rad, torque noise of 1e-2 N·m and steps of 1.25e-4 N·m.
 """

@@ -201,7 +201,7 @@ Force = Callable[[int, float, float, float, float], float]
 
 @cache
 def _hub() -> tuple[list[float], list[float]]:
-    """Angle and its speed, two values a tick."""
+    """Angle and its speed, two values per tick."""
     motion = _motion()
     angle, speed = (motion.at(motion.spectrum * motion.s**k, 2) for k in (0, 1))
     return angle.tolist(), speed.tolist()

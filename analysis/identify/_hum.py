@@ -115,7 +115,7 @@ def hum_beside_modes(
     Returns
     -------
     tuple of Hum
-        At most one a mode.
+        At most one per mode.
     """
     predicted, _ = comparison.prediction.torque(plant)
     measured = comparison.torque_nm[comparison.kept] + comparison.hum_nm

@@ -312,7 +312,7 @@ class Walk:
         places = gaps(list(self.costs), ORDER_RANGE, _GRID)
         if not (wide or open_below or open_above) or not places:
             return
-        # Loss at a mode and order are unknowns of their own: the loss stays as the order changes.
+        # Loss at a mode and order are separate unknowns: the loss stays as the order changes.
         looks = {}
         for value in places:
             start = self._first.x.copy()

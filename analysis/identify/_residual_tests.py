@@ -49,7 +49,7 @@ _LOUD: Final = 1.4
 
 _COHERENT_BINS: Final = 9
 _DRIVEN: Final = 0.1
-"""Power of the angle relative to what is usual round it, from which a bin counts as driven."""
+"""Power of the angle relative to what is usual around it, from which a bin counts as driven."""
 
 _LOUDEST: Final = 4.0
 """Where the whitened residual is limited: chance exceeds it once in 3000 bins."""

@@ -46,7 +46,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
 
     With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
-    then one by one where modes have offsets of their own.
+    then one by one where modes have their own offsets.
 
     Parameters
     ----------

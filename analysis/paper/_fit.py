@@ -337,7 +337,7 @@ def thinned(
     index : ndarray of int, shape (m,), m <= count
         Increasing.
     weights : ndarray, shape (m,)
-        Each point's share: its own weight and that of the points left out round it. Of sum 1.
+        Each point's share: its own weight and that of the points left out around it. Of sum 1.
     """
     n = measured.size
     if n <= count:

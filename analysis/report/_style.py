@@ -225,7 +225,7 @@ def save_picture(
     wanted: set[FigureFormat] = {"png", "svg", *formats}
     content = {kind: rendered(figure, kind) for kind in FIGURE_FORMATS if kind in wanted}
     for kind in formats:
-        # A name may have dots of its own.
+        # A name may have its own dots.
         write_new(stem.with_name(f"{stem.name}.{kind}"), content[kind])
     return Picture(stem.name, description, content["png"], content["svg"])
 

@@ -46,7 +46,7 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return what the control process is granted, tried in a process of its own.
+    """Return what the control process is granted, tried in its own process.
 
     Under ``supervision`` stands what supervisor and recorder are.
 

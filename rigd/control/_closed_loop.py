@@ -232,7 +232,7 @@ class ClosedLoop:
 
 
 def close_loop(model: LoopModel) -> ClosedLoop:
-    """Close the loop of a rig round its designed controller.
+    """Close the loop of a rig around its designed controller.
 
     Parameters
     ----------

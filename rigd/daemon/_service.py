@@ -711,7 +711,7 @@ class Service:
 
 
 async def _in_background(job: background.PredictionJob | background.CheckJob) -> Document:
-    """Have a job done in a process of its own."""
+    """Have a job done in its own process."""
     try:
         return await background.perform(job)
     except background.BackgroundError as error:

@@ -1,4 +1,4 @@
-"""Background jobs of the daemon: predictions and checks, each in a process of its own.
+"""Background jobs of the daemon: predictions and checks, each in its own process.
 
 They take processor time, and anybody may ask for a prediction while a session runs. In the daemon's
 own process they would hold the interpreter that supervises the session; theirs has the lowest
@@ -110,7 +110,7 @@ class BackgroundError(FailureError):
 
 
 async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
-    """Have a job done in a process of its own, without holding up the event loop.
+    """Have a job done in its own process, without holding up the event loop.
 
     Parameters
     ----------

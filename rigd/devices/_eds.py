@@ -337,7 +337,7 @@ def _entries(
 def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
     data_type = _integer(keys.get("datatype", ""))
     if data_type > _LAST_BASIC_TYPE:
-        # Tools define a type of their own for a number with limits, as an object whose sub-index 1
+        # Tools define their own type for a number with limits, as an object whose sub-index 1
         # names the basic type.
         basic = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")
         data_type = _integer(basic)

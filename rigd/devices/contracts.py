@@ -129,7 +129,7 @@ class Drive(Protocol):
 
 @runtime_checkable
 class StatedDrive(Protocol):
-    """A drive with safeguards of its own, which a session's file has to state."""
+    """Safeguards of the drive itself, which a session's file has to state."""
 
     def statement(self) -> dict[str, str]:
         """Return them as keys of the file's metadata; known once it is connected."""

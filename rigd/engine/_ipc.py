@@ -202,7 +202,7 @@ class Parent:
             sys.exit(0)
 
     def poll(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none comes in time (None: wait for ever).
+        """Return the next message, or None if none comes in time (None: wait forever).
 
         Raises
         ------

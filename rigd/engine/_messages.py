@@ -236,7 +236,7 @@ class MessageReader:
         self._pending = bytearray()
 
     def next(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none is complete in time (None: wait for ever).
+        """Return the next message, or None if none is complete in time (None: wait forever).
 
         Raises
         ------

@@ -119,7 +119,7 @@ def _clock_since_boot() -> Callable[[], int]:
 
 
 class TickScheduler:
-    """Absolute deadlines, one a period; a missed tick is skipped, never made up in a burst.
+    """Absolute deadlines, one per period; a missed tick is skipped, never made up in a burst.
 
     Parameters
     ----------

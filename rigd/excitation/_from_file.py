@@ -31,7 +31,7 @@ def from_csv(
     path
         Either columns ``time_s`` and ``angle_rad`` (named in the first line, more columns are
         ignored; angles are interpolated linearly to the ticks, times counted from the first), or
-        a single column of angles in rad, one a tick, with or without the heading ``angle_rad``.
+        a single column of angles in rad, one per tick, with or without the heading ``angle_rad``.
     rate_hz
         Ticks a second.
     rest_s, ring_down_s

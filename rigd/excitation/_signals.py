@@ -115,7 +115,7 @@ def within_a_turn(option: str, value_rad: float) -> None:
 
 
 def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
-    """Refuse a frequency that is not above 0, or has too few samples a period."""
+    """Refuse a frequency that is not above 0, or has too few samples per period."""
     finite(option, value, "Hz")
     highest = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
@@ -123,7 +123,7 @@ def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool =
         raise ExcitationError(f"{option} = {value:g} Hz {bound}.")
     if value > highest:
         raise ExcitationError(
-            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples a period at "
+            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
             f"{rate_hz:g} Hz; choose at most {highest:g} Hz."
         )
 

@@ -93,7 +93,7 @@ def moments(stack: Stack, timing: Timing, delay_s: float, scale: float, unknowns
     age_s = timing.angle_delay_s - timing.torque_delay_s
     y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
 
-    # A command stands for a period: its middle, and the integral over the period round it.
+    # A command stands for a period: its middle, and the integral over the period around it.
     middle_s = delay_s + 0.5 * period_s
     w, w1, _ = _test_window(tick_s + middle_s, length_s)
     held = np.sinc(omega * period_s / (2.0 * pi))

@@ -74,7 +74,7 @@ _AGAIN: Final = """
 
 
 class PageServer:
-    """Serves the page to browsers on this computer, in threads of its own.
+    """Serves the page to browsers on this computer, in separate threads.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ class RigError(FailureError):
 
 
 class Rig:
-    """The devices of one profile, in processes of their own.
+    """The devices of one profile, in separate processes.
 
     All but :meth:`status` is called from one thread.
 

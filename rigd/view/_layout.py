@@ -231,7 +231,7 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         overrides=visualizers,
         # The title says it all where there is but one curve.
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
-        # Left to itself it shows a minute round the cursor, half of it yet to come.
+        # Left to itself it shows a minute around the cursor, half of it yet to come.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),

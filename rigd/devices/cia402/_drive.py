@@ -128,7 +128,7 @@ class Cia402Drive:
         has_torque = outfit.has(ACTUAL_TORQUE)
         self._inbox.with_torque = has_torque
         self._following.compares = has_torque
-        # Without a heartbeat of its own the drive is heard by its TPDOs alone.
+        # Without its own heartbeat the drive is heard by its TPDOs alone.
         self._listens = outfit.has(HEARTBEAT_PRODUCER_MS)
         self._keeps_deadline = outfit.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)

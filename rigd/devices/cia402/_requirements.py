@@ -301,7 +301,7 @@ OPTIONAL: Final = (
         _R | _W,
         "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
         "Nothing in the drive would take the torque off when this computer falls silent. If the "
-        "drive has a watchdog of its own, set that up and state its time: cia402.own_watchdog_s.",
+        "drive has its own watchdog, set that up and state its time: cia402.own_watchdog_s.",
         accept=WATCHDOG,
     ),
     Requirement(

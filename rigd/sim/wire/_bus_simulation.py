@@ -87,7 +87,7 @@ class WallClock:
 class LockStep:
     """One period per SYNC; simulated time waits for the next one.
 
-    It does not wait for ever: five seconds after the last SYNC, and at once where nobody is left
+    It does not wait forever: five seconds after the last SYNC, and at once where nobody is left
     who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
     the first SYNC it goes on too.
 

@@ -1,4 +1,4 @@
-"""``rigd simulate``: a simulated rig as a process of its own, on the wire.
+"""``rigd simulate``: a simulated rig as a separate process, on the wire.
 
 One thread, one loop: it waits for frames, for bytes of the serial line, and for the time to pass.
 The operator's commands come over the control socket.

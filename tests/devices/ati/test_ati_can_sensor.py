@@ -313,7 +313,7 @@ def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
 
 
 class Restarting(Bench):
-    """A box that can be without power for some ticks; each calibration has a matrix of its own."""
+    """A box that can be without power for some ticks; each calibration has its own matrix."""
 
     def __init__(self, fakes, rig, mode):
         super().__init__(fakes, replace(rig, acquisition=replace(rig.acquisition, mode=mode)))
