@@ -277,5 +277,5 @@ def _watch(profile: str | None) -> None:
                 if link is not None:
                     link.close()
                     link = None
-                live.update(f"{error} Waiting for it; Ctrl-C ends.", refresh=True)
+                live.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
             time.sleep(_LOOK_S)

@@ -96,7 +96,8 @@ def copy(
     folder = WORKING_FOLDER if here else user_folder()
     if folder is None:
         fail(
-            "There is no per-user folder, for this user has no home; set XDG_CONFIG_HOME, or copy "
+            "There is no per-user folder, because this user has no home; set XDG_CONFIG_HOME, or "
+            "copy "
             "into this folder by --here.",
             EXIT_FAILED,
         )

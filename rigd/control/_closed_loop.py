@@ -360,7 +360,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     if growth <= 0.0:
         return None
     return (
-        f"{finding}, which is let through up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
+        f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
 

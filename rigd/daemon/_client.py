@@ -436,7 +436,7 @@ def what_is_left(pid: int, uid: int) -> str:
             f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
             f"status. {_UNKNOWN}"
         )
-    begin_again = "see the daemon's log for why, and start it again with rigd serve."
+    begin_again = "see the daemon's log for the cause, and start it again with rigd serve."
     if control:
         return (
             f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
@@ -445,8 +445,8 @@ def what_is_left(pid: int, uid: int) -> str:
     if uid != os.getuid() and not _sees_other_users():
         return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
     return (
-        "The daemon is gone. Its control process, which alone moves the motor, has ended too: see "
-        "that the rig stands still. What was recorded of a session is in the daemon's output "
+        "The daemon is gone. Its control process, which alone moves the motor, has ended too: "
+        "check that the rig is at rest. What was recorded of a session is in the daemon's output "
         f"folder; {begin_again}"
     )
 

@@ -159,7 +159,7 @@ def parse_request(line: bytes) -> AnyRequest:
     command = given.get("command")
     if command not in _COMMANDS:
         raise RequestError(
-            f"command = {_shown(command)} is not known; there are {', '.join(_COMMANDS)}.",
+            f"command = {_shown(command)} is unknown; choose {', '.join(_COMMANDS)}.",
             request_id,
         )
     try:
@@ -205,7 +205,7 @@ def _checked(request: SomeSession) -> SomeSession:
     """Check what depends on the excitation, by the signature of its function."""
     if request.excitation not in KINDS:
         raise RequestError(
-            f"excitation = {_shown(request.excitation)} is not known; there are {', '.join(KINDS)}."
+            f"excitation = {_shown(request.excitation)} is unknown; choose {', '.join(KINDS)}."
         )
     for note in NOTES:
         if not getattr(request.notes, note).isprintable():

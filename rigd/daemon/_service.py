@@ -450,7 +450,7 @@ class Service:
     async def _predict(self, request: protocol.Predict) -> Document:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
-            raise CommandError("Several predictions are being made; try again in a moment.")
+            raise CommandError("Several predictions are running; try again in a moment.")
         job = background.PredictionJob(
             self._profile,
             request.excitation,

@@ -153,7 +153,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     device = sections.get("deviceinfo", {})
     entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), sections, node_id)}
     if not entries:
-        raise EdsError(f"{path}: is no EDS file: no object of a drive is described in it.")
+        raise EdsError(f"{path}: is not an EDS file: it describes no object of a drive.")
     return Eds(
         path=path,
         node_id=node_id,
@@ -210,10 +210,10 @@ def _text(path: Path) -> str:
         except UnicodeDecodeError:
             text = data.decode("cp1252", errors="replace")
     if "\0" in text:
-        raise EdsError(f"{path}: is no EDS file: it is not text.")
+        raise EdsError(f"{path}: is not an EDS file: it is not text.")
     if text.lstrip().startswith("<"):
         raise EdsError(
-            f"{path}: is XML (an XDD file, or ESI of EtherCAT) and no EDS file; "
+            f"{path}: is XML (an XDD file, or ESI of EtherCAT), not an EDS file; "
             "ask the vendor for the drive's EDS of CANopen."
         )
     return text

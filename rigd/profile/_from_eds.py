@@ -57,7 +57,7 @@ QUESTIONS = (
     Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
 )
 """Friction and delay are not asked for: rigd identify motor measures them."""
-_OTHER = "What stood here was of another drive."
+_OTHER = "The previous value was of another drive."
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "

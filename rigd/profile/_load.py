@@ -192,8 +192,8 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
     values["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
-            f'cia402.eds = "{given}": there is no file {eds}; give its path, from the profile\'s '
-            "folder on, or remove the key."
+            f'cia402.eds = "{given}": there is no file {eds}; give its path, relative to the '
+            "profile's folder, or remove the key."
         )
 
 

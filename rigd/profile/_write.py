@@ -86,7 +86,7 @@ def check_new(path: Path) -> None:
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
-        raise ProfileError(f"{path}: there is no folder {path.parent}; make it first.")
+        raise ProfileError(f"{path}: there is no folder {path.parent}; create it first.")
 
 
 def write_new(path: Path, text: str) -> None:
@@ -154,7 +154,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
 
 
 def _taken(path: Path) -> ProfileError:
-    return ProfileError(f"{path}: is there already and is left as it is; name another file.")
+    return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
 def _places(lines: Sequence[str]) -> dict[str, int]:

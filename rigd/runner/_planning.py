@@ -162,9 +162,7 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
         largest_rad = largest_amplitude(profile, excitation, force=force)
         lower = "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
         refusals = [f"{finding}; {lower}." for finding in firm]
-        refusals += [
-            f"{finding}; {lower}, or let it be clipped with --force." for finding in forcible
-        ]
+        refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
     clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
     return Plan(
         prediction,

@@ -210,7 +210,7 @@ class Rig:
         """
         crew = self._require()
         if self._view is None:
-            return "No live view was asked for."
+            return "No live view was requested."
         _wipe(crew.channels.board)
         return self._view.show(order, stop)
 
@@ -355,7 +355,7 @@ class Rig:
         answer = self._crew.control.poll(patience_s)
         if answer is None:
             raise RigError(
-                f"The control process does not answer within {patience_s:g} s; check whether the "
+                f"The control process does not answer within {patience_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
         if isinstance(answer, Ended):

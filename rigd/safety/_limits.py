@@ -372,7 +372,7 @@ INTERLOCKS: Final = (
         0.5,
         Checked.LOOK,
         Action.FAULT,
-        "The disk is too slow, or the computer is overloaded: see what else writes to it.",
+        "The disk is too slow, or the computer is overloaded: check what else writes to it.",
     ),
     Interlock(
         "disk space",

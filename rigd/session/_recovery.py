@@ -106,10 +106,11 @@ class Recovery:
     def lines(self) -> list[str]:
         """Return it as lines of text."""
         if self.path is None:
-            return [f"{self.source} is complete and sound; there is nothing to recover."]
+            return [f"{self.source} is complete and intact; there is nothing to recover."]
         if self.damage is None:
             return [
-                f"{self.path}: {self.source} is complete and sound, and was copied under this name."
+                f"{self.path}: {self.source} is complete and intact, and was copied under this "
+                "name."
             ]
         lines = [
             f"{self.path}: {self.samples} samples recovered from {self.source}, which "
@@ -301,7 +302,7 @@ def remedy(path: Path, *, was_whole: bool) -> str:
         nothing = ", so there is nothing to recover"
         if was_whole:
             return f"{readable}{nothing}{again}."
-        return f"{readable}{nothing}. Copy it again if there is a whole one, or record it again."
+        return f"{readable}{nothing}. Copy it again if there is a complete one, or record it again."
     target = recovered_path(path)
     command = f"`rigd recover {shlex.quote(str(path))}`"
     if os.path.lexists(target):

@@ -80,7 +80,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     elif contents is None:
         contents, recording = beginning, is_being_written(path)
         problem = (
-            "The session is being recorded." if recording else f"The file has no end; {remedy}."
+            "The session is being recorded." if recording else f"The file is incomplete; {remedy}."
         )
     sampled = SAMPLE_TOPIC in {channel.topic for channel in contents.channels.values()}
     if not sampled and not problem:

@@ -282,7 +282,7 @@ def test_messages_that_the_statistics_count_must_be_there(kit, tmp_path):
     assert data[index.chunk_start_offset] == 6
     data[index.chunk_start_offset] = 0x86
     path.write_bytes(data)
-    refused(path, "has not the messages that its statistics count")
+    refused(path, "does not contain the messages that its statistics count")
 
 
 def test_a_damaged_attachment(tmp_path):

@@ -323,8 +323,8 @@ class AtiSerialSensor:
             self._errors_in_a_row = self._errors_in_a_row + 1 if check & ERROR_BIT else 0
             if self._errors_in_a_row >= _ERRORS_IN_A_ROW:
                 raise DeviceError(
-                    f"{self._name}: its records say that it has an error. Its status word says "
-                    "which: run rigd check."
+                    f"{self._name}: its records report an error. Run rigd check to read its status "
+                    "word."
                 )
 
     def _unpack(self, records: bytes) -> tuple[int, ...]:

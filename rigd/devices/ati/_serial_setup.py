@@ -183,9 +183,9 @@ def _reason(error: Exception) -> str:
 
 def _remedy(error: Exception) -> str:
     if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
-        return "another program has it open: end that first"
+        return "another program has it open: close that first"
     if isinstance(error, ValueError):
-        return "check ati_serial.baud, and whether the adapter can make it"
+        return "check ati_serial.baud, and whether the adapter supports it"
     return (
         "check ati_serial.port, whether the adapter is plugged in and whether you may use it "
         "(group dialout), or start the simulated rig: rigd simulate --profile PROFILE"

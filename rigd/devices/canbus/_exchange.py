@@ -311,7 +311,7 @@ class CanExchange:
             )
         elif kind & _NO_ACKNOWLEDGE:
             self._trouble = (
-                f"CAN bus {self.port.name}: nobody acknowledges our frames; check cable, "
+                f"CAN bus {self.port.name}: no device acknowledges the frames sent; check cable, "
                 "termination, power and bit rate."
             )
         elif kind & _CONTROLLER and data[_CONTROLLER_STATE] & _PASSIVE:

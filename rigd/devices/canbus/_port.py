@@ -69,7 +69,7 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     (16, (385, b'rigd'))
     """
     if not 0 <= can_id <= SFF_MASK:
-        raise ValueError(f"{can_id:#x} is no CAN identifier of 11 bits.")
+        raise ValueError(f"{can_id:#x} is not an 11-bit CAN identifier.")
     if len(data) > 8:
         raise ValueError(f"{len(data)} bytes do not fit into a CAN frame, which has 8.")
     return _FRAME.pack(can_id, len(data), data)

@@ -49,7 +49,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
     if state is DriveState.SWITCH_ON_DISABLED:
         # It has lost its supply there, mostly; a command leaves that on.
         supplied = bool(statusword & VOLTAGE_ENABLED)
-        hint = ", and its bit 4 says that the supply is there, which speaks for such a command"
+        hint = ", and its bit 4 says that the supply is there, which indicates such a command"
         dropped = wired_stop_dropped(
             name,
             f", or the motor's supply failed, or {_FOREIGN_COMMAND}: {left}"
@@ -138,7 +138,7 @@ class TorqueFollowing:
                 f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
                 f"6077) where {self._commanded / 10:g} % were commanded, for {_TICKS} ticks; "
                 "commands are lost, or the drive limits them. Check its diagnosis and "
-                "cia402.torque_tolerance_percent; where it measures this torque, at "
+                "cia402.torque_tolerance_percent; where it measures this torque, check "
                 "cia402.torque_response_s."
             )
 
@@ -288,8 +288,8 @@ def _turn_until(
         silent = 0 if answered else silent + 1
         if silent >= limit:
             raise DeviceError(
-                f"{node.name}: it has stopped answering SYNC while being enabled; check its "
-                "supply and at the cable."
+                f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
+                "and the cable."
             )
     raise DeviceError(f"{node.name}: {stuck()} (cia402.enable_timeout_s = {timeout_s:g} s).")
 
