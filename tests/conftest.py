@@ -133,7 +133,8 @@ BRIEF_LOOK = """
 import json, pathlib, sys
 
 session = pathlib.Path(sys.argv[1])
-look = {"file": session.name, "text": [f"Quick look at {session.stem}", "  mode 1"]}
+text = [f"Quick look at {session.stem}", "  mode 1"]
+look = {"version": 1, "file": session.name, "text": text}
 session.with_suffix(".look.json").write_text(json.dumps(look))
 """
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from rigd.errors import RigdError
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
 from rigd.session import NOTES, MetadataError, metadata_keys
 
@@ -31,6 +32,15 @@ class RequestError(Exception):
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
         self.request_id = request_id
+
+
+class CommandError(RigdError):
+    """A request is refused, or failed; the message is for the operator."""
+
+    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+        """The request itself has to be another."""
 
 
 class Request(BaseModel):

@@ -9,7 +9,6 @@ from typing import Final
 from rigd.errors import UserError
 from rigd.library._index import Index, Stamped
 from rigd.library._row import (
-    LOOK_SUFFIX,
     NUMBERS,
     PAGE,
     REPORT_FOLDER,
@@ -18,6 +17,7 @@ from rigd.library._row import (
     SessionRow,
     read_row,
 )
+from rigd.session import LOOK_SUFFIX
 
 _NS_PER_S: Final = 1_000_000_000
 _DATE_CHARACTERS: Final = len("2026-11-20")

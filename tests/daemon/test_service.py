@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon._service import CommandError
+from rigd.daemon._protocol import CommandError
 from rigd.daemon._states import Peer, State
 from rigd.devices._registry import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
