@@ -81,6 +81,7 @@ def rows(heading):
 
 
 AGAIN = {
+    "angle lost",
     "bus cut",
     "controlword corrupted",
     "drive restarts",
@@ -93,6 +94,7 @@ AGAIN = {
     "sensor silent",
     "statusword corrupted",
     "stream reports an error",
+    "stream silent",
     "streaming sensor restarts",
     "torque commands lost",
     "wrench lost",
