@@ -170,6 +170,11 @@ def rendered(figure: Figure, kind: FigureFormat) -> bytes:
         SVG has its text as text, and the same identifiers each time; PDF embeds TrueType fonts,
         as journals ask for.
     """
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.get_label_text():
+                # Else it is placed clear of the ticks, which are laid out twice more for it.
+                axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
     if kind == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
