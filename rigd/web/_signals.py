@@ -25,6 +25,8 @@ FIRST_HZ: Final = 0.5
 LAST_HZ: Final = 60.0
 _GROUPS: Final = 200
 """Groups of frequencies of which the extremes are told: at most twice as many points."""
+_EVERY: Final = 4
+"""Of `analyze`'s bins of 1/160 Hz: still more than two a segment's resolution of 1/17 Hz."""
 _MODEL_STEP_HZ: Final = 0.01
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
@@ -139,7 +141,7 @@ class SessionResponse:
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ)
+        self._sweep = SweepResponse(subject, LAST_HZ, every=_EVERY)
         self._thinning: Thinning | None = None
         self._waiting: list[Block] = []
         self._fresh = False
