@@ -407,7 +407,7 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
     new = place.with_name(f".{place.name}.{os.getpid()}")
     try:
         if there is None and place.exists() and place.stat().st_size > 0:
-            raise LookError(f"{place} is no quick look of this version; move it away.")
+            raise LookError(f"{place} is not a quick look of this version; move it away.")
         new.write_text(json.dumps(document, allow_nan=False), "utf-8")
         new.replace(place)
     except OSError as error:

@@ -53,7 +53,7 @@ class Outputs:
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:
-        """Return where people's text goes, in the report's width where that is no terminal."""
+        """Return where people's text goes, in the report's width where that is not a terminal."""
         from rich.console import Console
 
         console = Console(stderr=self.json_to_stdout, highlight=False)
@@ -63,7 +63,7 @@ class Outputs:
 
 
 def session_files(paths: Sequence[Path]) -> list[Path]:
-    """Put in the place of each folder the sessions in it, by name; torn ones are left out.
+    """Put in the place of each folder the sessions in it, by name; incomplete ones are left out.
 
     Parameters
     ----------

@@ -90,10 +90,10 @@ def list_sessions(
 
 
 def specimens() -> None:
-    """List the specimens that have a file of their own.
+    """List the specimens that have their own file.
 
     A file NAME.toml has the section [beam] of a profile and may have [beam.damping] and a text
-    note. It is looked for in specimens of the working folder, then in the per-user folder
+    note. It is searched in specimens of the working folder, then in the per-user folder
     ($XDG_CONFIG_HOME/rigd/specimens, by default ~/.config/rigd/specimens). Sessions with --specimen
     NAME use its beam instead of the profile's.
 

@@ -27,7 +27,7 @@ def fail(message: str, code: int) -> NoReturn:
 
 @contextlib.contextmanager
 def errors_told() -> Iterator[None]:
-    """End the command with what an error of the rig says: 2 for wrong use, else 1."""
+    """End the command with what an error of the rig says: 2 for a usage error, else 1."""
     try:
         yield
     except RigdError as error:

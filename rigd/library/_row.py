@@ -162,7 +162,7 @@ def _text(values: Mapping[str, str], key: str) -> str:
 
 def _count(values: Mapping[str, str], key: str) -> int | None:
     text = values.get(key, "")
-    # More digits are no count, and no 64 bits hold them.
+    # More digits are not a count, and no 64 bits hold them.
     countable = text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS + 1
     return int(text) if countable and int(text) < 2**63 else None
 

@@ -65,7 +65,7 @@ def result_line(session: Mapping[str, Any]) -> str:
 class ProgressLine:
     """One line on standard error that says how far a session is, and messages above it.
 
-    It is written by a thread of its own: a terminal that was stopped (Ctrl-S), or a pipe that
+    It is written by a separate thread: a terminal that was stopped (Ctrl-S), or a pipe that
     nobody reads, must not keep the supervisor from its session.
     """
 

@@ -1,6 +1,6 @@
 """Quick looks: a program that looks at each session that has ended, and never while one runs.
 
-The program is ``python -m analysis.quick_look``, a process of its own at the lowest priority. One
+The program is ``python -m analysis.quick_look``, a separate process at the lowest priority. One
 runs at a time. It is suspended before a session begins and goes on when that has ended; one that
 takes too long is killed, and all end with the process that started them.
 """

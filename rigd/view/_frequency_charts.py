@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import Status
-from rigd.spectral import RunningEstimate, RunningResponse
+from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
 from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
 from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
@@ -38,11 +38,18 @@ class SweepResponse:
         The session.
     last_hz
         Up to where the response is wanted.
+    every
+        Estimate only every so many of `analyze`'s bins, as far as the segments allow.
     """
 
-    def __init__(self, subject: "Subject", last_hz: float) -> None:
+    def __init__(self, subject: "Subject", last_hz: float, *, every: int = 1) -> None:
         self._first, end = subject.sweep
-        self._running = RunningResponse(subject.rate_hz, end - self._first, last_hz=last_hz)
+        samples = end - self._first
+        chosen = segmentation_of(samples, subject.rate_hz)
+        chosen = replace(chosen, nfft=max(chosen.nfft // every, chosen.segment_length))
+        self._running = RunningResponse(
+            subject.rate_hz, samples, last_hz=last_hz, segmentation=chosen
+        )
         self._at_rest: list[npt.NDArray[np.float64]] = []
         self._rest_rad: float | None = None
 
@@ -59,7 +66,7 @@ class SweepResponse:
             self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
             self._at_rest = []
         swept = samples[before:]
-        # What is held from an earlier tick is no measurement: the gap is filled like any other.
+        # What is held from an earlier tick is not a measurement: the gap is filled like any other.
         known = np.where(swept["status"] & _HELD, np.nan, 1.0)
         self._running.feed(
             ticks[before:],
@@ -474,7 +481,7 @@ class SpectrogramChart:
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
             left=width - _BAR - 24.0,
         )
-        # Row 0 is on top. Without the mean of the torque, which is no motion.
+        # Row 0 is on top. Without the mean of the torque, which is not a motion.
         self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
         self._filled = 0
         self._t_ns = 0

@@ -280,5 +280,5 @@ def _download_headers(name: str) -> dict[str, str]:
 
 def _whole(text: str, name: str) -> int:
     if not text.isdecimal() or len(text) > len(str(_MOST_ROWS)) + 3:
-        raise web.HTTPBadRequest(reason=f"{name} is no whole number.")
+        raise web.HTTPBadRequest(reason=f"{name} is not a whole number.")
     return int(text)

@@ -21,7 +21,7 @@ from rigd.session import look_path
 
 @pytest.fixture(scope="module")
 def chirps(short_chirps, tmp_path_factory):
-    """Both chirps in a folder of their own, and the looks at them in turn."""
+    """Both chirps in their own folder, and the looks at them in turn."""
     folder = tmp_path_factory.mktemp("looks")
     paths = [Path(shutil.copy(path, folder)) for path in short_chirps]
     looks = []

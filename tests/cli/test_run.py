@@ -346,7 +346,7 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
     process = start_rigd("run", "hold", *options)
     assert eventually(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
     (tmp_path / "file").write_text("in the way")
-    (tmp_path / "file").rename(tmp_path / "sessions")  # at one go: a missing folder is made anew
+    (tmp_path / "file").rename(tmp_path / "sessions")  # in one step: a missing folder is recreated
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, errors
     assert len(json.loads(output)["sessions"]) >= 2
