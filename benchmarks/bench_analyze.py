@@ -23,14 +23,16 @@ from pathlib import Path
 from rigd.runtime import use_one_thread
 
 RUNS = 5
-LOOK_LIMIT_S = 10.0
-REPORT_LIMIT_S = 6.0
-LONG_LIMIT_S = 40.0
-JUDGEMENT_LIMIT_S = 4.0
+LIMITS_S = {
+    "quick look": 10.0,
+    "analyze, full report": 6.0,
+    "analyze, 30 min of record": 40.0,
+    "whole record": 4.0,
+}
+"""By what is printed: "whole record" is one session's full judgement, with all rivals."""
 LIMIT_MB = 1000
 LONG_SWEEP_S = 1784
 """With rest and ring-down half an hour."""
-JUDGEMENT = "whole record"
 ANALYZE = [sys.executable, "-m", "analysis"]
 STEPS = """
 import resource, sys, time
@@ -47,7 +49,7 @@ mark("reading")
 welch = analysis.paper.analyse(record, WelchSettings())
 mark("the paper's route")
 selection = analysis.identify.select(Measurement.of_record(record))
-mark("JUDGEMENT")
+mark("whole record")
 from analysis.results import RecordResult, WholeRecord
 from analysis.report import frf_figure, illustrations, write_report
 mark("imports of matplotlib")
@@ -56,7 +58,7 @@ write_report(result, Path(sys.argv[2]), mark)
 mark("page, tables and JSON")
 for (name, end), (_, start) in zip(marks[1:], marks):
     print(name, end - start, sep="\\t")
-""".replace("JUDGEMENT", JUDGEMENT)
+"""
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,11 @@ def steps(session: Path, folder: Path) -> dict[str, float]:
     }
 
 
+def limit(what: str) -> str:
+    """Limit of what is printed, as it stands beside it."""
+    return f"{LIMITS_S[what]:5g} s" if what in LIMITS_S else ""
+
+
 def main() -> None:
     """Print costs, their ratios to the peers, and the steps."""
     use_one_thread()  # as the command does
@@ -139,18 +146,17 @@ def main() -> None:
         longest = cost([*ANALYZE, str(long), "--report", str(folder / "report of long")])
         print(f"best of {RUNS} processes, {session.name}, load {os.getloadavg()[0]:.1f}")
         print(f"  {'':28}  processor      wall   memory   limit")
-        for what, found, limit_s in (
-            ("interpreter alone", interpreter, None),
-            ("analyze --help", usage, None),
-            ("import numpy and matplotlib", floor, None),
-            ("quick look", look, LOOK_LIMIT_S),
-            ("analyze, full report", whole, REPORT_LIMIT_S),
-            ("analyze, 30 min of record", longest, LONG_LIMIT_S),
+        for what, found in (
+            ("interpreter alone", interpreter),
+            ("analyze --help", usage),
+            ("import numpy and matplotlib", floor),
+            ("quick look", look),
+            ("analyze, full report", whole),
+            ("analyze, 30 min of record", longest),
         ):
-            limit = f"{limit_s:5g} s" if limit_s else ""
             print(
                 f"  {what:28}  {found.processor_s:7.3f} s {found.wall_s:7.3f} s "
-                f"{found.megabytes:5.0f} MB {limit}"
+                f"{found.megabytes:5.0f} MB {limit(what)}"
             )
         print(
             f"  limit of memory {LIMIT_MB} MB; the report takes "
@@ -164,8 +170,7 @@ def main() -> None:
             for step, seconds in steps(session, target).items():
                 of_steps.setdefault(step, []).append(seconds)
         for step, times_s in of_steps.items():
-            limit = f"  limit {JUDGEMENT_LIMIT_S:g} s" if step == JUDGEMENT else ""
-            print(f"  {step:28}  {min(times_s):7.3f} s{limit}")
+            print(f"  {step:28}  {min(times_s):7.3f} s {limit(step)}")
 
 
 if __name__ == "__main__":
