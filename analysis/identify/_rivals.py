@@ -47,7 +47,7 @@ noise."""
 _HALVINGS: Final = 20
 
 _QUIETER: Final = 0.98
-"""Share of the sum of squares left by an extra, below which the noise is estimated anew."""
+"""Share of the sum of squares left by an extra, below which the noise is estimated again."""
 
 
 def with_extras(field: CandidateSet) -> CandidateSet:

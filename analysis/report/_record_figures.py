@@ -310,7 +310,7 @@ def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
     for line in analysis.lines:
         axes.annotate(
-            f"{line.frequency_hz:.4g} Hz hum", (line.frequency_hz, 1.0),
+            f"{line.frequency_hz:.4g} Hz disturbance", (line.frequency_hz, 1.0),
             xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
             ha="center", fontsize=7.5, color=style.PURPLE,
         )  # fmt: skip

@@ -112,7 +112,7 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
     if not title:
         return figure
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
-    # A file name may hold dollar signs, which are not mathematics, and bytes that are no text.
+    # A file name may hold dollar signs, which are not mathematics, and bytes that are not text.
     common: dict[str, Any] = {"va": "top", "parse_math": False}
     title, subtitle = (each.encode("utf-8", "replace").decode() for each in (title, subtitle))
     for text in (
@@ -232,7 +232,7 @@ def save_picture(
     wanted: set[FigureFormat] = {"png", "svg", *formats}
     content = {kind: rendered(figure, kind) for kind in FIGURE_FORMATS if kind in wanted}
     for kind in formats:
-        # A name may have dots of its own.
+        # A name may have its own dots.
         write_new(stem.with_name(f"{stem.name}.{kind}"), content[kind])
     return Picture(stem.name, description, content["png"], content["svg"])
 

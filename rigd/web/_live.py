@@ -143,5 +143,4 @@ class Pages:
             page.drop()
 
 
-def _text(document: Document) -> str:
-    return json.dumps(document, allow_nan=False, separators=(",", ":"))
+_text: Final = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode

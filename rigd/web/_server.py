@@ -6,7 +6,6 @@ import logging
 import os
 import re
 import sys
-import time
 from collections.abc import Awaitable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -41,7 +40,6 @@ _STOPS: Final = 4
 _LONGEST_REQUEST: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
-_GAUGES_S: Final = 0.095
 _RESPONSE_S: Final = 1.0
 _GRACE_S: Final = 0.3
 _AT_WORK: Final = ("running", "stopping")
@@ -79,7 +77,6 @@ class PageServer:
         self._status: Document | None = None
         self._lost: Document | None = None
         self._gauges: Document | None = None
-        self._gauges_s = 0.0
         self._strips = Strips()
         self._session: str | None = None
         self._response: SessionResponse | None = None
@@ -256,14 +253,9 @@ class PageServer:
             self.pages.send(self._strips.feed(block))
             if self._response is not None:
                 self._response.feed(block)
-        now_s = time.monotonic()
-        if now_s - self._gauges_s >= _GAUGES_S:
-            self._gauges_s = now_s
-            self._gauges = {
-                "type": "gauges",
-                **event["gauges"],
-                "frequency_hz": event["frequency_hz"],
-            }
+        if event["gauges"] is not None:
+            frequency_hz = event["frequency_hz"]
+            self._gauges = {"type": "gauges", **event["gauges"], "frequency_hz": frequency_hz}
             self.pages.send(self._gauges)
 
     def _lose(self, reason: str) -> None:

@@ -12,8 +12,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.beam import Beam, Damping, transfer
-from rigd.view import Subject, SweepResponse, Thinning
+from rigd.beam import Beam, Damping
+from rigd.view import (
+    LAST_HZ,
+    Subject,
+    SweepResponse,
+    Thinning,
+    nominal_response,
+    response_thinning,
+)
 
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
@@ -21,13 +28,11 @@ Real = npt.NDArray[np.float64]
 STRIP_S: Final = 0.05
 """Time that a point of a strip stands for."""
 _KEPT_S: Final = 10.0
-FIRST_HZ: Final = 0.5
-LAST_HZ: Final = 60.0
-_GROUPS: Final = 200
-"""Groups of frequencies of which the extremes are told: at most twice as many points."""
-_MODEL_STEP_HZ: Final = 0.01
+_EVERY: Final = 4
+"""Of `analyze`'s bins of 1/160 Hz: still more than two a segment's resolution of 1/17 Hz."""
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
+_NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _SAMPLE: Final = np.dtype(
     [
         ("tick", np.int64),
@@ -45,18 +50,15 @@ class Block:
 
     first_tick: int
     rate_hz: float
-    angle_rad: Real
-    reference_rad: Real
-    torque_nm: Real
+    values: Real
+    """Angle (rad), its reference (rad) and coupling torque (N·m), (3, n)."""
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "Block":
         """Take it out of the daemon's event ``signals``."""
-        angle, reference, torque = (
-            np.frombuffer(base64.b64decode(event[name]), dtype="<f4").astype(np.float64)
-            for name in ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
-        )
-        return cls(event["first_tick"], event["rate_hz"], angle, reference, torque)
+        data = b"".join(base64.b64decode(event[name]) for name in _NAMES)
+        values = np.frombuffer(data, dtype="<f4").reshape(len(_NAMES), -1).astype(np.float64)
+        return cls(event["first_tick"], event["rate_hz"], values)
 
 
 # Strips
@@ -76,7 +78,7 @@ class Strips:
     def feed(self, block: Block) -> Document | None:
         """Take a block; return the points that it completes as the page is told them."""
         ticks = max(1, round(STRIP_S * block.rate_hz))
-        values = np.stack((block.angle_rad, block.reference_rad, block.torque_nm))
+        values = block.values
         missing = block.first_tick - self._end
         if missing < 0 or missing > _KEPT_S * block.rate_hz:
             self._points.clear()
@@ -141,30 +143,34 @@ class SessionResponse:
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ)
+        self._sweep = SweepResponse(subject, LAST_HZ, every=_EVERY)
         self._thinning: Thinning | None = None
-        self._waiting: list[npt.NDArray[Any]] = []
+        self._waiting: list[Block] = []
         self._fresh = False
         self._reached_hz = 0.0
 
     def feed(self, block: Block) -> None:
         """Take a block; what is not known of it is left out."""
-        known = np.isfinite(block.angle_rad)
-        samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
-        samples["tick"] = (block.first_tick + np.arange(known.size))[known]
-        samples["angle_rad"] = block.angle_rad[known]
-        samples["angle_reference_rad"] = block.reference_rad[known]
-        samples["coupling_torque_nm"] = block.torque_nm[known]
-        if samples.size:
-            self._waiting.append(samples)
+        self._waiting.append(block)
         if len(self._waiting) >= _FED_AT_ONCE:
             self._feed_sweep()
 
     def _feed_sweep(self) -> None:
         """Feed what waits: a call for many blocks costs no more than one for a single block."""
-        if self._waiting:
-            self._sweep.feed(np.concatenate(self._waiting))
-            self._waiting.clear()
+        if not self._waiting:
+            return
+        values = np.concatenate([block.values for block in self._waiting], axis=1)
+        ticks = np.concatenate(
+            [block.first_tick + np.arange(block.values.shape[1]) for block in self._waiting]
+        )
+        self._waiting.clear()
+        known = np.isfinite(values[0])
+        if known.any():
+            samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
+            samples["tick"] = ticks[known]
+            for name, signal in zip(_NAMES, values, strict=True):
+                samples[name] = signal[known]
+            self._sweep.feed(samples)
             self._fresh = True
 
     def document(self) -> Document | None:
@@ -183,9 +189,9 @@ class SessionResponse:
         )
         grid = response.frequency_hz
         if self._thinning is None:
-            self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
+            self._thinning = response_thinning(grid)
         shown = np.where(estimate.excited, response.response, np.nan)
-        kept = _extremes(self._thinning, np.abs(shown))
+        kept = self._thinning.extremes(np.abs(shown))
         coherence = None
         if response.coherence is not None:
             coherence = _known(np.round(response.coherence[kept], 4))
@@ -206,10 +212,8 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     """
-    grid = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
-    s = 2j * np.pi * grid
-    model = transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
-    kept = _extremes(Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS), np.abs(model))
+    grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
+    kept = response_thinning(grid).extremes(np.abs(model))
     return {"type": "nominal", **_curve(grid[kept], model[kept])}
 
 
@@ -219,16 +223,3 @@ def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document
         "magnitude": [float(f"{value:.4g}") for value in np.abs(response)],
         "phase_rad": np.round(np.angle(response), 4).tolist(),
     }
-
-
-def _extremes(thinning: Thinning, magnitude: Real) -> npt.NDArray[np.intp]:
-    """Return where each group's least and greatest magnitude are, without those not known."""
-    grouped = magnitude[thinning.groups]
-    unknown = np.isnan(grouped)
-    rows = ~unknown.all(axis=1)
-    grouped, unknown, groups = grouped[rows], unknown[rows], thinning.groups[rows]
-    least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-    greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-    places = np.stack((least, greatest), axis=1)
-    kept: npt.NDArray[np.intp] = np.unique(np.take_along_axis(groups, places, axis=1))
-    return kept

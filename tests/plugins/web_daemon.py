@@ -72,7 +72,7 @@ class FakeDaemon:
 
 
 class Served:
-    """A page's server in a thread of its own, and the daemon behind it."""
+    """A page's server in its own thread, and the daemon behind it."""
 
     def __init__(self, folder, path, profile):
         self.folder = folder
