@@ -29,7 +29,7 @@ STRIP_S: Final = 0.05
 """Time that a point of a strip stands for."""
 _KEPT_S: Final = 10.0
 _EVERY: Final = 4
-"""Of `analyze`'s bins of 1/160 Hz: still more than two a segment's resolution of 1/17 Hz."""
+"""One bin in four of the 1/160 Hz of `analyze` is shown: still two in a segment's resolution."""
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
 _NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
