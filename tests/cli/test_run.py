@@ -67,7 +67,11 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     ("arguments", "ticks"),
     [
         (("hold", "--duration", "1", "--rest", "0.5"), 1500),
-        (("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"), 2000),
+        pytest.param(  # runs in tests/docs/test_readme.py as well
+            ("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"),
+            2000,
+            marks=pytest.mark.slow,
+        ),
         (
             ("multisine", "--amplitude", "0.01", "--period", "1", "--duration", "2", "--start-hz",
              "1", "--stop-hz", "20", "--rest", "0.5", "--ring-down", "0.5"),

@@ -86,6 +86,7 @@ AGAIN = {
     "controlword corrupted",
     "drive restarts",
     "drive's heartbeat lost",
+    "encoder jumps",
     "gauge at its end",
     "half of each wrench lost",
     "loop's frames lost",
