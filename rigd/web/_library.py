@@ -8,6 +8,7 @@ import json
 import re
 import tempfile
 from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,8 +96,7 @@ class Library:
         for row in await self.rows(specimen=specimen or None):
             if row.id == but or row.specimen != specimen:
                 continue
-            response = (self._look_of(row.id) or {}).get("response")
-            if response:
+            if response := self._response_of(row.id):
                 where = {"type": "last", "path": str(row.path), "specimen": row.specimen}
                 return {**response, **where, "id": row.id}
         return None
@@ -128,12 +128,11 @@ class Library:
             return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
         responses, errors = [], []
         for name in ids:
-            look = self._look_of(self._path(name).stem)
-            if look is None or not look.get("response"):
+            response = self._response_of(self._path(name).stem)
+            if response is None:
                 errors.append(f"{name}: there is no quick look of it, and so no response.")
             else:
-                specimen = look.get("specimen")
-                responses.append({"id": name, "specimen": specimen, **look["response"]})
+                responses.append({"id": name, **response})
         return web.json_response({"responses": responses, "errors": errors})
 
     # Downloads
@@ -170,7 +169,7 @@ class Library:
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
         path = self._session(request)
-        found = next((row for row in await self.rows() if row.id == path.stem), None)
+        found = next((row for row in await self.rows() if row.path.name == path.name), None)
         if found is None or found.report is None:
             return refused(404, "There is no report of it.")
         return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
@@ -264,12 +263,28 @@ class Library:
 
     def _look_of(self, name: str) -> Document | None:
         """Return the quick look of a session, if there is one that can be read."""
-        with suppress(OSError, ValueError, web.HTTPNotFound):
+        with suppress(OSError, ValueError, RecursionError, web.HTTPNotFound):
             path = self._inside(f"{name}.look.json")
             if path.stat().st_size <= _MOST_LOOK:
-                look = json.loads(path.read_bytes(), parse_constant=lambda _: None)
+                look = json.loads(
+                    path.read_bytes(), parse_constant=lambda _: None, parse_float=_finite
+                )
                 return look if isinstance(look, dict) else None
         return None
+
+    def _response_of(self, name: str) -> Document | None:
+        """Return the response of a quick look, with its specimen."""
+        look = self._look_of(name) or {}
+        response = look.get("response")
+        if not response or not isinstance(response, dict):
+            return None
+        return {"specimen": look.get("specimen"), **response}
+
+
+def _finite(text: str) -> float | None:
+    """Return a number of a file; None of 1e999, which JSON has no number for."""
+    number = float(text)
+    return number if isfinite(number) else None
 
 
 def _download_headers(name: str) -> dict[str, str]:

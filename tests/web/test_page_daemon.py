@@ -2,69 +2,29 @@
 
 import contextlib
 import os
+import re
 import resource
 import signal
-import subprocess
-import sys
 import time
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import expect
-from processes import child_running, eventually
+from processes import child_running
+from web_daemon import rig_with_page
 
-from rigd.daemon import page_address
-
-RIGD = Path(sys.executable).parent / "rigd"
 TELL_S = 1.0
 """Within this time the page has to say what the daemon has seen."""
 END_MS = 60_000
 """For what the rig or the analysis does, on a computer that is overloaded."""
 
 
-@dataclass
-class Served:
-    """A daemon with its page."""
-
-    process: subprocess.Popen
-    address: str
-
-
-@contextlib.contextmanager
-def served(profile, name, folder, *options):
-    command = [RIGD, "serve", "--profile", profile, "--output", folder / "out", "--web", *options]
-    told = folder / "serve.txt"
-    environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
-    with told.open("w") as said:
-        process = subprocess.Popen(
-            command, stdout=said, stderr=said, start_new_session=True, env=environment
-        )
-    try:
-        address = eventually(lambda: page_address(name), within_s=60.0)
-        assert address, told.read_text()
-        yield Served(process, address)
-    finally:
-        process.send_signal(signal.SIGCONT)
-        process.terminate()
-        try:
-            process.wait(20.0)
-        finally:
-            process.kill()
-            process.wait()
-
-
 @pytest.fixture
-def serve(tmp_path, write_profile):
+def serve(tmp_path, write_profile_in):
     """Start a daemon with its page, on a rig of this test's own."""
     with contextlib.ExitStack() as ending:
-
-        def start(*options):
-            name = f"page-{os.getpid()}-{time.monotonic_ns()}"
-            profile = write_profile("sim", {"name": f'"{name}"'}, patient=True)
-            return ending.enter_context(served(profile, name, tmp_path, *options))
-
-        yield start
+        yield lambda *options: ending.enter_context(
+            rig_with_page(write_profile_in, tmp_path, *options)
+        )
 
 
 @pytest.fixture
@@ -172,11 +132,24 @@ def test_a_new_operator_runs_stops_reports_and_compares_sessions(operate, open_p
     page.click(f"{row} >> text=Make report")
     report = page.locator("#sessions-result a")
     expect(report).to_have_text("open the report", timeout=2 * END_MS)
-    address = daemon.address.split("#")[0].rstrip("/") + report.get_attribute("href")
+    assert "antenna 3" in report_of(daemon, open_page, report)
+
+    if options:  # in real time, missed ticks may leave nothing to fit
+        page.click("#campaign")
+        expect(report).to_have_attribute("href", re.compile("campaign"), timeout=2 * END_MS)
+        told = report_of(daemon, open_page, report)
+        assert "antenna 3" in told
+        assert "2 sessions" in told
+
+
+def report_of(daemon, open_page, link):
+    """Open the report that a link of the page leads to; returns what it says."""
     assert not open_page.complaints
-    assert "antenna 3" in open_page(address).inner_text("body")
+    address = daemon.address.split("#")[0].rstrip("/") + link.get_attribute("href")
+    text = open_page(address).inner_text("body")
     # A report has no origin, and so no icon of the page's.
     open_page.complaints.clear()
+    return text
 
 
 def test_what_fails_is_told_within_a_second(operate, open_page):

@@ -84,6 +84,28 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert "second" in overlay["errors"][0]
 
 
+@pytest.mark.parametrize(
+    "look",
+    [b"[" * 100_000, b'{"response":' * 50_000, b'{"response": {"magnitude": [1e999, NaN, -1e400]}}',
+     b'{"response": [1]}', b"7", b"\xff"],
+    ids=["nested", "nested objects", "no numbers", "no response", "no look", "no text"],
+)  # fmt: skip
+def test_a_look_that_somebody_has_damaged_breaks_neither_list_nor_overlay(served, two, look):
+    (served.folder / "first.look.json").write_bytes(look)
+    _, _, found = get(served, "/api/sessions")
+    assert [row["id"] for row in found["sessions"]] == ["second", "first"]
+    status, _, told = get(served, "/api/sessions/first/look")
+    assert status == (200 if b'response": {' in look or b"[1]" in look else 404), told
+    _, _, overlay = get(served, "/api/frf?ids=first")
+    if overlay["responses"]:
+        assert overlay["responses"][0]["magnitude"] == [None, None, None]
+    else:
+        assert "no quick look" in overlay["errors"][0]
+    finding = served.server._library.last_response("antenna", "second")
+    last = asyncio.run_coroutine_threadsafe(finding, served.loop).result(30.0)
+    assert last is None or json.dumps(last, allow_nan=False)
+
+
 def test_another_format_is_made_and_sent(served, two):
     assert eventually(lambda: not served.server._jobs.paused)
     status, head, body = get(served, "/api/sessions/first/file.mat")
