@@ -207,7 +207,7 @@ class Library:
             or not all(isinstance(name, str) for name in ids)
         ):
             return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
-        paths = [str(self._path(name)) for name in dict.fromkeys(ids)]
+        paths = sorted({str(self._path(name)) for name in ids})  # as they were recorded
         folder = self._free("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
         return self._queue("campaign", arguments, "", f"/api/campaign/{folder.name}/")
