@@ -14,7 +14,7 @@ the damping's size at one frequency, and the order:
 * ``ln(gamma omega_1^lambda / (rho/EI omega_1²))``: external damping relative to the inertia at the
   undamped first mode, and ``lambda``.
 
-The whole-record fits have a parametrization of their own (`analysis.identify.Unknowns`), in which
+The whole-record fits have their own parametrization (`analysis.identify.Unknowns`), in which
 beam and rig are free as well.
 """
 
@@ -61,7 +61,7 @@ QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
         "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
         "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
         "delay_s": ("τ", "torque-channel delay", "µs", 1e6),
-        "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
+        "tool_inertia_kg_m2": ("J", "tool inertia", "1e-6 kg·m²", 1e6),
         "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
         "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
         "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
@@ -164,7 +164,7 @@ STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
 class FrequencyResponseModel:
     """Measured torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on one frequency grid.
 
-    The torque sensor sits under the clamp, so what it measures holds the clamp's inertia too; it
+    The torque sensor sits under the clamp, so what it measures includes the tool inertia; it
     is added to the model, and never taken from the data.
 
     Parameters

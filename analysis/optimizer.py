@@ -127,7 +127,7 @@ class Box:
     """Bounds between which steps go straight: an unknown that one would push through rests there.
 
     To make the best of it with the other unknowns within the same step, as `_step` does within
-    limits, is no gain here: the fits to a frequency response take 7 % more evaluations with it.
+    limits, brings no gain here: the fits to a frequency response take 7 % more evaluations with it.
     """
 
     lower: NDArray[np.float64]

@@ -20,9 +20,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.runtime import killed_first, raise_on, signal_when_orphaned, use_one_thread
-from rigd.session import LOOK_SUFFIX, SessionError, look_path
-from rigd.units import decimals
+from rigd.library import change_between
+from rigd.runtime import end_with, give_way, killed_first, raise_on, use_one_thread
+from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, read_look
+from rigd.units import decimals, with_half_width
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -36,31 +37,14 @@ if TYPE_CHECKING:
 
     Real = NDArray[np.float64]
 
-VERSION: Final = 1
-"""Version of the file's layout."""
-
 _JUDGED_S: Final = 300.0
 """Longest record to which every structure is fitted: that takes 15 ms per second of record at
 1 kHz, the freest structure alone 2 ms."""
 
-_LAST_HZ: Final = 60.0
-_FIRST_HZ: Final = 0.5
-"""Band of the response: that of the live view."""
-
-_POINTS: Final = 400
-"""Most points of the response in the file."""
-
-_COHERENT: Final = 0.8
-"""Coherence below which a band is named."""
-
 _NEAR: Final = 0.1
 """Distance of two such bands, relative to their frequency, below which they are told as one."""
 
-_SIGNIFICANT_STD: Final = 3.0
-"""A change counts from so many standard deviations of the difference on: six are looked at."""
-
-_MOST_LOOKS: Final = 200
-_MOST_BYTES: Final = 1_000_000
+_QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 
 
 class LookError(ValueError):
@@ -95,7 +79,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
 
     began_s = time.monotonic()
     modes: list[dict[str, Any]] = []
-    response, coherence = _no_response(), _no_coherence()
+    response, coherence = None, _no_coherence()
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     flags: list[str] = []
     compared = None
@@ -117,7 +101,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
     document = {
-        "version": VERSION,
+        "version": LOOK_VERSION,
         "file": path.name,
         "session_id": session_id,
         "start_utc_ns": start_utc_ns,
@@ -175,32 +159,33 @@ def _mode(mode: Mode) -> dict[str, Any]:
     }
 
 
-def _response(record: Record) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
+def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], list[str]]:
     """Estimate response and coherence as the live view does, where the reference has excited it."""
     import numpy as np
 
     from analysis.models import LARGEST_SHARE_OF_RATE
     from analysis.suited import against_welch
     from rigd.spectral import SpectralError, segmentation_of
+    from rigd.view import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
 
-    last_hz = min(_LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
+    last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.sweep_samples, record.rate_hz)
     try:
         estimate = _estimate(record, segments, last_hz)
         # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
         coherence = None
-        if estimate is not None and against_welch(record, (_FIRST_HZ, last_hz)) is None:
+        if estimate is not None and against_welch(record, (FIRST_HZ, last_hz)) is None:
             coherence, segments = _coherence(record, estimate, segments, last_hz)
     except SpectralError as error:
-        return _no_response(), _no_coherence(), [str(error)]
+        return None, _no_coherence(), [str(error)]
     if estimate is None:
-        return _no_response(), _no_coherence(), []
+        return None, _no_coherence(), []
     found = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
-    shown = estimate.excited & (found.frequency_hz >= _FIRST_HZ) & np.isfinite(found.response)
+    shown = estimate.excited & (found.frequency_hz >= FIRST_HZ) & np.isfinite(found.response)
     hz, values = found.frequency_hz[shown], found.response[shown]
-    kept = _thinned(hz, np.abs(values))
+    kept = response_thinning(hz).extremes(np.abs(values))
     response = {
         "frequency_hz": _rounded(hz[kept]),
         "magnitude": _rounded(np.abs(values[kept])),
@@ -210,7 +195,7 @@ def _response(record: Record) -> tuple[dict[str, Any], dict[str, Any], list[str]
     if coherence is None or hz.size == 0:
         return response, _no_coherence(), []
     coherent = coherence[shown]
-    low = _bands(hz, coherent < _COHERENT, record.rate_hz / segments.segment_length)
+    low = _bands(hz, coherent < LOW_COHERENCE, record.rate_hz / segments.segment_length)
     bands = [[round(edge, 3) for edge in band] for band in low]
     return response, {"mean": round(float(coherent.mean()), 4), "low_bands": bands}, []
 
@@ -249,26 +234,6 @@ def _coherence(
     return estimate.response.coherence, segments
 
 
-def _thinned(frequency_hz: Real, magnitude: Real) -> NDArray[np.intp]:
-    """Choose the least and the largest magnitude of groups even on a logarithmic axis.
-
-    So resonances and antiresonances keep their heights.
-    """
-    import numpy as np
-
-    if frequency_hz.size <= _POINTS:
-        return np.arange(frequency_hz.size)
-    edges = np.geomspace(frequency_hz[0], frequency_hz[-1], _POINTS // 2 + 1)
-    starts = np.unique(np.searchsorted(frequency_hz, edges[:-1]))
-    ends = [*starts[1:], frequency_hz.size]
-    kept = [
-        first + place
-        for first, end in zip(starts, ends, strict=True)
-        for place in (np.argmin(magnitude[first:end]), np.argmax(magnitude[first:end]))
-    ]
-    return np.unique(kept)
-
-
 def _bands(
     frequency_hz: Real, low: NDArray[np.bool_], resolved_hz: float
 ) -> Iterator[tuple[float, float]]:
@@ -285,10 +250,6 @@ def _bands(
             yield float(hz[first]), float(hz[end - 1])
 
 
-def _no_response() -> dict[str, Any]:
-    return {"frequency_hz": [], "magnitude": [], "phase_rad": [], "coherence": None}
-
-
 def _no_coherence() -> dict[str, Any]:
     return {"mean": None, "low_bands": []}
 
@@ -296,29 +257,8 @@ def _no_coherence() -> dict[str, Any]:
 # Against the last session
 
 
-def _last_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
-    """Find the last session of a specimen before a time, by the looks beside its file."""
-    looks: list[tuple[float, Path]] = []
-    with suppress(OSError):
-        for found in path.parent.glob(f"*{LOOK_SUFFIX}"):
-            with suppress(OSError):
-                looks.append((found.stat().st_mtime, found))
-    # Those made last suffice: reading all of some thousand would take as long as the look.
-    newest = sorted(looks, reverse=True)[:_MOST_LOOKS]
-    read = (_read_look(found) for _, found in newest if found != look_path(path))
-    alike = [
-        each
-        for each in read
-        if each is not None
-        and each["specimen"] == specimen
-        and each["start_utc_ns"] < before_utc_ns
-        and any(mode["shown"] for mode in each["modes"])
-    ]
-    return max(alike, key=lambda each: each["start_utc_ns"], default=None)
-
-
 def _look_of(last: Path) -> dict[str, Any]:
-    look = _read_look(look_path(last))
+    look = read_look(look_path(last))
     if look is None:
         raise LookError(
             f"--last {last}: there is no quick look beside it that can be read; make one with "
@@ -327,40 +267,16 @@ def _look_of(last: Path) -> dict[str, Any]:
     return look
 
 
-def _read_look(path: Path) -> dict[str, Any] | None:
-    """Read a look; None if it is none, or of another version."""
-    try:
-        with path.open("rb") as file:
-            document = json.loads(file.read(_MOST_BYTES))
-        known = {
-            "file": str(document["file"]),
-            "specimen": str(document["specimen"]),
-            "start_utc_ns": int(document["start_utc_ns"]),
-            "made_utc_ns": int(document["made_utc_ns"]),
-            "modes": [
-                {
-                    "mode": int(mode["mode"]),
-                    "shown": mode["shown"] is True,
-                    **{name: _read_quantity(mode[name]) for name in _QUANTITIES},
-                }
-                for mode in document["modes"]
-            ],
-        }
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return known if document.get("version") == VERSION else None
-
-
-_QUANTITIES: Final = ("frequency_hz", "damping_ratio")
-
-
-def _read_quantity(quantity: Mapping[str, Any]) -> dict[str, Any]:
-    std = quantity["std"]
-    return {
-        "value": float(quantity["value"]),
-        "std": None if std is None else float(std),
-        "flag": quantity["flag"],
-    }
+def _last_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
+    """Find the last session of a specimen before a time, by the looks beside its file."""
+    found = last_look(
+        path.parent,
+        specimen,
+        before_utc_ns=before_utc_ns,
+        but=path.stem,
+        usable=lambda look: any(mode["shown"] for mode in look["modes"]),
+    )
+    return None if found is None else found[1]
 
 
 def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str, Any]:
@@ -375,7 +291,9 @@ def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str
         change_hz = hz["value"] - other["frequency_hz"]["value"]
         was = other["damping_ratio"]["value"]
         percent = 100 * (damping["value"] / was - 1) if was else math.nan
-        significant = [_differs(mode[name], other[name]) for name in _QUANTITIES]
+        significant = [
+            change_between(other[name], mode[name]).significant is True for name in _QUANTITIES
+        ]
         compared.append(
             {
                 "mode": mode["mode"],
@@ -401,19 +319,13 @@ def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str
     return {"file": before["file"], "sentence": sentence, "modes": compared}
 
 
-def _differs(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two estimates differ by more than their uncertainties explain."""
-    if one["flag"] or other["flag"] or one["std"] is None or other["std"] is None:
-        return False
-    limit = _SIGNIFICANT_STD * math.hypot(one["std"], other["std"])
-    return bool(abs(one["value"] - other["value"]) > limit > 0)
-
-
 # Text
 
 
 def _text(document: Mapping[str, Any]) -> Iterator[str]:
     """Say it in a few lines for a terminal."""
+    from rigd.view import LOW_COHERENCE
+
     specimen = f" ({document['specimen']})" if document["specimen"] else ""
     # What it leaves out: scale of the torque, length and density of the beam.
     yield f"Quick look at {document['session_id']}{specimen}; ± 95 %, statistical only:"
@@ -421,8 +333,8 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     for mode in shown:
         hz, damping = mode["frequency_hz"], mode["damping_ratio"]
         yield (
-            f"  mode {mode['mode']}: {_with_half_width(hz)} Hz, "
-            f"damping {_with_half_width(damping, 100.0)} %"
+            f"  mode {mode['mode']}: {with_half_width(hz['value'], hz['interval_95'])} Hz, "
+            f"damping {with_half_width(damping['value'], damping['interval_95'], 100.0)} %"
         )
     doubts = dict.fromkeys(
         flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
@@ -434,23 +346,11 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])
-        low = f", below {_COHERENT:g} from {bands} Hz" if bands else ""
+        low = f", below {LOW_COHERENCE:g} from {bands} Hz" if bands else ""
         yield f"  mean coherence {coherence['mean']:.2f}{low}"
     yield from (f"  {flag}" for flag in document["flags"])
     if document["against_last"] is not None:
         yield f"  {document['against_last']['sentence']}"
-
-
-def _with_half_width(quantity: Mapping[str, Any], scale: float = 1.0) -> str:
-    """Write a number with half of its 95 % interval."""
-    if quantity["interval_95"] is None:
-        return f"{scale * quantity['value']:.5g}"
-    low, high = quantity["interval_95"]
-    half = scale * (high - low) / 2
-    if not 0 < half < math.inf:
-        return f"{scale * quantity['value']:.5g}"
-    digits = decimals(half)
-    return f"{scale * quantity['value']:.{digits}f} ± {half:.{digits}f}"
 
 
 def _rounded(values: Real) -> list[float]:
@@ -501,13 +401,13 @@ def write_look(document: Mapping[str, Any], path: Path) -> Path:
         It cannot be written, or something else has its name.
     """
     place = look_path(path)
-    there = _read_look(place)
+    there = read_look(place)
     if there is not None and there["made_utc_ns"] > document["made_utc_ns"]:
         return place
     new = place.with_name(f".{place.name}.{os.getpid()}")
     try:
         if there is None and place.exists() and place.stat().st_size > 0:
-            raise LookError(f"{place} is no quick look of this version; move it away.")
+            raise LookError(f"{place} is not a quick look of this version; move it away.")
         new.write_text(json.dumps(document, allow_nan=False), "utf-8")
         new.replace(place)
     except OSError as error:
@@ -532,12 +432,9 @@ def main() -> None:
     parser.add_argument("--parent", type=int, help="End with the process of this number.")
     asked = parser.parse_args()
     if asked.parent is not None:
-        signal_when_orphaned(signal.SIGKILL)
-        if os.getppid() != asked.parent:  # it was gone before
-            sys.exit(1)
+        end_with(asked.parent)
     killed_first()
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    give_way()
     use_one_thread()
     try:
         document = look_at(asked.file, asked.last)

@@ -363,7 +363,7 @@ def check_fillable(
     channel : str
         What messages call it.
     unknown : ndarray of bool, shape (n,)
-        Samples of the sweep without a value of their own.
+        Samples of the sweep without a new value.
     first_tick : int
         First tick of the sweep.
     rate_hz : float
@@ -388,7 +388,7 @@ def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
     what : str
         The channel, as the message calls it.
     unknown, of : int
-        Samples without a value of their own, and all.
+        Samples without a new value, and all.
     """
     if unknown <= MAX_UNKNOWN_SHARE * of:
         return None

@@ -65,7 +65,7 @@ def main() -> None:
     print(f"  G                                    {value:7.2f} ms   {peer_value / value:5.1f} x")
     print(f"  G + 4 derivatives, differences       {peer:7.2f} ms")
     print(f"  G + 4 derivatives                    {gradient:7.2f} ms   {peer / gradient:5.1f} x")
-    print(f"  G + 4 derivatives, grid made anew    {fresh:7.2f} ms   {peer / fresh:5.1f} x")
+    print(f"  G + 4 derivatives, grid rebuilt       {fresh:7.2f} ms   {peer / fresh:5.1f} x")
 
     exact = grid.evaluate_with_gradient(BEAM, DAMPING)[1]
     differences = textbook_with_differences(s)[1]

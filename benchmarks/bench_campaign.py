@@ -10,7 +10,7 @@ what the work costs. Half of it is the least wall time on two cores that are oth
 
 Peers: the same Welch fits one after the other in this process, and for the minima that they find
 Nelder-Mead from random starts on all points of the same cost (scipy), each fit's CPU time beside
-it. All fits are cold: the global search is made for every session anew.
+it. All fits are cold: the global search is repeated for every session.
 """
 
 import math

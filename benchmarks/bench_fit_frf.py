@@ -1,7 +1,7 @@
 """All fits of one session: times, and minima against other searches on the same cost.
 
 Peers, on every point: fifty random starts of scipy.optimize.least_squares with analytic
-derivatives, and a fine grid round the minimum. A ratio of costs below 1 - 1e-9 in the column
+derivatives, and a fine grid around the minimum. A ratio of costs below 1 - 1e-9 in the column
 "lowest / ours" would be a minimum we missed. With ``--peer TYPE`` (several times, if wanted) only
 scipy.optimize.differential_evolution, on the same cost in the same bounds: processor time of one
 run of it, and the least of five of ours.

@@ -1,7 +1,7 @@
-"""Library of a thousand sessions: time of its index made anew, brought up to date, and warm.
+"""Library of a thousand sessions: time to rebuild its index, to update it, and to list it warm.
 
 Files are as long as the paper's session, twenty of them under fifty names each; every one has a
-quick look. What must hold: `rigd list` below 1 s warm, the index made anew below 60 s.
+quick look. What must hold: `rigd list` below 1 s warm, the index rebuilt below 60 s.
 """
 
 import json
@@ -70,11 +70,11 @@ def main() -> None:
         (folder / INDEX_NAME).unlink()
         same = list_sessions(folder) == grown
     print(f"library of {SESSIONS} sessions, {TICKS} samples each")
-    print(f"  index made anew   {anew_s:7.2f} s (must be below 60)")
+    print(f"  index rebuilt      {anew_s:7.2f} s (must be below 60)")
     print(f"  warm              {warm_s:7.3f} s")
     print(f"  one more session  {one_more_s:7.3f} s")
     print(f"  rigd list, warm   {command_s:7.3f} s (must be below 1)")
-    print(f"  made anew equal to the one brought up to date: {same}")
+    print(f"  rebuilt index equal to the updated one: {same}")
 
 
 if __name__ == "__main__":

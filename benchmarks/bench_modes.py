@@ -1,4 +1,4 @@
-"""Narrow sweeps round the modes against the chirp: deviations for the same time of 136 s.
+"""Narrow sweeps around the modes against the chirp: deviations for the same time of 136 s.
 
 The peer is the paper's chirp (0.025 rad, 0.05-50 Hz in 120 s, 1 s of rest before and 15 s of
 ring-down after). It is fitted first, as an operator would; its modes (those of the first session's

@@ -7,10 +7,10 @@ structure; one of them at a time, or several ``--peer``). ``bench_record_fit.py 
 N sessions of each plant and prints, parameter by parameter, mean errors and the coverage of the
 95 % intervals. With ``--undeclared`` rho/EI is off by 1 % and EI by 2 % in the file, and a delay of
 0.3 ms and a clamp of 1e-5 kg m² are not in it; with ``--ringing`` the beam rings when the record
-begins. The last row is the tool's inertia once more, from a descent in which it may be negative:
+begins. The last row is the tool inertia once more, from a descent in which it may be negative:
 the estimate itself never is, which shifts it by 0.40 standard deviations where the truth is 0.
 
-The sessions are made in the frequency domain on a grid of their own: chirp 0.025 rad, 0.05-50 Hz in
+The sessions are made in the frequency domain on a separate grid: chirp 0.025 rad, 0.05-50 Hz in
 120 s behind a motor loop of 20 Hz, at 1 kHz, 1 s of rest before and 15 s after; encoder steps of
 7e-5 rad, torque noise of 1e-2 N·m and steps of 1.25e-4 N·m.
 """
@@ -97,7 +97,7 @@ def session(plant: Plant, *, ringing: bool = False) -> Session:
 
 
 class Peer:
-    """The same sum of squares, put together anew, for a search that knows nothing of it."""
+    """The same sum of squares, assembled again, for a search that knows nothing of it."""
 
     def __init__(self, measurement: Measurement, name: str, analysis: RecordAnalysis) -> None:
         self.comparison = Comparison.of(measurement, (0.0, 50.0))
@@ -185,7 +185,7 @@ def compare(plant: str, name: str) -> None:
 def tool_inertia_of_either_sign(
     measurement: Measurement, analysis: RecordAnalysis, true: Damping
 ) -> float:
-    """Estimate a tool's inertia that may come out negative, everything else free as well."""
+    """Estimate a tool inertia that may come out negative, everything else free as well."""
     comparison = Comparison.of(measurement, (0.0, 50.0))
     unknowns = Unknowns.of(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
     weight = analysis.noise.weight

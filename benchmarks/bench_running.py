@@ -1,6 +1,6 @@
 """What the running frequency response and spectrogram cost while a sweep of 120 s comes in.
 
-Peers: Welch's estimate of all that has come, computed anew each time; scipy.signal.spectrogram.
+Peers: Welch's estimate of all that has come, recomputed each time; scipy.signal.spectrogram.
 """
 
 import time

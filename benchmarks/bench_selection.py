@@ -112,7 +112,7 @@ def _mode_1(made: Session, cubic: float) -> tuple[NDArray[np.float64], float]:
 
 
 def humming(made: Session) -> Session:
-    """Hum of the mains, just beyond the end of the band."""
+    """Disturbance by the mains, just beyond the end of the band."""
     t = np.arange(made.torque_nm.size) / RATE_HZ
     hum = HUM_NM * np.sin(2 * np.pi * 50.01 * t)
     return replace(made, torque_nm=made.torque_nm + hum)
@@ -216,7 +216,7 @@ CASES: dict[str, Case] = {
         lambda: session(Plant(LINK, HALF_FRACTIONAL)), frozenset({"VI"}), FRACTIONAL, FRACTIONAL
     ),
     **{
-        f"{n}, 50 Hz hum": expected(n, lambda n=n: humming(session(plant_of(n))), "hum")
+        f"{n}, 50 Hz disturbance": expected(n, lambda n=n: humming(session(plant_of(n))), "hum")
         for n in PLANTS
     },
     "III, 1 % cubic stiffness": expected(

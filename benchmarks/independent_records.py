@@ -3,7 +3,7 @@
 Nothing here is taken from `rigd` or `analysis`. Eq. 25 of the paper stands as hyperbolic functions
 spell it, and its poles are where their denominator vanishes; the torque is the angle's Laplace
 transform times that, on a grid four times as fine as the record's, with a decay and a padding of
-its own; the noise has a generator of its own.
+its own; the noise has its own generator.
 
 A record is 136 s at 1 kHz: 1 s of rest, a chirp of 0.025 rad from 0.05 to 50 Hz in 120 s behind a
 motor loop of 20 Hz, 15 s of ring-down. The encoder has steps of 7e-5 rad, the sensor steps of
@@ -29,7 +29,7 @@ LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2 = 0.98, 4.7e-3, 0.090275
 _FINER = 4
 _DECAY = 14.0
 _PADDED = 2.0
-"""What wraps round the padded grid has decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
+"""What wraps around the padded grid has decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
 
 _LOOP_RAD_S = 2 * math.pi * 20.0
 _SHAKEN_S = 8.0

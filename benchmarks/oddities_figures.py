@@ -74,7 +74,7 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
     colours = (style.PURPLE, style.BLUE, style.GREEN, style.ORANGE, style.VERMILION)
     with style.styled():
         figure = style.new_figure(
-            10.0, 4.5, "The window has a peak of its own",
+            10.0, 4.5, "The window has its own peak",
             "left: five beams of different damping; right: the damping ratio that each method "
             "finds for the first mode (one session each, torque noise 10 mN·m)",
         )  # fmt: skip

@@ -201,7 +201,7 @@ Force = Callable[[int, float, float, float, float], float]
 
 @cache
 def _hub() -> tuple[list[float], list[float]]:
-    """Angle and its speed, two values a tick."""
+    """Angle and its speed, two values per tick."""
     motion = _motion()
     angle, speed = (motion.at(motion.spectrum * motion.s**k, 2) for k in (0, 1))
     return angle.tolist(), speed.tolist()
@@ -408,7 +408,7 @@ def scaled(torque: float, rig: Rig, seed: int) -> Record:
 
 
 def hums(frequency_hz: float, size_nm: float, rig: Rig, seed: int) -> Record:
-    """Hum whose frequency wanders by 0.02 Hz."""
+    """Narrow-band disturbance whose frequency wanders by 0.02 Hz."""
     made, rng = record(rig, seed), np.random.default_rng(seed + 2000)
     slow = np.interp(np.arange(TICKS), np.arange(0, TICKS + 4000, 4000), rng.normal(size=35))
     phase = 2 * np.pi * np.cumsum(frequency_hz + 0.02 * slow) / RATE_HZ
@@ -505,13 +505,13 @@ DEFECTS: dict[str, tuple[tuple[str, ...], Make]] = {
         _III,
         partial(stiffens, {1: 0.01, 2: 0.01, 3: 0.01}, 1),
     ),
-    **{f"play {w:g} mrad": (ALL, partial(play, 1e-3 * w)) for w in (0.1, 0.5, 2.0)},
+    **{f"backlash {w:g} mrad": (ALL, partial(play, 1e-3 * w)) for w in (0.1, 0.5, 2.0)},
     "drift 50 mN·m, parabola": (_TWO, partial(drifts, "parabola")),
     "drift 50 mN·m, random walk": (_TWO, partial(drifts, "walk")),
     "gain +2 %": (_TWO, partial(scaled, 1.02)),
-    "hum 50 Hz, 2 mN·m": (_TWO, partial(hums, 50.0, 2e-3)),
-    "hum 50 Hz, 10 mN·m": (_TWO, partial(hums, 50.0, 1e-2)),
-    "hum on mode 3, 5 mN·m": (_TWO, partial(hums, _MODE_3_HZ, 5e-3)),
+    "disturbance 50 Hz, 2 mN·m": (_TWO, partial(hums, 50.0, 2e-3)),
+    "disturbance 50 Hz, 10 mN·m": (_TWO, partial(hums, 50.0, 1e-2)),
+    "disturbance on mode 3, 5 mN·m": (_TWO, partial(hums, _MODE_3_HZ, 5e-3)),
     "clipped at 80 %": (_TWO, partial(clipped, 0.8)),
     "clipped at 50 %": (_TWO, partial(clipped, 0.5)),
     "missing ticks 1 %": (_TWO, partial(missing, 0.01)),

@@ -24,5 +24,5 @@ def main(paths: list[str]) -> None:
         print(*together.verdict.sentences, sep="\n")
 
 
-if __name__ == "__main__":  # worker processes import this file anew
+if __name__ == "__main__":  # worker processes import this file again
     main(sys.argv[1:])

@@ -1,4 +1,4 @@
-"""A drive and a sensor of one's own, behind the devices' contract: a rigid hub with friction.
+"""A custom drive and sensor, behind the devices' contract: a rigid hub with friction.
 
 Usage: python own_device.py
 

@@ -16,7 +16,7 @@ def main(path: str) -> None:
     rate_hz = session.number("rate_hz")
     print(f"{session.metadata['specimen']}: {session.metadata['excitation']} at {rate_hz:g} Hz")
 
-    samples = session.samples  # one row a tick, fields with their units in the names
+    samples = session.samples  # one row per tick, fields with their units in the names
     print(f"{len(samples)} samples of {', '.join(samples.dtype.names or ())}")
     for name, (first, end) in session.segments.items():
         part = samples[(samples["tick"] >= first) & (samples["tick"] < end)]

@@ -24,7 +24,6 @@
      |    +-- RigBusyError          another program runs the rig
      |    +-- AddressError          no daemon is running, or its socket cannot be made
      |    +-- DaemonGoneError       the daemon was killed while it was asked
-     |    +-- BackgroundError       the process that predicts a session for the daemon was killed
      |    +-- SessionError          a session file is damaged, or the disk is full
      |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run

@@ -1,8 +1,10 @@
-"""Printable text: what comes from outside, and counts, made fit for a terminal."""
+"""What terminals show: text from outside made harmless, counts, progress with the time left."""
 
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 UNPRINTABLE: Final = "?"
 """Replacement of a character that cannot be printed."""
@@ -10,9 +12,7 @@ UNPRINTABLE: Final = "?"
 _FROM: Final = 10_000
 """Numbers of four digits are read without help."""
 
-BAR_STYLES: Final = MappingProxyType(
-    {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
-)
+_BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
 """Theme of rich for a progress bar: its own is red, which on a rig is for alarms."""
 
 
@@ -78,3 +78,32 @@ def counts_text(counts: Mapping[str, Any]) -> str:
 
 def _count_text(count: int | str | None) -> str:
     return "unknown" if count is None else grouped(int(count))
+
+
+def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
+    """Return a line of progress on standard error, which goes away when the work is done.
+
+    It is shown on a terminal only. Its `console` writes messages above it.
+
+    Parameters
+    ----------
+    *texts
+        What stands between the bar and the time left, as rich formats the columns of a task.
+    auto_refresh
+        Let a thread of rich draw it, or draw it by its `refresh` only.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.theme import Theme
+
+    console = Console(stderr=True, highlight=False, theme=Theme(_BAR_STYLES))
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        *map(TextColumn, texts),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        auto_refresh=auto_refresh,
+        disable=not console.is_terminal,
+    )

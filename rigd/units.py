@@ -1,6 +1,7 @@
 """Units: which one a key's ending names, and how many digits an uncertain number is shown with."""
 
-from math import floor, log10
+from collections.abc import Sequence
+from math import floor, inf, log10
 from types import MappingProxyType
 from typing import Final
 
@@ -36,6 +37,9 @@ UNITS: Final = MappingProxyType(
 """Ending of a key → its unit, the longer endings first: the first that fits is the key's."""
 
 
+_MOST_DECIMALS: Final = 9
+
+
 def suffix_of(key: str) -> str:
     """Return the ending of a key that names its unit; empty if there is none.
 
@@ -56,6 +60,30 @@ def unit_of(key: str) -> str:
     'N·m'
     """
     return UNITS.get(suffix_of(key), "")
+
+
+def with_half_width(value: float, interval: Sequence[float] | None, scale: float = 1.0) -> str:
+    """Write a number with half the width of its interval, to the second digit of that.
+
+    Parameters
+    ----------
+    value
+        The number.
+    interval
+        Its low and its high end; None if they are not known.
+    scale
+        Factor of the unit in which it is written.
+
+    Examples
+    --------
+    >>> print(with_half_width(2.56987, (2.56980, 2.56994)), with_half_width(0.0091, None, 100.0))
+    2.569870 ± 0.000070 0.91
+    """
+    half = 0.0 if interval is None else scale * (interval[1] - interval[0]) / 2
+    if not 0 < half < inf:
+        return f"{scale * value:.5g}"
+    digits = min(decimals(half), _MOST_DECIMALS)
+    return f"{scale * value:.{digits}f} ± {half:.{digits}f}"
 
 
 def decimals(uncertainty: float) -> int:

@@ -24,8 +24,8 @@ from rigd import testing
 from rigd.runtime import use_one_thread
 
 pytest_plugins = [
-    "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "shipped_profile",
-    "standstill", "synthetic_sessions", "web_daemon",
+    "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "rewritten_once",
+    "shipped_profile", "standstill", "synthetic_sessions", "web_daemon",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
@@ -133,7 +133,8 @@ BRIEF_LOOK = """
 import json, pathlib, sys
 
 session = pathlib.Path(sys.argv[1])
-look = {"file": session.name, "text": [f"Quick look at {session.stem}", "  mode 1"]}
+text = [f"Quick look at {session.stem}", "  mode 1"]
+look = {"version": 1, "file": session.name, "text": text}
 session.with_suffix(".look.json").write_text(json.dumps(look))
 """
 

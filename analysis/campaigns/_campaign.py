@@ -140,7 +140,7 @@ def campaign(
 
     Notes
     -----
-    Worker processes import the calling script anew, so a script has to call this under
+    Worker processes import the calling script again, so a script has to call this under
     ``if __name__ == "__main__":``.
     """
     if not paths:

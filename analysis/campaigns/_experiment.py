@@ -145,7 +145,7 @@ class Experiment:
         return None
 
     def same_specimen(self, other: Experiment) -> bool:
-        """Whether another one states the same beam and the same inertia of the tool."""
+        """Whether another one states the same beam and the same tool inertia."""
         return not any(
             key in self.facts and not _same(other.facts.get(key, self.facts[key]), self.facts[key])
             for key in _OF_SPECIMEN
@@ -159,7 +159,7 @@ class StatedSpecimen:
     Attributes
     ----------
     facts : mapping of str to (str or float)
-        Beam and inertia of the tool by the keys of the session files.
+        Beam and tool inertia by the keys of the session files.
     paths : tuple of Path
         Files that state it, whether they can be used or not.
     """

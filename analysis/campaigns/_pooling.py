@@ -53,7 +53,7 @@ class RandomEffects:
         Squares of the deviations from the weighted mean over the sessions' variances, summed:
         about K − 1 without scatter between sessions.
     deviance : float
-        ``-2 ln`` likelihood of the mean and tau, above that of a value of its own for each
+        ``-2 ln`` likelihood of the mean and tau, above that with a separate value for each
         session: ``sum_k ln|I + S_k⁻¹ diag(tau²)| + r_kᵀ (S_k + diag(tau²))⁻¹ r_k``. Of the tau by
         moments and of none, the one that is likelier: parameters that each session correlates
         closely do not scatter one by one, and a tau of a third of their standard deviations then
@@ -240,7 +240,7 @@ class PooledEstimate:
     structure : str
         Name.
     uniform : bool
-        Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+        Whether the beam was taken to be uniform; else each mode has its own stiffness.
     beam : str
         As of `RecordEstimate`.
     plant : Plant
@@ -323,7 +323,7 @@ def determines_damping(estimate: RecordEstimate) -> bool:
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     """Pool one structure; None if fewer than two sessions determine its damping.
 
-    A setting of rig or specimen (the tool's inertia, mostly) that rests on its bound in some
+    A setting of rig or specimen (the tool inertia, mostly) that rests on its bound in some
     session has no place in the common covariance; the plant gets its plain mean.
     """
     used = list(filter(determines_damping, estimates))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Names and numbers
 
-_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool's inertia"}
+_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
 """Names of what a letter alone would not call to mind."""
 _FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
 """Units smaller than a single record's: of the scatter between sessions more digits are told."""

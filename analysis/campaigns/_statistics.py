@@ -124,7 +124,7 @@ class NominalModel:
     parameters : dict
         zeta, alpha, gamma and lambda, the fixed ones included.
     response : ndarray of complex, shape (n,)
-        With the tool's inertia, in N·m/rad.
+        With the tool inertia, in N·m/rad.
     peaks : tuple of Peak or None
         Peaks of that response, mode by mode.
     indices : tuple of Indices

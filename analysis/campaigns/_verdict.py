@@ -128,7 +128,7 @@ class CampaignVerdict:
     rivals : tuple of str
         Structures, as tables call them, that all data together cannot tell from it.
     sessions : int
-        Those with a verdict of their own, on which this one rests.
+        Those with their own verdict, on which this one rests.
     alone : mapping of str to int
         How many sessions select which structure by themselves.
     adequate : int

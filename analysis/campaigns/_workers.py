@@ -242,7 +242,7 @@ def _begin() -> None:
 _CONNECT_S: Final = 5.0
 _WORKERS_S: Final = 10.0
 _GONE_S: Final = 30.0
-"""How long a cluster may be without any worker: its nannies start them anew in seconds."""
+"""How long a cluster may be without any worker: its nannies restart them in seconds."""
 
 
 @contextmanager
@@ -347,7 +347,7 @@ class _DaskWorkers(Workers):
 
     def _gone(self, what: str) -> str:
         return (
-            f"The Dask scheduler at {self._address} {what}; look at its log and the workers', and "
+            f"The Dask scheduler at {self._address} {what}; check its log and the workers', and "
             "start the campaign again, or leave --dask out."
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -90,6 +91,8 @@ Version = Annotated[
 
 
 _EXIT_INTERRUPTED: Final = 130
+_GARBAGE: Final = 20_000
+"""Objects more than before from which garbage is looked for."""
 
 _COMMANDS: Final = {
     "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
@@ -104,9 +107,9 @@ Example: analyze session.mcap --types III,VI --json fits.json
 Figures, tables and JSON go to session.report/ beside the file (session.report-2/ if that exists).
 Several files are a campaign: statistics, nominal models, pooled estimate and validation go to
 campaign.report/ beside the first. Sessions that do not suit Welch's method (steps, multisines,
-narrow sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
+narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
-Exit code: 0 done; 1 a file could not be analysed; 2 wrong use; 130 stopped by Ctrl-C."""
+Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""
 
 
 _METHODS: Final = ("welch", "record", "all")
@@ -116,7 +119,7 @@ _OF_WELCH: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
 """Options of the Welch fits alone."""
 
 _TYPED: Final = "COMMANDLINE"
-"""What click calls the source of an option's value that is no default."""
+"""What click calls the source of an option's value that is not a default."""
 
 # Plain messages of one or two sentences, not boxes: they end up in logs.
 app = typer.Typer(
@@ -133,6 +136,9 @@ def main() -> None:
     """Entry point of the command."""
     raise_on(signal.SIGINT)
     use_one_thread()
+    # Figures are made of many objects that live until they are drawn: to look among them for
+    # garbage every 700 takes a twentieth of all time.
+    gc.set_threshold(_GARBAGE)
     _quieten_libraries()
     with standard_streams():
         try:
@@ -224,7 +230,7 @@ def analyze(
         ),
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print all tables, not the main results alone.")
+        bool, typer.Option("--verbose", help="Print all tables, not only the main results.")
     ] = False,
     each: Annotated[
         bool,

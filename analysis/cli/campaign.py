@@ -115,22 +115,11 @@ def _analysed(
     formats: Sequence[FigureFormat],
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     from analysis.campaigns import LoneSessionError
     from analysis.report import new_folder, write_campaign
+    from rigd.printable import progress_bar
 
-    terminal = Console(stderr=True, highlight=False)
-    with Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeRemainingColumn(),
-        console=terminal,
-        transient=True,
-        disable=not terminal.is_terminal,
-    ) as progress:
+    with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
         bar = progress.add_task("starting", total=2 * files + _FIGURES)
 
         def on_progress(done: int, total: int, name: str) -> None:
@@ -144,11 +133,9 @@ def _analysed(
                 found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
+    tell = partial(progress.console.print, markup=False, soft_wrap=True)
     for failure in found.failures:
-        terminal.print(f"Error: {failure.message}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"Error: {failure.message}")
     for lost in found.lost_trials:
-        terminal.print(
-            f"Error: {lost.path} is not predicted from the others: {lost.reason}",
-            markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
+        tell(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
     return found

@@ -34,9 +34,9 @@ IMPORT_EPILOG = """\
 Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "Rig/Tz:mN.m"
 --rate-hz 1000 --profile rig.toml --rest 0,1 --sweep 1,121
 
-Exit code: 0 done, 1 the file cannot be imported, 2 wrong use, 130 stopped by Ctrl-C."""
+Exit code: 0 done, 1 the file cannot be imported, 2 usage error, 130 stopped by Ctrl-C."""
 
-_EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 wrong use, 130 stopped by Ctrl-C."
+_EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."
 
 _Session = Annotated[
     Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")
@@ -71,9 +71,7 @@ def import_command(
     torque: Annotated[str, _channel("Coupling torque; N.m, mN.m, N.mm, …")],
     profile: Annotated[
         Path,
-        typer.Option(
-            metavar="FILE", readable=False, help="TOML with [beam] and the clamp's inertia."
-        ),
+        typer.Option(metavar="FILE", readable=False, help="TOML with [beam] and the tool inertia."),
     ],
     time: Annotated[str | None, _channel("Time of the samples; s, ms, us, ns.")] = None,
     rate_hz: Annotated[
@@ -280,6 +278,4 @@ def _interval(option: str, text: str) -> tuple[float, float]:
 
 def _check_delay(option: str, delay_s: float) -> None:
     if not abs(delay_s) <= 1.0:
-        raise typer.BadParameter(
-            f"{delay_s} s is no delay between a quantity and its sample.", param_hint=option
-        )
+        raise typer.BadParameter(f"{delay_s} s cannot be the delay of a sample.", param_hint=option)

@@ -53,7 +53,7 @@ class Outputs:
         return self.json is not None and str(self.json) == "-"
 
     def console(self) -> Console:
-        """Return where people's text goes, in the report's width where that is no terminal."""
+        """Return where people's text goes, in the report's width where that is not a terminal."""
         from rich.console import Console
 
         console = Console(stderr=self.json_to_stdout, highlight=False)
@@ -63,7 +63,7 @@ class Outputs:
 
 
 def session_files(paths: Sequence[Path]) -> list[Path]:
-    """Put in the place of each folder the sessions in it, by name; torn ones are left out.
+    """Put in the place of each folder the sessions in it, by name; incomplete ones are left out.
 
     Parameters
     ----------
@@ -171,27 +171,19 @@ def _analyse_all(
 ) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report every file; return results, message by failed file, and exit code."""
     from numpy.linalg import LinAlgError
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from analysis.identify import MeasurementError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report import OutputError
+    from rigd.printable import progress_bar
     from rigd.session import SessionError
 
     found: list[RecordResult] = []
     errors: dict[str, str] = {}
     code = 0
-    terminal = _standard_error()
-    tell = partial(terminal.print, markup=False, highlight=False, soft_wrap=True)
-    with Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeRemainingColumn(),
-        console=terminal,
-        transient=True,
-        disable=not terminal.is_terminal,
-    ) as progress:
+    with progress_bar() as progress:
+        tell = partial(progress.console.print, markup=False, soft_wrap=True)
         steps = _steps(routes, rerun)
         task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
@@ -262,12 +254,6 @@ def _analyse_file(
         write_rerun_file(result, rerun)
         on_step("figure for Rerun")
     return result
-
-
-def _standard_error() -> Console:
-    from rich.console import Console
-
-    return Console(stderr=True, highlight=False)
 
 
 def _say(console: Console, text: str) -> None:

@@ -46,7 +46,7 @@ def standard_streams() -> Iterator[None]:
         if not isinstance(stream, io.TextIOWrapper):  # closed, or a test's
             continue
         stream.reconfigure(errors="replace")
-        # A terminal has its reader for as long as it is one, and is no mere file on Windows.
+        # A terminal has its reader for as long as it is one, and is not just a file on Windows.
         if not stream.isatty():
             setattr(sys, name, _like(stream))
     try:

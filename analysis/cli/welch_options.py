@@ -48,9 +48,7 @@ Overlap = Annotated[
 ]
 Nfft = Annotated[
     int | None,
-    typer.Option(
-        metavar="SAMPLES", min=2, max=_MAX_NFFT, help="Length of the transform.  [default: 160 s]"
-    ),
+    typer.Option(metavar="SAMPLES", min=2, max=_MAX_NFFT, help="FFT length.  [default: 160 s]"),
 ]
 
 

@@ -89,7 +89,7 @@ def factor(quantity: str, unit: str) -> float:
     Raises
     ------
     ExchangeError
-        If it is no unit of that quantity, or the number is not finite or 0.
+        If it is not a unit of that quantity, or the number is not finite or 0.
     """
     size, name = _scaled(unit)
     known = canonical_unit(name)

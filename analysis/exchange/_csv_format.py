@@ -148,8 +148,8 @@ def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
     while line := stream.readline(_MAX_LINE + 1):
         if len(line) > _MAX_LINE:
             raise ExchangeError(
-                f"{path}: has a line of more than {_MAX_LINE} characters, so it is no table of a "
-                "few channels with a line for each sample; export the session's channels alone."
+                f"{path}: has a line of more than {_MAX_LINE} characters; a table has one line per "
+                "sample and few channels. Export the session's channels alone."
             )
         yield line
 
@@ -178,7 +178,7 @@ def _odd_cell(
     separator: str,
     number: _Reader,
 ) -> float:
-    """Return NaN for an empty cell, and say what is wrong with any other that is no number."""
+    """Return NaN for an empty cell, and say what is wrong with any other that is not a number."""
     place = f"sample {before + 1} of the column '{name}'"
     if column >= len(row):
         raise ExchangeError(

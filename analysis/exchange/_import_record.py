@@ -138,7 +138,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     Raises
     ------
     ExchangeError
-        If the file cannot be read, is no record, or contradicts the plan.
+        If the file cannot be read, is not a record, or contradicts the plan.
     rigd.session.SessionError
         If the session exists or cannot be written.
     """
@@ -423,7 +423,7 @@ def timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]
     Raises
     ------
     ExchangeError
-        If the times are no time base, or the file has another rate than was stated.
+        If the times are not a time base, or the file has another rate than was stated.
     """
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor

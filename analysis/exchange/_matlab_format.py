@@ -97,7 +97,7 @@ def _vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[Any]:
         found = getattr(value, "dtype", None)
         if found is None or found.names is None or value.size != 1:
             raise ExchangeError(
-                f"{path}: '{name}' asks for the field '{field}' of what is no single struct."
+                f"{path}: '{name}' asks for a field '{field}', but its parent is not one struct."
             )
         if field not in found.names:
             raise no_such_channel(path, name, (f"{variable}.{each}" for each in found.names))
@@ -112,7 +112,7 @@ def _column(path: Path, name: str, value: Any, column: int | None) -> NDArray[An
         listed = ", ".join(f"{name}.{each}" for each in names[:12])
         raise ExchangeError(f"{path}: '{name}' is a struct; choose one of its fields: {listed}.")
     if shape is None or getattr(value, "dtype", None) is None or hasattr(value, "tocoo"):
-        raise ExchangeError(f"{path}: '{name}' is no full array of numbers; save it as one.")
+        raise ExchangeError(f"{path}: '{name}' is not a full array of numbers; save it as one.")
     check_samples(path, f"'{name}'", max(shape, default=0))
     if column is None:
         if value.size != max(shape, default=0):
@@ -124,7 +124,7 @@ def _column(path: Path, name: str, value: Any, column: int | None) -> NDArray[An
         return as_column(path, name, value.reshape(-1))
     if value.ndim != 2 or column >= value.shape[1]:
         size = "×".join(map(str, shape))
-        raise ExchangeError(f"{path}: '{name}' is no column of it, its size is {size}.")
+        raise ExchangeError(f"{path}: '{name}' is not a column of it, its size is {size}.")
     return as_column(path, name, value[:, column])
 
 

@@ -114,7 +114,7 @@ def frf_table(
 ) -> Table:
     """Estimate the response from angle to coupling torque, as the analysis does that fits it.
 
-    The channels' delays are taken out of it; the tool's inertia is not. Without a band it is what
+    The channels' delays are taken out of it; the tool inertia is not. Without a band it is what
     the record's rate holds of that of the settings.
 
     Raises

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 _MOST_ENTRIES: Final = 5_000_000
-"""Most channels, counted anew in each segment: npTDMS takes that many steps before it reads."""
+"""Most channels, counted again in each segment: npTDMS takes that many steps before it reads."""
 
 _LEAD_IN: Final = 28
 _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6

@@ -42,7 +42,7 @@ _FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
 their frequencies say nothing of the orders, only their damping does."""
 
 _DISMISSED: Final = 10.0
-"""Difference of BIC by which these must be better for the noise to be taken anew."""
+"""Difference of BIC by which these must be better for the noise to be estimated again."""
 
 _SHOWS: Final = 4.0
 """Deviance that a damping must save to stay in the freest structure: one that saves less moves no
@@ -58,7 +58,7 @@ _CROSS_CHECKS: Final = 3
 _NEARLY: Final = 1e-3
 
 _DOUBTFUL: Final = 0.01
-"""Probability of a residual's shape by chance, below which all modes are searched for anew."""
+"""Probability of a residual's shape by chance, below which all modes are searched again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ class CandidateSet:
 
     @property
     def bic(self) -> float:
-        """The lowest, comparable between fields whose noise has been estimated anew."""
+        """The lowest, comparable between fields whose noise has been estimated again."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(
@@ -260,7 +260,7 @@ class CandidateSet:
         )
 
     def _without_leakage(self) -> CandidateSet:
-        """Leave out what hum beyond the band spoils."""
+        """Leave out the bins that a disturbance beyond the band leaks into."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 
@@ -321,10 +321,10 @@ class CandidateSet:
         least = candidate.fit.cost * (1 - MISSED)
         if outlook.promised_cost > least:
             return candidate
-        first = self.descent(unknowns, outlook.x, FEW)
+        first = outlook.further(FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
             return candidate
-        found = self.descent(unknowns, first.x, MANY)
+        found = first.further(MANY)
         return candidate if found.cost > least else found.candidate()
 
     def with_orders_free(self) -> CandidateSet:

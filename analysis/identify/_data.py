@@ -52,7 +52,7 @@ class Measurement:
     name : str
         What messages call it: the file's path.
     angle_rad, torque_nm : ndarray, shape (n,)
-        Motor angle and coupling torque, one value a tick.
+        Motor angle and coupling torque, one value per tick.
     rate_hz : float
         Ticks per second.
     beam : Beam

@@ -269,7 +269,7 @@ _MAINS_WANDER: Final = 0.005
 
 _SLOW_HZ: Final = 0.5
 _FEWEST_PERIODS: Final = 5.0
-"""In the record: what is slower is no hum but a sensor that drifts."""
+"""In the record: what is slower is not a hum but a sensor that drifts."""
 
 _SAME_TURN: Final = 0.5
 """Phase over the whole record, in turns, within which a line's frequency is a harmonic's."""
@@ -444,5 +444,5 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
                 ),
                 value=harmonic.deviate,
                 unit="standard deviations",
-                remedy="Repeat the sweep at half the amplitude; look for play in the clamp.",
+                remedy="Repeat the sweep at half the amplitude; check the clamp for backlash.",
             )

@@ -50,7 +50,7 @@ _PROMISE: Final = 6.0
 
 _ROUNDS: Final = 15
 _FEW: Final = 12
-"""Evaluations of a descent before the drag is computed anew."""
+"""Evaluations of a descent before the drag is recomputed."""
 
 _MANY: Final = 40
 _HOPELESS: Final = 50.0
@@ -58,11 +58,11 @@ _HOPELESS: Final = 50.0
 
 _SETTLED: Final = 2.0
 _ROUGHLY: Final = 500.0
-"""Squares that another step may save where the drag need not be computed anew: the step is taken
+"""Squares that another step may save where the drag need not be recomputed: the step is taken
 all the same, by all that is fitted at this drag (`_all`).
 
 The two numbers of a law and external damping can make up for each other along a flat valley. There
-the drag computed anew promised a step of half a standard deviation, always the same way, for ten
+the recomputed drag promised a step of half a standard deviation, always the same way, for ten
 rounds and more: it led away from the truth, and each round cost a second.
 """
 
@@ -110,7 +110,7 @@ class DragEstimate:
 
 
 def with_air_drag(field: CandidateSet) -> CandidateSet:
-    """Fit all candidates anew with the air's drag, if that explains the record better.
+    """Refit all candidates with the air's drag, if that explains the record better.
 
     To first order a column of known shape tells what drag could save beside each of a few
     structures. Only if one of them could then be the best of all is anything fitted.
@@ -317,7 +317,7 @@ def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
         unknowns = other.unknowns(before.structure, before.uniform)
         refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
         if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
-            refit = other.descent(unknowns, refit.x, _MANY)
+            refit = refit.further(_MANY)
         candidates.append(refit.candidate())
     found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))

@@ -493,7 +493,7 @@ _OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DragExpansion:
-    """Changes of the torque by drag round one beam and drag, as spectra in the band.
+    """Changes of the torque by drag around one beam and drag, as spectra in the band.
 
     Attributes
     ----------
@@ -551,7 +551,7 @@ class DragExpansion:
                 apart = pole.at_rad_s - own[pole.mode]
                 curved, steeper = self._remainder(pole.mode, own[pole.mode], pole.at_rad_s)
                 by_pole = self.by_pole[pole.mode]
-                # Slopes at the pole itself, the values of the remainder as a row of their own.
+                # Slopes at the pole itself, the values of the remainder in a separate row.
                 rows += [*by_pole, *steeper, curved]
                 moved += [apart.real, apart.imag, 0.0, 0.0, -1.0]
                 turn = [pole.derivative.real, pole.derivative.imag]

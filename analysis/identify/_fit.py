@@ -40,7 +40,7 @@ _BEFORE_LINES: Final = 1e-4
 """The same while noise and lines are still to be found: a standard deviation."""
 
 _REPEATS: Final = 3
-"""Each leaves a fifth of what hum had made of the beam."""
+"""Each leaves a fifth of the bias that a narrow-band disturbance caused."""
 
 
 def fit_record(
@@ -123,7 +123,7 @@ def fit_record(
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:
-    """Compute anew what follows no reference: it was, with a beam that the hum had spoilt."""
+    """Recompute the part that follows no reference: the first was biased by a disturbance."""
     hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
     for _ in range(_REPEATS):
         comparison = whole.following_reference(clean.plant).without_hum(hum)

@@ -357,7 +357,7 @@ def structures(
     """Say which structures a record excludes, and which would do.
 
     A special case of the freest structure on the same beam is excluded by the likelihood ratio;
-    whatever is no special case of it, where its likelihood is as much lower, and its BIC is higher
+    any other structure where its likelihood is lower by as much and its BIC is higher
     than the lowest by 10. One that explains the record with more than it takes is not excluded.
     What fixes an order at 1 that the record excludes is excluded with it.
 

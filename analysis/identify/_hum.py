@@ -1,9 +1,9 @@
-"""Hum beside a mode: a sinusoid that lasts while the beam does not answer at its frequency.
+"""Narrow-band disturbance (hum) near a mode: a sinusoid that lasts while the beam does not respond.
 
-At a sharp resonance a fit takes a hum for the beam's doing, and what a wrong model leaves looks
-like a hum. Time tells them apart: a beam answers while the sweep passes, and rings down; a hum
+At a sharp resonance a fit attributes a hum to the beam, and the residual of a wrong model looks
+like a hum. Time separates them: a beam responds while the sweep passes, and rings down; a hum
 lasts. So the residual's spectrum is taken over the times at which the model predicts next to
-nothing there, and what stands out has to be the same in all of them.
+nothing there, and what stands out must be the same in all of them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _RESONANCE_BINS: Final = 20
 """The same for the sharpest of them, in bins."""
 
 _BESIDE: Final = 3.0
-"""How far hum is looked for, in these reaches: farther off its skirts do no harm to the mode."""
+"""Range of the search for hum, in these units: farther off its skirts do not affect the mode."""
 
 _BLOCK_S: Final = 4.0
 _WRONG: Final = 0.3
@@ -62,7 +62,7 @@ _STEPS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Hum:
-    """A sinusoid in the torque.
+    """A narrow-band disturbance: a sinusoid in the torque.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ def hum_beside_modes(
     noise: Noise,
     decaying_nm: NDArray[np.float64],
 ) -> tuple[Hum, ...]:
-    """Look for hum beside each mode, that which was taken out already included.
+    """Search for hum near each mode, including what has been taken out already.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def hum_beside_modes(
     Returns
     -------
     tuple of Hum
-        At most one a mode.
+        At most one per mode.
     """
     predicted, _ = comparison.prediction.torque(plant)
     measured = comparison.torque_nm[comparison.kept] + comparison.hum_nm

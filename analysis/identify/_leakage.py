@@ -1,4 +1,4 @@
-"""Leakage of a hum next to the band: the mains lie at the very end of a band to 50 Hz.
+"""Leakage of a narrow-band disturbance (hum) next to the band: the mains are at 50 Hz, its end.
 
 Within the band the estimator finds lines itself (`RecordAnalysis.lines`).
 """

@@ -1,4 +1,4 @@
-"""Noise spectrum of the torque, from the residual of a fit: a smooth spectrum, and lines (hum).
+"""Noise spectrum of the torque, from the residual of a fit: smooth, and narrow-band lines.
 
 The spectrum is smoothed by medians over blocks of bins, which what a wrong model leaves at a mode,
 or a hum at one frequency, does not raise; a line is a group of bins far above it that lasts all
@@ -72,7 +72,7 @@ def noise_of(
     share: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
 ) -> Noise:
-    """Tell noise and hum from what a residual holds.
+    """Separate noise and hum in a residual.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def smooth_power(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
 
     The power of noise in one bin is exponentially distributed, so its mean is the median over
     ln 2; the median of a block of bins does not see what a wrong model leaves at a mode or a hum
-    at one frequency, which are no noise. Between the blocks' middles the logarithm is interpolated.
+    at one frequency, which are not noise. The logarithm is interpolated between block centres.
     Blocks are narrower at low frequency, where drift makes the spectrum steep.
 
     Parameters

@@ -198,7 +198,7 @@ class NonlinearForce:
 def nonlinear_forces(
     field: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add forces one by one while each saves far more than chance would; fit all anew with them.
+    """Add forces one by one while each saves far more than chance would; refit all with them.
 
     A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
     order. Where the best candidate has these, the search also starts from those without. But even

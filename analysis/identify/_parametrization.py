@@ -12,7 +12,7 @@ directly; orders then change alone:
 * the stiffness that counts with its damping, ``EI |1 + z exp(j alpha pi/2)|``, and likewise
   density over stiffness, ``rho/EI |1 - g exp(j lambda pi/2)| / |1 + z exp(j alpha pi/2)|``, both
   as logarithms relative to the nominal beam's;
-* the delay in ms, the tool's inertia relative to the nominal beam's, and the relative offsets of
+* the delay in ms, the tool inertia relative to the nominal beam's, and the relative offsets of
   the modes' stiffness;
 * of the `EXTRAS` those that a candidate carries: the root's compliance relative to the nominal
   beam's L/EI, the tip's mass relative to its mass, time constants in ms, the clocks' difference in

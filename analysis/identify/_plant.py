@@ -57,7 +57,7 @@ class Plant:
     stiffness_offsets : tuple of float
         By how much the stiffness of modes 2, 3, … differs from the uniform beam's, relatively.
     root_compliance_rad_per_nm : float
-        By how much the clamp turns for a torque on the beam's root. The tool's inertia is on the
+        By how much the clamp turns for a torque on the beam's root. The tool inertia is on the
         motor's side of it: what is bolted to the sensor is stiff, what yields is the grip on the
         beam.
     tip_mass_kg : float

@@ -1,4 +1,4 @@
-"""Profile likelihood of the damping's orders: everything else is fitted anew at each value.
+"""Profile likelihood of the damping's orders: everything else is refitted at each value.
 
 The 95 % interval is all that the chi-square limit of one degree of freedom admits. A walk goes from
 the minimum both ways until the record excludes what lies beyond, and looks on a coarse grid for
@@ -35,7 +35,7 @@ WIDEST_SHARE: Final = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Deviance of an order's values, everything else fitted anew at each.
+    """Deviance of an order's values, everything else refitted at each.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ def profiled(field: CandidateSet, *, walk: bool = True) -> tuple[CandidateSet, P
     Returns
     -------
     field : CandidateSet
-        With the candidates ranked anew.
+        With the candidates ranked again.
     alpha, lambda_ : Profile
     """
     for round_ in range(1, _ROUNDS + 1):
@@ -312,7 +312,7 @@ class Walk:
         places = gaps(list(self.costs), ORDER_RANGE, _GRID)
         if not (wide or open_below or open_above) or not places:
             return
-        # Loss at a mode and order are unknowns of their own: the loss stays as the order changes.
+        # Loss at a mode and order are separate unknowns: the loss stays as the order changes.
         looks = {}
         for value in places:
             start = self._first.x.copy()

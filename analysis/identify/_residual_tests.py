@@ -49,7 +49,7 @@ _LOUD: Final = 1.4
 
 _COHERENT_BINS: Final = 9
 _DRIVEN: Final = 0.1
-"""Power of the angle relative to what is usual round it, from which a bin counts as driven."""
+"""Power of the angle relative to what is usual around it, from which a bin counts as driven."""
 
 _LOUDEST: Final = 4.0
 """Where the whitened residual is limited: chance exceeds it once in 3000 bins."""
@@ -196,7 +196,7 @@ def input_relation(
     neighbours = min(_NEIGHBOURS, power.size)
     around = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
     driven = angle / np.sqrt(np.maximum(around, np.finfo(float).tiny))
-    # A hum is no linear dynamics, however loud.
+    # A hum is not linear dynamics, however large.
     limited = residual / np.maximum(np.abs(residual) / _LOUDEST, 1.0)
     cross = limited * driven.conj()
     blocks = residual.size // _COHERENT_BINS
@@ -275,7 +275,7 @@ def harmonics(
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> tuple[Harmonic, ...]:
-    """Look along the sweep; empty if the angle is no sweep.
+    """Look along the sweep; empty if the angle is not a sweep.
 
     Parameters
     ----------

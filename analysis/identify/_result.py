@@ -97,13 +97,13 @@ class RecordFit:
         and tool_inertia_kg_m2, the fixed ones included; stiffness_offset_2, … if modes were free.
     std : dict of str to (float or None)
         Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
-        or that the data do not determine. Of a tool's inertia that rests on 0: what it would be
+        or that the data do not determine. Of a tool inertia that rests on 0: what it would be
         without that bound. An estimate that cannot be negative of a value that is 0 lies 0 to one
         side of it half of the time and a half-normal error to the other: on average it is
         1/sqrt(2 pi) = 0.40 of this deviation too large, and it scatters by 0.58 of it.
     interval : dict of str to ((float, float) or None)
         95 % confidence intervals of the free ones, None as above. Of the positive parameters they
-        are symmetric in the logarithm; that of a tool's inertia ends at 0 (`interval_from_zero`).
+        are symmetric in the logarithm; that of a tool inertia ends at 0 (`interval_from_zero`).
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
@@ -169,7 +169,7 @@ class RecordAnalysis:
     noise_nm2_per_hz : ndarray, shape (K,)
         One-sided power spectral density of the torque's noise, without lines.
     lines : tuple of Line
-        Hum found in the torque, which no structure was compared with.
+        Narrow-band disturbances of the torque, left out of all comparisons.
     comparison : Comparison
         What they were compared with.
     """
@@ -212,8 +212,8 @@ class RecordAnalysis:
     def fit_percent(self, fit: RecordFit) -> float:
         """Fit of one of the models to the measured torque in the band (`nrmse_percent`).
 
-        Hum is no part of that torque, and at its lines nothing is compared; a decay that began
-        before the record counts as explained, as initial conditions do.
+        Narrow-band disturbances are not part of it, and nothing is compared at their lines; a
+        decay that began before the record counts as explained, as initial conditions do.
 
         Parameters
         ----------

@@ -46,7 +46,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
 
     With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
-    then one by one where modes have offsets of their own.
+    then one by one where modes have their own offsets.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ _CLEARLY: Final = 0.9
 
 _MOST_MINIMA: Final = 4
 _LOOKS: Final = 3
-"""As often hum is looked for: the first fit took part of it for the beam's doing."""
+"""Number of searches for hum: the first fit attributed part of it to the beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +227,7 @@ class Descent:
         return Descent(objective, minimum.x)
 
     def hum(self) -> tuple[Hum, ...]:
-        """Look for what hums beside a mode, with the beam found so far."""
+        """Search for narrow-band disturbances near the modes of the beam found so far."""
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         amplitudes = self.objective.project(at, noise.weight).amplitudes
@@ -236,7 +236,7 @@ class Descent:
         return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def without_hum(self, tolerance: float) -> Descent:
-        """Take out what hums beside a mode, and descend again; `self` if nothing does."""
+        """Take out the hum near modes and descend again; `self` if there is none."""
         here = self
         for _ in range(_LOOKS):
             hum = here.hum()
@@ -250,7 +250,7 @@ class Descent:
         return here
 
     def noise(self, *, with_lines: bool = False) -> Noise:
-        """Take for noise what remains here and is no free decay."""
+        """Take for noise what remains here and is not a free decay."""
         objective, comparison = self.objective, self.objective.comparison
         at = objective.linearise(self.x)
         near_mode = None

@@ -478,7 +478,7 @@ def experiments(
             advice.append(f"To determine {names}, {_for_two_modes(field, visible)}")
         else:
             advice.append(
-                f"To determine {names}, run narrow, slow sweeps round the modes, or a wider sweep "
+                f"To determine {names}, run narrow, slow sweeps around the modes, or a wider sweep "
                 "that reaches one more mode."
             )
     unexplained = any(finding.kind == "unexplained" for finding in found)

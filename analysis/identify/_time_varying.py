@@ -1,4 +1,4 @@
-"""Changes along the record (damping, stiffness, gain), and the motor's play.
+"""Changes along the record (damping, stiffness, gain), and backlash.
 
 Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
 would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
@@ -63,13 +63,13 @@ _SETTLED: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One thing that changes along the record, or the play.
+    """One thing that changes along the record, or the backlash.
 
     Attributes
     ----------
     what : str
     size, std : float
-        Change from the first sample to the last, relative; the play in rad.
+        Change from the first sample to the last, relative; the backlash in rad.
     behind : float
         BIC with it above the lowest without it.
     """
@@ -91,7 +91,7 @@ class Change:
 
 
 def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
-    """Find what changes along the record; fit all anew beside it if nothing explains it as well.
+    """Find what changes along the record; refit all with it if nothing else explains it as well.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
 
 
 def _possible(change: Change) -> bool:
-    """Whether a size is one: play is positive, and nothing changes by more than it is."""
+    """Whether a size is one: backlash is positive, and nothing changes by more than itself."""
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
@@ -233,12 +233,16 @@ def _changed(plant: Plant, what: What, size: float) -> Plant:
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
-    """Hub's angle less the shaft's with a play of `_UNIT_PLAY_RAD`, at the decimated rate."""
+    """Hub's angle less the shaft's with a backlash of `_UNIT_PLAY_RAD`, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
     half, here, hub = _UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
     for angle in shaft.tolist():
-        here = min(max(here, angle - half), angle + half)
+        # A comparison each: min and max take three times as long, at every tick of the record.
+        if here < angle - half:
+            here = angle - half
+        elif here > angle + half:
+            here = angle + half
         hub.append(here)
     lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub) - shaft)
     return lag
@@ -304,7 +308,7 @@ _NAMES: Final[dict[What, str]] = {
     "damping": "Damping that changes along the record",
     "stiffness": "Stiffness that changes along the record",
     "gain": "A torque gain that changes along the record",
-    "play": "Play between encoder and beam",
+    "play": "Backlash between encoder and beam",
 }
 _KINDS: Final[dict[What, Kind]] = {
     "damping": "drifting damping",
@@ -359,7 +363,7 @@ def _finding(change: Change) -> Finding:
         interval=(change.size - half, change.size + half),
         unit="rad" if of_play else "1",
         remedy=(
-            "Remove the play in gear and clamp."
+            "Remove the backlash in gear and clamp."
             if of_play
             else "Repeat with the sweep from high to low frequency, which separates changes with "
             "time from those with frequency."

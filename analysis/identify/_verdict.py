@@ -176,7 +176,7 @@ class Row:
     structure : str
         "I" to "VII".
     uniform : bool
-        Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+        Whether the beam was taken to be uniform; else each mode has its own stiffness.
     parameters : int
     cost : float
         Sum of squares of the whitened residual.

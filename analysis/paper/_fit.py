@@ -20,7 +20,7 @@ sessions with type VI:
   are 3 to 50 times the scatter between sessions. The bias itself is 1 to 7 times as large as
   they are, and 4 to 20 times if the structure is wrong.
 
-So they rank parameters by how well the response determines them and are no confidence intervals.
+So they rank parameters by how well the response determines them and are not confidence intervals.
 """
 
 import itertools
@@ -337,7 +337,7 @@ def thinned(
     index : ndarray of int, shape (m,), m <= count
         Increasing.
     weights : ndarray, shape (m,)
-        Each point's share: its own weight and that of the points left out round it. Of sum 1.
+        Each point's share: its own weight and that of the points left out around it. Of sum 1.
     """
     n = measured.size
     if n <= count:
@@ -390,7 +390,7 @@ def starts(
     hollow = np.ones(costs.shape, dtype=bool)
     for axis in range(costs.ndim):
         rise = np.diff(costs, axis=axis)
-        # A point is no hollow if the cost falls towards the next one, or rose from the last.
+        # A point is not a hollow if the cost falls towards the next one, or rose from the last.
         pad_end = [(0, 1) if k == axis else (0, 0) for k in range(costs.ndim)]
         pad_start = [(1, 0) if k == axis else (0, 0) for k in range(costs.ndim)]
         hollow &= np.pad(rise, pad_end) >= 0

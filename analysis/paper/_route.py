@@ -293,7 +293,7 @@ class FittedModel:
     ----------
     fit : FrfFit
     response : ndarray of complex, shape (n,)
-        The model with the tool's inertia on the bins that were fitted, in N·m/rad.
+        The model with the tool inertia on the bins that were fitted, in N·m/rad.
     indices : Indices
     modes : tuple of Mode
         Modes of the beam alone, from its poles; empty where damping is so strong that one has none.

@@ -73,7 +73,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     inside = (frequency_hz >= analysis.frequency_hz[0]) & (
         frequency_hz <= analysis.frequency_hz[-1]
     )
-    # A line is no excitation, and what is compared has none.
+    # A line is not an excitation, and what is compared has none.
     nearest = np.searchsorted(analysis.frequency_hz, frequency_hz[inside])
     inside[inside] = analysis.compared[np.minimum(nearest, analysis.compared.size - 1)]
     power = np.abs(np.fft.rfft(torque)[inside]) ** 2 * 2 / (torque.size * record.rate_hz)

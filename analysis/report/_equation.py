@@ -230,7 +230,7 @@ def types_table(whole: WholeRecord) -> Table:
         (
             "Internal damping multiplies EI by 1 + the term, external damping adds the term to "
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
-            "mode with a stiffness of its own. The marked type is the one that the numbers are of.",
+            "mode with its own stiffness. The marked type is the one that the numbers are of.",
         ),
         selected=list(STRUCTURES).index(whole.fit.structure.name),
     )

@@ -54,7 +54,7 @@ def report_folders(
     Raises
     ------
     OutputExistsError
-        If the folder asked for exists and is not empty, and is no earlier report to be replaced.
+        If the folder exists, is not empty and does not hold an earlier report to be replaced.
     """
     if report is None:
         # A folder given for a file may have no name of its own ("." or "/").
@@ -196,7 +196,7 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
     """
     check_new_file(path, "The file", overwrite=overwrite)
     if isinstance(content, str):
-        # File names may hold bytes that are no text; as escapes they are text, and JSON.
+        # File names may hold bytes that are not text; as escapes they are text, and valid JSON.
         content = content.encode("utf-8", "backslashreplace")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -146,7 +146,7 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
         ("beam length", f"{beam.length_m:g} m"),
         ("beam density", f"{beam.density_kg_per_m:g} kg/m"),
         ("bending stiffness", f"{beam.bending_stiffness_n_m2:g} N·m²"),
-        ("inertia of the clamp", f"{record.tool_inertia_kg_m2:g} kg·m²"),
+        ("tool inertia", f"{record.tool_inertia_kg_m2:g} kg·m²"),
         ("measurement latency of the angle", f"{1e3 * record.angle_delay_s:g} ms"),
         ("measurement latency of the torque", f"{1e3 * record.torque_delay_s:g} ms"),
         ("missing ticks", f"{gaps.missing_ticks}, {gaps.sweep_missing_ticks} of them in the sweep"),

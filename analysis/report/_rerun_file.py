@@ -506,7 +506,7 @@ def _span(largest: float) -> tuple[float, float]:
 
 
 def check_rerun_file(path: Path) -> None:
-    """Raise OutputExistsError if a path is taken, or is no name of such a file."""
+    """Raise OutputExistsError if a path is taken, or is not a name of such a file."""
     try:
         check_new(path)
     except RrdFileError as error:

@@ -85,7 +85,7 @@ def _main_results(whole: WholeRecord) -> RenderableType:
 
 
 def _bare(table: Table) -> Table:
-    """Leave of what stands round a table the reasons for marked numbers."""
+    """Leave of what stands around a table the reasons for marked numbers."""
     notes = tuple(note for note in table.notes if note.startswith(MARK))
     return replace(table, caption="", notes=notes)
 

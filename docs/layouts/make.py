@@ -186,7 +186,7 @@ def _rerun_plot(panel: Panel) -> "rrb.TimeSeriesView":
         origin=SAMPLE_TOPIC,
         overrides={SAMPLE_TOPIC: curves},
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(curves) > 1),
-        # Left to itself it shows a minute round the cursor.
+        # Left to itself it shows a minute around the cursor.
         axis_x=rrb.TimeAxis(view_range=whole),
     )
     view.id = _fixed_id(panel.title)

@@ -396,7 +396,7 @@ def couple(
     viscous_nm_s_per_rad: float = 0.0,
     tool_inertia_kg_m2: float = 0.0,
 ) -> CoupledModel:
-    """Attach the beam, with the clamp's inertia in front of it, to a motor.
+    """Attach the beam, with the tool inertia in front of it, to a motor.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
         )
     except (OSError, subprocess.SubprocessError) as error:
         said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        raise CyclictestError(said[-1] if said else "it failed without a word") from error
+        raise CyclictestError(said[-1] if said else "it failed without a message") from error
     return measured(done.stdout, rate_hz)
 
 

@@ -36,7 +36,7 @@ _WANTED = {
     "scheduling": "SCHED_FIFO {priority}",
     "supervision": "SCHED_RR {supervision_priority}",
     "cpu": "realtime.cpu: a core of this computer",
-    "idle_states": "/dev/cpu_dma_latency may be written to",
+    "idle_states": "/dev/cpu_dma_latency is writable",
 }
 _IDLE_STATES_REMEDY = (
     "Idle states: a sleeping core takes long to wake up. Let the group rigd bound that with this "
@@ -46,7 +46,7 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return what the control process is granted, tried in a process of its own.
+    """Return what the control process is granted, tried in its own process.
 
     Under ``supervision`` stands what supervisor and recorder are.
 
@@ -258,8 +258,8 @@ def _clock_row(root: Path) -> Row:
         grade(fail=False, warn=not quick),
         ""
         if quick
-        else "Clock source: reading the time costs a microsecond each; see in the kernel's log why "
-        "it does not trust the processor's counter (dmesg | grep -i tsc).",
+        else "Clock source: reading the time costs a microsecond each; the kernel log says why it "
+        "does not trust the processor's counter (dmesg | grep -i tsc).",
     )
 
 

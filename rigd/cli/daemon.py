@@ -124,7 +124,9 @@ def rig_name(profile: str | None) -> str | None:
 
 def status(
     profile: DaemonOf = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Update it until Ctrl-C.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Update continuously until Ctrl-C.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the status of daemon, rig and session.
@@ -176,7 +178,7 @@ def stop(
     if status is None:
         fail(
             f"The daemon was asked to stop, but its session did not end within "
-            f"{_END_PATIENCE_S:g} s; look at rigd status and at the rig, and press the wired stop "
+            f"{_END_PATIENCE_S:g} s; check rigd status and the rig, and press the wired stop "
             "(STO) if anything moves.",
             EXIT_FAILED,
         )
@@ -216,7 +218,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Set the zero of the angle where the motor stands.
+    """Set the present motor angle as zero.
 
     The angle limits are relative to this zero. The torque stays off.
 
@@ -275,5 +277,5 @@ def _watch(profile: str | None) -> None:
                 if link is not None:
                     link.close()
                     link = None
-                live.update(f"{error} Waiting for it; Ctrl-C ends.", refresh=True)
+                live.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
             time.sleep(_LOOK_S)

@@ -1,4 +1,4 @@
-"""``rigd info`` and ``rigd recover``: contents of a session file, and repair of a torn one."""
+"""``rigd info`` and ``rigd recover``: contents and recovery of session files."""
 
 import json
 from pathlib import Path
@@ -44,12 +44,12 @@ def recover(
     paths: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...", readable=False, help="Torn .mcap.part or damaged .mcap files."
+            metavar="FILE...", readable=False, help="Incomplete .mcap.part or damaged .mcap files."
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Recover the intact part of torn or damaged session files.
+    """Recover the intact part of incomplete or damaged session files.
 
     Writes X.mcap beside X.mcap.part, and X.recovered.mcap beside a damaged X.mcap: every sample up
     to the damage, marked as recovered. Nothing is overwritten or removed.

@@ -10,7 +10,7 @@ import typer
 
 from rigd.cli.options import EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
 from rigd.printable import printable
-from rigd.units import decimals
+from rigd.units import with_half_width
 
 if TYPE_CHECKING:
     from rigd.library import Change, ModeTrend, Quantity, SessionRow, TrendPoint
@@ -90,10 +90,10 @@ def list_sessions(
 
 
 def specimens() -> None:
-    """List the specimens that have a file of their own.
+    """List the specimens that have their own file.
 
     A file NAME.toml has the section [beam] of a profile and may have [beam.damping] and a text
-    note. It is looked for in specimens of the working folder, then in the per-user folder
+    note. It is searched in specimens of the working folder, then in the per-user folder
     ($XDG_CONFIG_HOME/rigd/specimens, by default ~/.config/rigd/specimens). Sessions with --specimen
     NAME use its beam instead of the profile's.
 
@@ -204,7 +204,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "significant at 95 %, ? is flagged in its report or quick look."
+        "significant (3 standard deviations), ? is flagged in its report or quick look."
     )
 
 
@@ -234,19 +234,12 @@ def _interval(point: "TrendPoint", low: float, high: float) -> str:
 
 
 def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
-    value, mark = scale * quantity["value"], " ?" if quantity["flag"] else ""
-    if quantity["interval_95"] is None:
-        return f"{value:.4g}{mark}"
-    low, high = quantity["interval_95"]
-    half = scale * (high - low) / 2
-    if not half > 0:
-        return f"{value:.6g}{mark}"
-    places = min(decimals(half), 9)
-    return f"{value:.{places}f} ± {half:.{places}f}{mark}"
+    text = with_half_width(quantity["value"], quantity["interval_95"], scale)
+    return f"{text} ?" if quantity["flag"] else text
 
 
 def _relative(change: "Change | None", first: float) -> str:
     if change is None or first == 0:
         return ""
     percent = 100 * change.difference / first
-    return f"{percent:+.2g} %{' *' if change.beyond_intervals else ''}"
+    return f"{percent:+.2g} %{' *' if change.significant else ''}"

@@ -147,8 +147,8 @@ def _how_to_start(profile: str | None) -> str:
             continue
         if with_view:
             return (
-                f"The daemon of the rig {rig} has no live view at the moment: rigd status says "
-                "what it is doing. rigd live --wait waits for the view."
+                f"The daemon of the rig {rig} has no live view at the moment: rigd status shows "
+                "its state. rigd live --wait waits for the view."
             )
         return (
             f"The daemon of the rig {rig} was started without a live view; end it and start it "
@@ -199,8 +199,8 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
             shown = view
         elif view is None and there:
             typer.echo(
-                f"The live view of {shown.rig} has ended; the window stays, and shows the next one "
-                "when it begins.",
+                f"The live view of {shown.rig} has ended; the window stays open and shows the next "
+                "one.",
                 err=True,
             )
         there = view is not None
@@ -238,11 +238,11 @@ def replay(
             _save(path, save, web=web)
         return
     if not web and not has_screen():
-        _check_shown(path)  # what is no file for a window is none elsewhere, either
+        _check_shown(path)  # what is not a file for a window is not one elsewhere either
         elsewhere = (
-            "the file can be looked at elsewhere as it is"
+            "the file can be opened elsewhere"
             if path.suffix == SUFFIX
-            else f"--save OUT{SUFFIX} writes a file that can be looked at elsewhere"
+            else f"--save OUT{SUFFIX} writes a file that can be opened elsewhere"
         )
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
@@ -260,7 +260,8 @@ def replay(
 def _save(path: Path, out: Path, *, web: bool) -> None:
     if web:
         fail(
-            "--save writes a file and shows nothing, so it does not go with --web.", EXIT_WRONG_USE
+            "--save writes a file and shows nothing, so it cannot be combined with --web.",
+            EXIT_WRONG_USE,
         )
     if path.suffix == SUFFIX:
         fail(f"{path} is a recording for Rerun already; copy it instead.", EXIT_WRONG_USE)

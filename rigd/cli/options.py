@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from rigd.errors import RigdError
-from rigd.printable import BAR_STYLES
+from rigd.printable import progress_bar
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -27,7 +27,7 @@ def fail(message: str, code: int) -> NoReturn:
 
 @contextlib.contextmanager
 def errors_told() -> Iterator[None]:
-    """End the command with what an error of the rig says: 2 for wrong use, else 1."""
+    """End the command with what an error of the rig says: 2 for a usage error, else 1."""
     try:
         yield
     except RigdError as error:
@@ -62,19 +62,7 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 
 @contextlib.contextmanager
 def _bar(name: str) -> Iterator[Callable[[float], None]]:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-    from rich.theme import Theme
-
-    console = Console(stderr=True, theme=Theme(BAR_STYLES))
-    with Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as bar:
+    with progress_bar() as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 

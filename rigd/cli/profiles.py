@@ -31,7 +31,7 @@ profiles_app = typer.Typer(
 def profiles(context: typer.Context) -> None:
     """List, show and copy hardware profiles, or write a new one.
 
-    A new one is written from a drive's EDS file. A name is looked for in hw_profiles of the working
+    A new one is written from a drive's EDS file. Names are searched in hw_profiles of the working
     folder, then in the per-user folder ($XDG_CONFIG_HOME/rigd/profiles, by default
     ~/.config/rigd/profiles), then among those that came with the program. Without a command, the
     profiles are listed.
@@ -46,7 +46,7 @@ def profiles(context: typer.Context) -> None:
 def list_profiles() -> None:
     """List the profiles that --profile takes by name.
 
-    The list says where each one is, and which others it hides.
+    The list shows the location of each, and which others it hides.
 
     Example: rigd profiles list
     """
@@ -86,7 +86,7 @@ def copy(
 ) -> None:
     """Copy a profile into the per-user folder, to be edited there. No file is ever overwritten.
 
-    Under the same name the copy takes the place of the shipped profile, which stays as it is.
+    Under the same name the copy hides the shipped profile, which is not changed.
 
     Example: rigd profiles copy sim my_rig
     """
@@ -96,7 +96,8 @@ def copy(
     folder = WORKING_FOLDER if here else user_folder()
     if folder is None:
         fail(
-            "There is no per-user folder, for this user has no home; set XDG_CONFIG_HOME, or copy "
+            "There is no per-user folder, because this user has no home; set XDG_CONFIG_HOME, or "
+            "copy "
             "into this folder by --here.",
             EXIT_FAILED,
         )

@@ -90,7 +90,7 @@ def inject(
     end[,fault=sto]                           end faults of one kind (release the STO), or all
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
-    """  # noqa: D301 - the mark that keeps lines apart is no raw text
+    """  # noqa: D301 - the mark that keeps lines apart is not raw text
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()

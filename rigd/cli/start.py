@@ -72,7 +72,7 @@ def start_processes(*, live: bool) -> "tuple[StopRequest, ProcessGroup]":
         return stop, ProcessGroup(live=live)
     except OSError as error:
         fail(
-            f"The processes of a session cannot be started ({error.strerror}); look at the limits "
+            f"The processes of a session cannot be started ({error.strerror}); check the limits "
             "of open files (ulimit -n) and of shared memory (/dev/shm).",
             EXIT_FAILED,
         )

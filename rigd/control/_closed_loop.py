@@ -44,7 +44,7 @@ MAX_DAMPING_TAKEN = 0.004
 """Largest damping ratio that the controller may take from a mode of the beam.
 
 Checked on a beam of the same dimensions that has next to no damping of its own: a loop that is
-stable only by the damping it is to measure is no safe loop, and its record shows little of the beam
+stable only by the damping it is to measure is not safe, and its record shows little of the beam
 near that mode. With the coupling torque fed forward a mode loses 0.0001 to 0.0015 (poles from 40 to
 120 rad/s, gains from 0.8 to 1.2, torque readings up to 10 ms old); without, 0.0045 to 0.013.
 """
@@ -232,7 +232,7 @@ class ClosedLoop:
 
 
 def close_loop(model: LoopModel) -> ClosedLoop:
-    """Close the loop of a rig round its designed controller.
+    """Close the loop of a rig around its designed controller.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     if growth <= 0.0:
         return None
     return (
-        f"{finding}, which is let through up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
+        f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
 

@@ -7,7 +7,7 @@ torque command
     Motor and drive: torque constant, gear, delay of the command. Everything goes through here, the
     angle's PID and the coupling torque's feed-forward.
 angle reading
-    The loop the controller was designed for: the PID round the motor, with the beam cancelled by
+    The loop the controller was designed for: the PID around the motor, with the beam cancelled by
     the feed-forward.
 torque reading
     The feed-forward alone: calibration, lever arm and delay of the sensor.

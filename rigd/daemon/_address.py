@@ -131,7 +131,7 @@ def _group_number(group: str) -> int:
     except KeyError:
         raise UnknownGroupError(
             f"--group {group!r}: there is no such group; name one that exists, or have the "
-            "administrator make it with groupadd."
+            "administrator create it with groupadd."
         ) from None
 
 

@@ -25,7 +25,7 @@ STOP_SIGNAL = signal.SIGUSR1
 """Asks the daemon's process for what `stop` asks for."""
 
 _ANSWER_PATIENCE_S = 60.0
-"""Connecting the devices anew takes up to half of it."""
+"""Reconnecting the devices takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
 """Time to go on trying a daemon that turns clients away, or accepts nobody."""
@@ -436,7 +436,7 @@ def what_is_left(pid: int, uid: int) -> str:
             f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
             f"status. {_UNKNOWN}"
         )
-    begin_again = "see the daemon's log for why, and start it again with rigd serve."
+    begin_again = "see the daemon's log for the cause, and start it again with rigd serve."
     if control:
         return (
             f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
@@ -445,8 +445,8 @@ def what_is_left(pid: int, uid: int) -> str:
     if uid != os.getuid() and not _sees_other_users():
         return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
     return (
-        "The daemon is gone. Its control process, which alone moves the motor, has ended too: see "
-        "that the rig stands still. What was recorded of a session is in the daemon's output "
+        "The daemon is gone. Its control process, which alone moves the motor, has ended too: "
+        "check that the rig is at rest. What was recorded of a session is in the daemon's output "
         f"folder; {begin_again}"
     )
 

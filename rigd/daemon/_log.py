@@ -1,4 +1,4 @@
-"""The daemon's log: on standard error, written by a thread of its own.
+"""The daemon's log: on standard error, written by a separate thread.
 
 A terminal that was stopped, or a journal that hangs, must not keep the daemon from hearing a stop.
 """

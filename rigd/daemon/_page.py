@@ -97,7 +97,7 @@ class PageProcess:
         self._file.unlink(missing_ok=True)
 
     def _attend(self) -> None:
-        """Keep it running; in a thread of its own."""
+        """Keep it running; in its own thread."""
         starts = 0
         while starts < _MOST_STARTS:
             starts += 1

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from rigd.errors import RigdError
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
 from rigd.session import NOTES, MetadataError, metadata_keys
 
@@ -31,6 +32,15 @@ class RequestError(Exception):
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
         self.request_id = request_id
+
+
+class CommandError(RigdError):
+    """A request is refused, or failed; the message is for the operator."""
+
+    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+        """The request itself has to be another."""
 
 
 class Request(BaseModel):
@@ -159,7 +169,7 @@ def parse_request(line: bytes) -> AnyRequest:
     command = given.get("command")
     if command not in _COMMANDS:
         raise RequestError(
-            f"command = {_shown(command)} is not known; there are {', '.join(_COMMANDS)}.",
+            f"command = {_shown(command)} is unknown; choose {', '.join(_COMMANDS)}.",
             request_id,
         )
     try:
@@ -205,7 +215,7 @@ def _checked(request: SomeSession) -> SomeSession:
     """Check what depends on the excitation, by the signature of its function."""
     if request.excitation not in KINDS:
         raise RequestError(
-            f"excitation = {_shown(request.excitation)} is not known; there are {', '.join(KINDS)}."
+            f"excitation = {_shown(request.excitation)} is unknown; choose {', '.join(KINDS)}."
         )
     for note in NOTES:
         if not getattr(request.notes, note).isprintable():

@@ -24,13 +24,14 @@ from rigd.daemon._log import NAME
 from rigd.daemon._protocol import (
     LONGEST_LINE,
     AnyRequest,
+    CommandError,
     Id,
     RequestError,
     Stop,
     Watch,
     parse_request,
 )
-from rigd.daemon._service import CommandError, Service
+from rigd.daemon._service import Service
 from rigd.daemon._states import Document, Peer, look_up_user
 
 MOST_CLIENTS = 32

@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -19,6 +18,8 @@ from typing import Any, Protocol, TypeVar
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import NAME
+from rigd.daemon._protocol import CommandError
+from rigd.daemon._series import Publish, SeriesTeller, ServedSeries
 from rigd.daemon._states import (
     Document,
     Peer,
@@ -34,7 +35,6 @@ from rigd.daemon._states import (
     transition_document,
 )
 from rigd.devices import WhatMoves, what_moves
-from rigd.engine import Event
 from rigd.errors import RigdError, UserError
 from rigd.profile import Profile, with_specimen
 from rigd.runner import (
@@ -45,18 +45,14 @@ from rigd.runner import (
     RigStatus,
     Series,
     SessionFailedError,
-    SessionProgress,
-    SessionResult,
     SessionRig,
     SignalBlock,
     excitation_for,
-    result_line,
     what_is_kept,
 )
-from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
-"""Time from one look at the rig to the next."""
+"""Time between two checks of the rig."""
 _SIGNALS_S = 0.05
 """Time from one block of a record's signals to the next."""
 _MOST_PREDICTIONS = 4
@@ -65,17 +61,8 @@ _DEAF_S = 1.5
 """Time without a look after which the event loop counts as stuck, and hears no stop."""
 _RATE_LOOKS = 10
 """Number of looks over which a rate is measured."""
-_LOGGED = {
-    "info": logging.INFO,
-    "warning": logging.WARNING,
-    "error": logging.ERROR,
-    "fatal": logging.CRITICAL,
-}
-"""Levels of events that are told, and as what they are logged."""
-
 _SHUTTING_DOWN = "The daemon is being shut down."
 
-Publish = Callable[[Document], None]
 T = TypeVar("T")
 
 _log = logging.getLogger(NAME)
@@ -101,7 +88,7 @@ class RigControl(SessionRig, Protocol):
         """Make the present angle the zero."""
 
     def watch(self) -> None:
-        """See whether all is well between sessions."""
+        """Check whether all is well between sessions."""
 
     def status(self) -> RigStatus | None:
         """Read the status from shared memory, from any thread."""
@@ -111,52 +98,6 @@ class RigControl(SessionRig, Protocol):
 
     def disconnect(self) -> None:
         """Close everything."""
-
-
-class CommandError(RigdError):
-    """A request is refused, or failed; the message is for the operator."""
-
-    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
-        super().__init__(message)
-        self.wrong_use = wrong_use
-        """The request itself has to be another."""
-
-
-@dataclass(slots=True)
-class ServedSeries:
-    """Sessions that one request asked for, and how far they came."""
-
-    number: int
-    request: protocol.Start
-    stop: StopRequest = field(default_factory=StopRequest)
-    planned: Series | None = None
-    session: int = 0
-    """The one that is run, from 1 on."""
-    path: Path | None = None
-    results: list[SessionResult] = field(default_factory=list)
-    """Also of one that failed."""
-    reason: str = ""
-    """Why it ended before its time."""
-    running: bool = False
-    failed: bool = False
-    """Something went wrong: the sessions are fewer, or not what was asked for."""
-
-    def as_document(self) -> Document:
-        """Tell what it is and how far it came."""
-        return {
-            "series": self.number,
-            "excitation": self.request.excitation,
-            "session": self.session,
-            "repeat": self.request.repeat,
-            "notes": self.request.notes.model_dump(exclude_defaults=True),
-            "plan": None if self.planned is None else self.planned.plan_document(),
-            "path": None if self.path is None else str(self.path),
-            "running": self.running,
-            "stopped": self.stop.requested,
-            "failed": self.failed,
-            "reason": self.reason,
-            "sessions": [result.as_dict() for result in self.results],
-        }
 
 
 class Service:
@@ -403,7 +344,7 @@ class Service:
             self._publish({"event": "progress", **progress})
 
     async def watch(self) -> None:
-        """See whether the rig is well between sessions."""
+        """Check whether the rig is well between sessions."""
         # A check asks nothing of the rig, and the thread of its calls is free.
         busy = self._doing not in ("", "check")
         if busy or not self._rig.connected or self.state not in (State.READY, State.FAULT):
@@ -450,7 +391,7 @@ class Service:
     async def _predict(self, request: protocol.Predict) -> Document:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
-            raise CommandError("Several predictions are being made; try again in a moment.")
+            raise CommandError("Several predictions are running; try again in a moment.")
         job = background.PredictionJob(
             self._profile,
             request.excitation,
@@ -461,7 +402,7 @@ class Service:
         self._predictions += 1
         try:
             async with self._predicting:
-                return await _in_background(job)
+                return await background.perform(job)
         finally:
             self._predictions -= 1
 
@@ -474,7 +415,9 @@ class Service:
         self._refuse_if_busy()
         self._doing = "check"
         try:
-            told = await _in_background(background.CheckJob(self._profile, self._rig.calibration))
+            told = await background.perform(
+                background.CheckJob(self._profile, self._rig.calibration)
+            )
         finally:
             self._doing = ""
         self._last_check = {"utc_ns": time.time_ns(), "verdict": told["verdict"]}
@@ -531,7 +474,7 @@ class Service:
                 try:
                     await self._call(self._rig.watch)
                 except RigError:
-                    pass  # it is connected anew
+                    pass  # it is reconnected
                 else:
                     self._states.move(State.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
@@ -578,7 +521,7 @@ class Service:
     # Series
 
     def _plan(self, request: protocol.Start) -> Series:
-        """Make the excitation and see that it may be run; in the second thread."""
+        """Make the excitation and check that it may be run; in the second thread."""
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
@@ -627,7 +570,7 @@ class Service:
             _log.exception("the last signals could not be told")
         series.running = False
         series.failed = bool(fault or (series.reason and not series.stop.requested))
-        self._states.move(*_after(series, fault))
+        self._states.move(*series.state_after(fault))
         self._publish({"event": "series", **series.as_document()})
 
     async def _let_go(self) -> None:
@@ -645,7 +588,7 @@ class Service:
         def publish(event: Document) -> None:
             loop.call_soon_threadsafe(self._publish, event)
 
-        told = _Told(series, publish, self._listens)
+        told = SeriesTeller(series, publish, self._listens)
         try:
             planned.run(
                 self._rig,
@@ -708,66 +651,3 @@ class Service:
 
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
-
-
-async def _in_background(job: background.PredictionJob | background.CheckJob) -> Document:
-    """Have a job done in a process of its own."""
-    try:
-        return await background.perform(job)
-    except background.BackgroundError as error:
-        raise CommandError(str(error), wrong_use=error.wrong_use) from None
-
-
-class _Told:
-    """Notes, logs and publishes what becomes of a series; called in the second thread."""
-
-    def __init__(self, series: ServedSeries, publish: Publish, listens: Callable[[], bool]) -> None:
-        self._series = series
-        self._publish = publish
-        self._listens = listens
-
-    def begins(self, number: int, path: Path) -> None:
-        if not self._listens():
-            raise RigError(
-                "The daemon does not respond to requests: no further session is started."
-            )
-        self._series.session, self._series.path = number, path
-
-    def shown(self, where: str) -> None:
-        self._tell("info", where)
-
-    def update(self, progress: SessionProgress, events: list[Event]) -> None:  # noqa: ARG002
-        for event in events:
-            if event.level in _LOGGED:
-                self._tell(event.level, event.message)
-
-    def ended(self, result: SessionResult) -> None:
-        series = self._series
-        series.results.append(result)
-        line = result_line(result.as_dict())
-        _log.log(
-            logging.INFO if result.went_well else logging.WARNING,
-            "series %d: session %d of %d, %s: %s",
-            series.number,
-            series.session,
-            series.request.repeat,
-            result.path or result.part or "no file",
-            line,
-        )
-        # For lists of events, in the words of the terminal.
-        self._publish({"event": "message", "level": "info", "text": line})
-        self._publish({"event": "session", "number": series.session, **result.as_dict()})
-
-    def _tell(self, level: str, text: str) -> None:
-        _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
-        self._publish({"event": "message", "level": level, "text": text})
-
-
-def _after(series: ServedSeries, fault: str) -> tuple[State, str]:
-    if fault:
-        return State.FAULT, fault
-    if series.stop.requested:
-        return State.READY, f"{series.request.excitation} was stopped"
-    if series.reason:
-        return State.READY, series.reason
-    return State.READY, f"{series.request.excitation} is complete"

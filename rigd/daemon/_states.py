@@ -281,7 +281,7 @@ def _view_document(view: LiveAddress | None) -> Document | None:
 
 
 def _state(process: ProcessStatus, phase: Phase) -> str:
-    """Return a process's state; of one that is started for each session its end is no news."""
+    """Return a process's state; of one that is started for each session its end is normal."""
     passing = any(p.for_one_session and p.name == process.name for p in PROCESSES)
     return "done" if process.state == "ended" and passing and phase is Phase.OFF else process.state
 

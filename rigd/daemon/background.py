@@ -1,4 +1,4 @@
-"""Background jobs of the daemon: predictions and checks, each in a process of its own.
+"""Background jobs of the daemon: predictions and checks, each in its own process.
 
 They take processor time, and anybody may ask for a prediction while a session runs. In the daemon's
 own process they would hold the interpreter that supervises the session; theirs has the lowest
@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.errors import FailureError, RigdError
+from rigd.daemon._protocol import CommandError
+from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile
 from rigd.runtime import SINGLE_THREADED, killed_first
@@ -93,24 +94,8 @@ class CheckJob:
         }
 
 
-class BackgroundError(FailureError):
-    """The work was refused or failed; the message is for the operator.
-
-    Parameters
-    ----------
-    message
-        Reason.
-    wrong_use
-        Whether the request itself has to be another.
-    """
-
-    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
-        super().__init__(message)
-        self.wrong_use = wrong_use
-
-
 async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
-    """Have a job done in a process of its own, without holding up the event loop.
+    """Have a job done in its own process, without holding up the event loop.
 
     Parameters
     ----------
@@ -119,7 +104,7 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
 
     Raises
     ------
-    BackgroundError
+    CommandError
         If it is refused, fails, or takes longer than 60 s.
     """
     try:
@@ -131,20 +116,20 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
             env=os.environ | SINGLE_THREADED,
         )
     except OSError as error:
-        raise BackgroundError(f"No process can be started for it ({error.strerror}).") from None
+        raise CommandError(f"No process can be started for it ({error.strerror}).") from None
     try:
         told, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
         answer = json.loads(told)
     except TimeoutError:
-        raise BackgroundError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
+        raise CommandError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
     except ValueError:
-        raise BackgroundError(f"Its process ended with exit code {process.returncode}.") from None
+        raise CommandError(f"Its process ended with exit code {process.returncode}.") from None
     finally:
         if process.returncode is None:
             process.kill()
             await process.wait()
     if "error" in answer:
-        raise BackgroundError(answer["error"], wrong_use=answer["wrong_use"])
+        raise CommandError(answer["error"], wrong_use=answer["wrong_use"])
     done: dict[str, Any] = answer
     return done
 

@@ -153,7 +153,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     device = sections.get("deviceinfo", {})
     entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), sections, node_id)}
     if not entries:
-        raise EdsError(f"{path}: is no EDS file: no object of a drive is described in it.")
+        raise EdsError(f"{path}: is not an EDS file: it describes no object of a drive.")
     return Eds(
         path=path,
         node_id=node_id,
@@ -189,7 +189,7 @@ def _text(path: Path) -> str:
         if stat.S_ISDIR(found.st_mode):
             raise EdsError(f"{path}: is a folder; name the EDS file in it.")
         if not stat.S_ISREG(found.st_mode):
-            raise EdsError(f"{path}: is no ordinary file; name the drive's EDS file.")
+            raise EdsError(f"{path}: is not an ordinary file; name the drive's EDS file.")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except EdsError:  # a ValueError too
@@ -210,10 +210,10 @@ def _text(path: Path) -> str:
         except UnicodeDecodeError:
             text = data.decode("cp1252", errors="replace")
     if "\0" in text:
-        raise EdsError(f"{path}: is no EDS file: it is not text.")
+        raise EdsError(f"{path}: is not an EDS file: it is not text.")
     if text.lstrip().startswith("<"):
         raise EdsError(
-            f"{path}: is XML (an XDD file, or ESI of EtherCAT) and no EDS file; "
+            f"{path}: is XML (an XDD file, or ESI of EtherCAT), not an EDS file; "
             "ask the vendor for the drive's EDS of CANopen."
         )
     return text
@@ -231,7 +231,7 @@ def _sections(text: str, path: Path) -> Sections:
             continue
         if line[0] == "[":
             title, bracket, _ = line[1:].partition("]")
-            # Without its end it is no section, and what follows belongs to none.
+            # Without its end it is not a section, and what follows belongs to none.
             keys = sections.setdefault(title.strip().lower(), {}) if bracket else {}
             if len(sections) > MAX_ENTRIES:
                 raise _too_many(path)
@@ -337,7 +337,7 @@ def _entries(
 def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
     data_type = _integer(keys.get("datatype", ""))
     if data_type > _LAST_BASIC_TYPE:
-        # Tools define a type of their own for a number with limits, as an object whose sub-index 1
+        # Tools define their own type for a number with limits, as an object whose sub-index 1
         # names the basic type.
         basic = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")
         data_type = _integer(basic)

@@ -77,7 +77,7 @@ class ResettableDrive(Protocol):
     """A drive that can be in fault; simulated ones in this process cannot."""
 
     def reset_fault(self) -> str | None:
-        """Switch off, reset a fault, see that it would get ready; return the fault, or None.
+        """Switch off, reset a fault, check that it would get ready; return the fault, or None.
 
         Raises
         ------
@@ -107,7 +107,7 @@ def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
     """
     drive = open_devices(rig, moving).drive
     if not isinstance(drive, ResettableDrive):
-        return "The drive is simulated in each session anew: there is no fault to reset."
+        return "Each session simulates a new drive: there is no fault to reset."
     try:
         fault = drive.reset_fault()
     finally:

@@ -36,8 +36,8 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
         How the drive shows it, as the rest of a sentence.
     """
     return DeviceError(
-        f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, see "
-        "that nobody is within reach of the beam, release it, then reset the rig."
+        f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, "
+        "check that nobody is within reach of the beam, release it, then reset the rig."
     )
 
 
@@ -129,7 +129,7 @@ class Drive(Protocol):
 
 @runtime_checkable
 class StatedDrive(Protocol):
-    """A drive with safeguards of its own, which a session's file has to state."""
+    """Safeguards of the drive itself, which a session's file has to state."""
 
     def statement(self) -> dict[str, str]:
         """Return them as keys of the file's metadata; known once it is connected."""

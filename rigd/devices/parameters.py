@@ -237,7 +237,7 @@ class AtiSerial:
     stream_hz: Positive
     """Records a second that the sensor streams."""
     filter: Literal["mean", "triangle"]
-    """Filter from the records to one a tick: mean of one tick's, or triangle over two ticks'."""
+    """Filter from the records to one per tick: mean of one tick's, or triangle over two ticks'."""
     calibration: Annotated[int, Ge(1), Le(16)]
     """Number of the calibration block that is loaded."""
     serial_number: str

@@ -81,7 +81,7 @@ class Standstill:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with the next angle: the drive has been, or is being, controlled."""
+        """Start over with the next angle: the drive has been, or is being, controlled."""
         self._angle_rad: float | None = None
         self._due_ns = 0
         self._moved: tuple[float, float] | None = None
@@ -255,7 +255,7 @@ class Cycle:
         return None
 
     def forget_recent(self) -> None:
-        """Begin anew with what `turns_against_torque` goes by."""
+        """Reset what `turns_against_torque` judges by."""
         self._recent.clear()
 
     def turns_against_torque(
@@ -517,7 +517,7 @@ def recalled_heat_nm2(profile: Profile) -> float:
     except (OSError, ValueError, TypeError, KeyError):
         return 0.0
     passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
-    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # of before the computer was started anew
+    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # from before a reboot
         return 0.0
     motor = profile.rig.motor
     warmest_nm2 = motor.peak_torque_nm**2

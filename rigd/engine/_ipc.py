@@ -72,8 +72,8 @@ class Child:
                 )
         except OSError as error:
             raise ChildError(
-                f"The {name} process cannot be started ({error.strerror}); see what else this "
-                "computer runs, and its limits (ulimit -a)."
+                f"The {name} process cannot be started ({error.strerror}); check the load of this "
+                "computer and its limits (ulimit -a)."
             ) from None
         if cores:
             with contextlib.suppress(OSError):  # it has ended already: poll() tells
@@ -202,7 +202,7 @@ class Parent:
             sys.exit(0)
 
     def poll(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none comes in time (None: wait for ever).
+        """Return the next message, or None if none comes in time (None: wait forever).
 
         Raises
         ------
@@ -251,7 +251,7 @@ CONTROL = Process(
     hung_after_s=3.0,
     grace_s=5.0,
     for_one_session=False,
-    loss="the drive goes off by its own watch, the session ends as a fault",
+    loss="the drive's watchdog switches it off, the session ends as a fault",
 )
 RECORDER = Process(
     "recorder",
@@ -270,7 +270,7 @@ LIVE = Process(
     hung_after_s=5.0,
     grace_s=2.0,
     for_one_session=False,
-    loss="it is started again, the session goes on",
+    loss="it is restarted, the session continues",
 )
 SUPERVISOR = Process(
     "supervisor",

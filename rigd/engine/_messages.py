@@ -171,7 +171,7 @@ class Close:
     """Close the file with its outcome."""
 
     outcome: Mapping[str, str]
-    """Metadata ``outcome`` of docs/session_format.md; the recorder counts the samples anew."""
+    """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,14 +236,14 @@ class MessageReader:
         self._pending = bytearray()
 
     def next(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none is complete in time (None: wait for ever).
+        """Return the next message, or None if none is complete in time (None: wait forever).
 
         Raises
         ------
         EOFError
             If the other end is gone and no whole message is left.
         ValueError
-            If what comes is no message.
+            If what comes is not a message.
         """
         while (message := self._whole()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):

@@ -123,7 +123,7 @@ class Ring:
         return block
 
     def discard(self) -> None:
-        """Release all records unseen; for a consumer that begins anew."""
+        """Release all records unseen; for a consumer that starts over."""
         self._counters[_READ] = self._counters[_WRITTEN]
 
     def close(self) -> None:
@@ -225,7 +225,7 @@ def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpe
     fd
         Descriptor of the memory.
     reference_rad
-        From the rig's zero, one a tick.
+        From the rig's zero, one per tick.
 
     Raises
     ------
@@ -240,6 +240,6 @@ def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpe
 
 
 def map_reference(spec: ReferenceSpec) -> Sequence[float]:
-    """Attach to a reference: one Python number a tick, read where it lies."""
+    """Attach to a reference: one Python number per tick, read where it lies."""
     memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=mmap.ACCESS_READ)
     return memoryview(memory).cast("d")

@@ -27,7 +27,7 @@ _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
-"""Counts the time that this process has run itself: a stalled computer is no supervisor's fault."""
+"""Counts the time that this process has run: a stalled computer is not the supervisor's fault."""
 _OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
 _AGAINST_TORQUE = (
     "The shaft accelerates against the torque: angle and torque have opposite signs. "
@@ -46,7 +46,7 @@ class SessionEnd(Exception):
     outcome, reason
         Outcome and reason, for the file and the operator.
     device_failed
-        A device did not do what it was asked: it must be connected anew.
+        A device did not do what it was asked: it must be reconnected.
     """
 
     def __init__(self, outcome: str, reason: str, *, device_failed: bool = False) -> None:
@@ -417,7 +417,7 @@ class SessionSequence:
         return None
 
     def _look(self) -> SessionEnd | None:
-        """Give this process's heartbeat and readings; see whether the others give theirs."""
+        """Give this process's heartbeat and readings; check whether the others give theirs."""
         self._show()
         violation = self._cycle.look(
             self._metronome.due_ns,

@@ -5,7 +5,7 @@ Words
     one writer. Access takes a fraction of a microsecond and never blocks, so the control loop may
     use them.
 Events
-    What the control process has to say, as fixed-size records in a ring of their own. The loop must
+    What the control process has to say, as fixed-size records in a separate ring. The loop must
     not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
     event into the file, the supervisor shows it to the operator.
 

@@ -29,7 +29,7 @@ class Clock(Protocol):
 class RealClock:
     """The system's monotonic clock.
 
-    Deadlines are absolute: the remainder is computed anew for each sleep, so that neither the
+    Deadlines are absolute: the remainder is recomputed for each sleep, so that neither the
     work of a tick nor a late wake-up adds up (a loop that sleeps "period minus work" drifts).
     ``time.sleep`` itself waits for an absolute time; calling the kernel's ``clock_nanosleep`` for
     the deadline wakes up no earlier (measured in alternation: medians of 24–31 µs either way).
@@ -119,7 +119,7 @@ def _clock_since_boot() -> Callable[[], int]:
 
 
 class TickScheduler:
-    """Absolute deadlines, one a period; a missed tick is skipped, never made up in a burst.
+    """Absolute deadlines, one per period; a missed tick is skipped, never made up in a burst.
 
     Parameters
     ----------

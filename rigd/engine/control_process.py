@@ -1,7 +1,7 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on.
 
 It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
-the supervisor requests, one after the other. A device that fails ends it: connecting anew is the
+the supervisor requests, one after the other. A device that fails ends it: reconnecting is the
 operator's decision.
 """
 
@@ -230,7 +230,7 @@ class _Attendance:
             self._silent = self._silent + 1 if cycle.stale else 0
         if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; see whether the device "
+                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; check that the device "
                 "is on and connected."
             )
 

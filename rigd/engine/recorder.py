@@ -187,7 +187,11 @@ class Recorder:
             "lost": scheduled - accounted,
         }
         if counts["lost"] and outcome["outcome"] == "complete":
-            outcome = {**outcome, "outcome": "fault", "reason": "Samples were lost on their way."}
+            outcome = {
+                **outcome,
+                "outcome": "fault",
+                "reason": "Samples were lost before the recorder.",
+            }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
         path = self._writer.close(counted)
         return Closed(path, counts, outcome["outcome"], outcome["reason"])

@@ -31,7 +31,7 @@ def from_csv(
     path
         Either columns ``time_s`` and ``angle_rad`` (named in the first line, more columns are
         ignored; angles are interpolated linearly to the ticks, times counted from the first), or
-        a single column of angles in rad, one a tick, with or without the heading ``angle_rad``.
+        a single column of angles in rad, one per tick, with or without the heading ``angle_rad``.
     rate_hz
         Ticks a second.
     rest_s, ring_down_s
@@ -144,7 +144,7 @@ def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) 
     Raises
     ------
     ExcitationError
-        If it is no such file.
+        If the file is not of that kind.
     OSError
         If it cannot be opened.
     """

@@ -21,7 +21,7 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
 """Functions by the names that the command line and session files use."""
 
 FROM_THE_RIG = frozenset({"rate_hz", "rig"})
-"""Arguments that are no options: the rig's own data."""
+"""Arguments that are not options: the rig's own data."""
 
 
 def make_excitation(

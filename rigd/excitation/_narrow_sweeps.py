@@ -223,7 +223,7 @@ class Band:
 
     @classmethod
     def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Lay one round a mode, so many half-power widths to either side of where it may lie."""
+        """Lay one around a mode, so many half-power widths to either side of where it may lie."""
         half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(

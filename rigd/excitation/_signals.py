@@ -12,7 +12,7 @@ from rigd.errors import UserError
 FloatArray = NDArray[np.float64]
 
 SAMPLES_PER_PERIOD = 4
-"""Fewest samples in a period of the reference: with less it is no sine any more."""
+"""Fewest samples in a period of the reference: with less it is not a sine any more."""
 
 MAX_TICKS = 7_200_000
 """Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
@@ -75,7 +75,7 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
 
 
 def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
-    """Return a time as its number of ticks; refuse one that is no whole number of them."""
+    """Return a time as its number of ticks; refuse one that is not a whole number of them."""
     ticks = round(value_s * rate_hz)
     if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
         raise ExcitationError(
@@ -115,7 +115,7 @@ def within_a_turn(option: str, value_rad: float) -> None:
 
 
 def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
-    """Refuse a frequency that is not above 0, or has too few samples a period."""
+    """Refuse a frequency that is not above 0, or has too few samples per period."""
     finite(option, value, "Hz")
     highest = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
@@ -123,7 +123,7 @@ def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool =
         raise ExcitationError(f"{option} = {value:g} Hz {bound}.")
     if value > highest:
         raise ExcitationError(
-            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples a period at "
+            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
             f"{rate_hz:g} Hz; choose at most {highest:g} Hz."
         )
 
@@ -305,7 +305,7 @@ def step(
     finite("amplitude_rad", amplitude_rad, "rad")
     if amplitude_rad == 0.0:
         raise ExcitationError(
-            "amplitude_rad = 0 rad is no step; give an angle other than zero, or use hold."
+            "amplitude_rad = 0 rad is not a step; give an angle other than zero, or use hold."
         )
     within_a_turn("amplitude_rad", amplitude_rad)
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)

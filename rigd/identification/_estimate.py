@@ -93,7 +93,7 @@ def moments(stack: Stack, timing: Timing, delay_s: float, scale: float, unknowns
     age_s = timing.angle_delay_s - timing.torque_delay_s
     y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
 
-    # A command stands for a period: its middle, and the integral over the period round it.
+    # A command stands for a period: its middle, and the integral over the period around it.
     middle_s = delay_s + 0.5 * period_s
     w, w1, _ = _test_window(tick_s + middle_s, length_s)
     held = np.sinc(omega * period_s / (2.0 * pi))
@@ -382,7 +382,7 @@ def estimate_motor(
     if found is None:
         raise EstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
-            "Look at actuation.delay_s of the profile, from which the search begins, and at the "
+            "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
     values, stds = found.values, found.stds
@@ -390,7 +390,7 @@ def estimate_motor(
     if inertia <= 0.0:
         raise EstimateError(
             f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
-            "motor's own motion. Look at sensor.projection, encoder.delay_s and sensor.delay_s."
+            "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
     jump = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
     sampled_s = jump / timing.rate_hz / sqrt(12.0)

@@ -185,7 +185,7 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
 
 
 def read_layout(metadata: Mapping[str, str]) -> Layout | None:
-    """Return the layout that a session's metadata state; None if it is no such session."""
+    """Return the layout stated in the metadata of a session; None for any other session."""
     if metadata.get("excitation") not in TOP_HZ:
         return None
     try:

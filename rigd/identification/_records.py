@@ -72,7 +72,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         raise EstimateError("No session file is given.")
     if all(window.top_hz == TOP_HZ[SPEEDS] for window in windows):
         raise EstimateError(
-            "Constant speeds alone do not tell inertia, delay and the torque's scale; give the "
+            "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."
         )
     return Recording(windows, *first, unusable)
@@ -83,8 +83,8 @@ def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[Window]
     layout = read_layout(session.metadata)
     if layout is None:
         raise EstimateError(
-            f"{session.path}: was not recorded by rigd identify motor, so its passes are not "
-            "known; give the files that it named."
+            f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
+            "give the files that it wrote."
         )
     kind = session.metadata["excitation"]
     samples = session.samples

@@ -1,6 +1,6 @@
 """Index of a folder of sessions: an SQLite file beside them, a table of one row per session.
 
-It is a cache. Each row carries the stamp of the files that it was made from, and is made anew when
+It is a cache. Each row carries the stamp of the files that it was made from, and is rebuilt when
 that differs; an index that cannot be read, written or understood is done without. Several programs
 may use it at once: each writes in one transaction, and what another one has overwritten or removed
 is noticed by its stamp the next time.
@@ -24,7 +24,7 @@ INDEX_NAME: Final = "library.sqlite"
 
 _APPLICATION: Final = 0x72696764  # "rigd"
 _VERSION: Final = 1
-"""Greater whenever the table, or what a row is made of, is another: older indexes are made anew."""
+"""Greater whenever the table, or what a row is made of, is another: older indexes are rebuilt."""
 _HEADER: Final = b"SQLite format 3\0"
 _APPLICATION_PLACE: Final = slice(68, 72)
 _PATIENCE_S: Final = 2.0
@@ -88,7 +88,7 @@ class Index:
                     return {}
                 columns = ", ".join(("file", "stamp", *_READ))
                 for file, stamp, *values in database.execute(f"SELECT {columns} FROM sessions"):
-                    with contextlib.suppress(ValueError, TypeError):  # it is made anew
+                    with contextlib.suppress(ValueError, TypeError):  # it is rebuilt
                         rows[file] = stamp, self._row(file, dict(zip(_READ, values, strict=True)))
         except sqlite3.Error:  # locked for long, or damaged
             return {}
@@ -201,7 +201,7 @@ def _iso(utc_ns: int) -> str | None:
 
 
 def _storable(file: str) -> bool:
-    """Tell whether a name is text; any other is read anew each time."""
+    """Tell whether a name is text; any other is read again each time."""
     try:
         file.encode()
     except UnicodeEncodeError:

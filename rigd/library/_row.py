@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.session import modes_of, read_look
 
 SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
-LOOK_SUFFIX: Final = ".look.json"
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
 """Name of the folder of a report: of which session, and which of its reports."""
 PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
 _MOST_JSON_BYTES: Final = 8 << 20
-_MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_META: Final = 100
 _MOST_DIGITS: Final = 18
@@ -164,7 +163,7 @@ def _text(values: Mapping[str, str], key: str) -> str:
 
 def _count(values: Mapping[str, str], key: str) -> int | None:
     text = values.get(key, "")
-    # More digits are no count, and no 64 bits hold them.
+    # More digits are not a count, and no 64 bits hold them.
     countable = text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS + 1
     return int(text) if countable and int(text) < 2**63 else None
 
@@ -186,12 +185,13 @@ def _modes(look: Path | None, report: Path | None) -> tuple[Mode, ...]:
         for headline in _list(_document(report / NUMBERS), "headlines"):
             if modes := usable_modes(_list(headline, "modes")):
                 return modes
-    return usable_modes(_list(_document(look), "modes"))
+    found = None if look is None else read_look(look)
+    return () if found is None else usable_modes(found["modes"])
 
 
-def _document(path: Path | None) -> object:
+def _document(path: Path) -> object:
     try:
-        if path is None or path.stat().st_size > _MOST_JSON_BYTES:
+        if path.stat().st_size > _MOST_JSON_BYTES:
             return None
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):  # a result less, no session less
@@ -203,36 +203,14 @@ def _list(document: object, key: str) -> list[object]:
     return found if isinstance(found, list) else []
 
 
-def usable_modes(modes: list[object]) -> tuple[Mode, ...]:
+def usable_modes(modes: object) -> tuple[Mode, ...]:
     """Return the modes of a list that the record shows, if their numbers are finite."""
-    found = []
-    for mode in modes[:_MOST_MODES]:
-        if isinstance(mode, dict) and mode.get("shown") is not False:
-            frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
-            if frequency is not None and frequency["value"] > 0 and damping is not None:
-                found.append({"frequency_hz": frequency, "damping_ratio": damping})
-    return tuple(found)
+    return tuple(
+        {name: mode[name] for name in ("frequency_hz", "damping_ratio")}
+        for mode in modes_of(modes)
+        if mode["shown"]
+    )
 
 
-def _quantity(document: object) -> dict[str, Any] | None:
-    if not isinstance(document, dict) or (value := _finite(document.get("value"))) is None:
-        return None
-    ends = document.get("interval_95")
-    interval = [_finite(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
-    flag = document.get("flag")
-    return {
-        "value": value,
-        "std": _finite(document.get("std")),
-        "interval_95": None if interval is None or None in interval else interval,
-        "flag": _cut(flag) if isinstance(flag, str) else None,
-    }
-
-
-def _finite(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if isfinite(number) else None
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None

@@ -9,7 +9,6 @@ from typing import Final
 from rigd.errors import UserError
 from rigd.library._index import Index, Stamped
 from rigd.library._row import (
-    LOOK_SUFFIX,
     NUMBERS,
     PAGE,
     REPORT_FOLDER,
@@ -18,6 +17,7 @@ from rigd.library._row import (
     SessionRow,
     read_row,
 )
+from rigd.session import LOOK_SUFFIX
 
 _NS_PER_S: Final = 1_000_000_000
 _DATE_CHARACTERS: Final = len("2026-11-20")
@@ -42,8 +42,8 @@ def list_sessions(
     """List the sessions of a folder, the newest first.
 
     Files are read where they are new or have changed, by their size and time, and the index of the
-    folder is brought up to date if it can be written. Torn and foreign files are listed with their
-    problem. Folders inside the folder are not looked into.
+    folder is updated if it can be written. Incomplete and foreign files are listed with the
+    reason. Subfolders are not searched.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def _moment_ns(given: str | datetime | None, name: str) -> int | None:
         return int(moment.timestamp()) * _NS_PER_S + moment.microsecond * 1000
     except (ValueError, OverflowError, OSError):
         raise LibraryError(
-            f"{name} = {str(given)[:40]!r} is no date; give one as 2026-11-20 or 2026-11-20T14:30."
+            f"{name} = {str(given)[:40]!r} is not a date; write 2026-11-20 or 2026-11-20T14:30."
         ) from None
 
 
@@ -182,7 +182,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
     Raises
     ------
     LibraryError
-        If it is no folder, or cannot be read.
+        If it is not a folder, or cannot be read.
     """
     found: dict[str, _Found] = {}
     looks: dict[str, Path] = {}

@@ -10,6 +10,9 @@ from rigd.library._row import SessionRow
 _SAME_MODE: Final = log(1.25)
 """Largest ratio of two frequencies that may be one mode's; a beam's modes are further apart."""
 
+_SIGNIFICANT: Final = 3.0 / 1.96
+"""Half-widths of a 95 % interval in three standard deviations."""
+
 Quantity = Mapping[str, Any]
 """Number of a mode: ``value``, ``std``, ``interval_95``, ``flag``."""
 
@@ -20,8 +23,8 @@ class Change:
 
     difference: float
     """Later less earlier, in the unit of the quantity."""
-    beyond_intervals: bool | None
-    """Whether it is beyond what both 95 % intervals allow; None if that cannot be told: an interval
+    significant: bool | None
+    """Whether it is larger than three standard deviations; None if that cannot be told: an interval
     is not known, or a quantity is flagged."""
 
 
@@ -82,13 +85,14 @@ def change_between(before: Quantity, after: Quantity) -> Change:
     -----
     Both errors are independent, so that the difference has a 95 % interval whose half-width is
     the root of the sum of the squared half-widths; of each interval that half counts which faces
-    the other value.
+    the other value. A change is significant beyond three standard deviations, 1.53 times that: two
+    sessions have six such changes and a trend many more, and 95 % would call one in twenty real.
 
     Examples
     --------
     >>> from rigd.library import change_between
     >>> before = {"value": 2.60, "interval_95": [2.59, 2.61]}
-    >>> change_between(before, {"value": 2.63, "interval_95": [2.62, 2.64]}).beyond_intervals
+    >>> change_between(before, {"value": 2.63, "interval_95": [2.62, 2.64]}).significant
     True
     """
     difference = after["value"] - before["value"]
@@ -96,7 +100,7 @@ def change_between(before: Quantity, after: Quantity) -> Change:
         return Change(difference, None)
     low, high = (before, after) if difference >= 0 else (after, before)
     allowed = hypot(low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0])
-    return Change(difference, abs(difference) > allowed)
+    return Change(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
 
 
 def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
@@ -144,4 +148,4 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
 def _document(change: Change | None) -> dict[str, Any] | None:
     if change is None:
         return None
-    return {"difference": change.difference, "beyond_intervals": change.beyond_intervals}
+    return {"difference": change.difference, "significant": change.significant}

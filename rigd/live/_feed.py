@@ -54,7 +54,7 @@ class Feed:
         self.stalled = False
 
     def begin(self, recording_id: str, frame: "Callable[[], Iterable[Drawing]]") -> None:
-        """Send to a recording of its own from now on.
+        """Send to a new recording from now on.
 
         Parameters
         ----------

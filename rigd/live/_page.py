@@ -74,7 +74,7 @@ _AGAIN: Final = """
 
 
 class PageServer:
-    """Serves the page to browsers on this computer, in threads of its own.
+    """Serves the page to browsers on this computer, in separate threads.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
         split = urllib.parse.urlsplit(self.path)
         name, address = split.path.lstrip("/"), self.server.address()
         if name not in _FILES:
-            self._say(HTTPStatus.NOT_FOUND, "There is nothing of that name here.")
+            self._say(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
             self._come_again()
         elif name == _STATE:

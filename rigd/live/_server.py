@@ -1,6 +1,6 @@
 """Server of the live view: takes what the publisher sends, and passes it on to any viewers.
 
-It is a process of its own because a viewer that is slow or frozen then holds nobody up, and because
+It is a separate process because a viewer that is slow or frozen then holds nobody up, and because
 the SDK's own server listens on every interface. Viewers connect to it without any authentication,
 so it must never be reachable from another machine.
 """

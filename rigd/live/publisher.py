@@ -7,12 +7,11 @@ what could be shown. The process ends when its standard input does, and takes th
 """
 
 import collections
-import json
 import os
 import signal
 import time
 from collections.abc import Iterable
-from pathlib import Path
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -33,9 +32,8 @@ from rigd.live._feed import Feed
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown
 from rigd.live._server import Outlet
-from rigd.printable import printable
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import look_path
+from rigd.session import last_look, look_path, read_look
 from rigd.view import (
     RETURNING,
     RUNNING,
@@ -257,15 +255,12 @@ class _Shown:
         """Add the text of the quick look to the events, once there is one."""
         if self._look is None:
             return
-        try:
-            lines = [str(line) for line in json.loads(self._look.read_text("utf-8"))["text"]]
-        except FileNotFoundError:
+        look = read_look(self._look)
+        if look is None:
             return
-        except (OSError, ValueError, KeyError, TypeError):
-            lines = []
         self._look = None
         picture, t_ns = self.intake.picture, self.intake.t_ns
-        self.backlog.owe(picture.events([Note(t_ns, "info", printable(line)) for line in lines]))
+        self.backlog.owe(picture.events([Note(t_ns, "info", line) for line in look["text"]]))
 
     def send(self, feed: Feed, *, connected: bool) -> None:
         """Send what waits; if newly `connected`, with the frame of the scene."""
@@ -356,9 +351,6 @@ class Backlog:
 
 # Response of the last session
 
-_MOST_LOOKS: Final = 50
-"""Quick looks among which one of the specimen is searched, from the newest on."""
-
 
 def last_response(session: "LiveSession", own: LastResponse | None) -> LastResponse | None:
     """Return the response of the last session of the same specimen.
@@ -378,32 +370,19 @@ def last_response(session: "LiveSession", own: LastResponse | None) -> LastRespo
         own = None
     if session.folder is None:
         return own
-    looks = sorted(session.folder.glob("*.look.json"), reverse=True)
-    for path in looks[:_MOST_LOOKS]:
-        name = path.name.partition(".")[0]
-        if own is not None and name < own.session:
-            break
-        if name != session.subject.name and (found := _of_look(path, name, specimen)) is not None:
-            return found
-    return own
-
-
-def _of_look(path: Path, name: str, specimen: str) -> LastResponse | None:
-    """Return the response of a quick look; None if it has none, or is of another specimen."""
-    try:
-        look = json.loads(path.read_text("utf-8"))
-        if (look["specimen"] or "") != specimen:
-            return None
-        frequency_hz, magnitude, phase_rad = (
-            np.array(look["response"][key], np.float64)
-            for key in ("frequency_hz", "magnitude", "phase_rad")
-        )
-        response = magnitude * np.exp(1j * phase_rad)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    if frequency_hz.ndim != 1 or response.shape != frequency_hz.shape:
-        return None
-    return LastResponse(name, specimen, frequency_hz, response)
+    found = last_look(
+        session.folder, specimen, but=session.subject.name, usable=itemgetter("response")
+    )
+    if found is None:
+        return own
+    path, look = found
+    # Names of session files begin with their time.
+    if own is not None and path.stem < own.session:
+        return own
+    frequency_hz, magnitude, phase_rad = (
+        np.array(look["response"][key]) for key in ("frequency_hz", "magnitude", "phase_rad")
+    )
+    return LastResponse(path.stem, specimen, frequency_hz, magnitude * np.exp(1j * phase_rad))
 
 
 # State and health of a session

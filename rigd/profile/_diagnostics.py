@@ -35,7 +35,7 @@ _JUMP_FACTOR = 100.0
 _NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 
 _FIRST_MODE_HZ = 0.1, 100.0
-"""First mode of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+"""First mode of the undamped beam: outside it a unit is wrong or the antenna unsuitable."""
 
 
 _PER_MILLE_LIMIT = 32.767
@@ -81,7 +81,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     if asked < peak:
         yield (
             f"limits.torque_command_nm = {asked:g} N·m is below motor.peak_torque_nm = {peak:g} "
-            "N·m, where commands are cut; what the controller may ask for has to be more."
+            "N·m, where commands saturate; the controller's command limit must be higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
     if stop <= angle:
@@ -95,7 +95,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     if drift < warning:
         yield (
             f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
-            f"session.tare_drift_nm = {warning:g} N·m, which warns; it has to be the greater one."
+            f"session.tare_drift_nm = {warning:g} N·m, which warns; it must be the greater one."
         )
     yield from first_mode(values)
     if not any(values["sensor.projection"]):

@@ -57,7 +57,7 @@ QUESTIONS = (
     Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
 )
 """Friction and delay are not asked for: rigd identify motor measures them."""
-_OTHER = "What stood here was of another drive."
+_OTHER = "The previous value was of another drive."
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
@@ -296,7 +296,7 @@ class Draft:
             "  paper      printed in the paper (antenna, damping, encoder)",
             "  datasheet  told by the drive's file, or typed in from a data sheet",
             "  measured   on a rig or a computer, as said beside it",
-            "  assumed    of the profile started from: look at those marked TO FILL IN first",
+            "  assumed    of the profile started from: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(
                 ["", "Of this drive:", *(f"* {doubt}" for doubt in self.doubts)]

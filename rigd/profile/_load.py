@@ -71,7 +71,7 @@ def read_text(path: Path) -> str:
     Raises
     ------
     ProfileError
-        If it cannot be read, or is no text.
+        If it cannot be read, or is not text.
     """
     try:
         return path.read_bytes().decode("utf-8")
@@ -192,8 +192,8 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
     values["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
-            f'cia402.eds = "{given}": there is no file {eds}; give its path, from the profile\'s '
-            "folder on, or remove the key."
+            f'cia402.eds = "{given}": there is no file {eds}; give its path, relative to the '
+            "profile's folder, or remove the key."
         )
 
 
@@ -228,7 +228,7 @@ def _is_number(key: str) -> bool:
 
 
 def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys; a table that is no known section and has a value is a number."""
+    """Yield dotted keys; a table that is not a known section and has a value is a number."""
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (

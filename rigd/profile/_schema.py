@@ -29,7 +29,7 @@ from rigd.safety import Limits
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """Settings round a record: taring before it, the way back and the check after it."""
+    """Settings around a record: taring before it, the way back and the check after it."""
 
     tare_s: Annotated[float, Ge(0.5), Le(60)]
     """Time at rest over which the sensor is averaged."""
@@ -191,7 +191,7 @@ def fields_of(section: str) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Specimen:
-    """One specimen, as a file of its own describes it."""
+    """One specimen, as its own file describes it."""
 
     name: str
     """Name of the file without ``.toml``, by which sessions name the specimen."""
@@ -228,7 +228,7 @@ class Profile:
     limits: Limits
     """Levels that end a session."""
     session: SessionSettings
-    """Settings round a record."""
+    """Settings around a record."""
     realtime: RealtimeSettings
     """What its processes ask of the operating system."""
     metadata: MetadataSettings

@@ -1,4 +1,4 @@
-"""Specimens in files of their own: ``specimens/NAME.toml``, with the beam as a profile has it."""
+"""Specimens in their own files: ``specimens/NAME.toml``, with the beam as a profile has it."""
 
 from dataclasses import replace
 from pathlib import Path

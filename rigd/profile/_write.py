@@ -79,14 +79,14 @@ def check_new(path: Path) -> None:
     Raises
     ------
     ProfileError
-        If there is a file, no folder for it, or its name is no profile's.
+        If there is a file, no folder for it, or its name is not a profile's.
     """
     if path.suffix != ".toml":
         raise ProfileError(f"{path}: the name of a profile ends in .toml.")
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
-        raise ProfileError(f"{path}: there is no folder {path.parent}; make it first.")
+        raise ProfileError(f"{path}: there is no folder {path.parent}; create it first.")
 
 
 def write_new(path: Path, text: str) -> None:
@@ -129,7 +129,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
     Raises
     ------
     ProfileError
-        If there is such a file, it cannot be written, or the name is no profile's.
+        If there is such a file, it cannot be written, or the name is not a profile's.
     """
     settings = [] if name is None else [Setting("name", name)]
     drive = profile.rig.cia402
@@ -154,7 +154,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
 
 
 def _taken(path: Path) -> ProfileError:
-    return ProfileError(f"{path}: is there already and is left as it is; name another file.")
+    return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
 def _places(lines: Sequence[str]) -> dict[str, int]:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rigd.engine import Phase
-from rigd.printable import BAR_STYLES, counts_text
+from rigd.printable import counts_text, progress_bar
 
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
@@ -65,25 +65,13 @@ def result_line(session: Mapping[str, Any]) -> str:
 class ProgressLine:
     """One line on standard error that says how far a session is, and messages above it.
 
-    It is written by a thread of its own: a terminal that was stopped (Ctrl-S), or a pipe that
+    It is written by a separate thread: a terminal that was stopped (Ctrl-S), or a pipe that
     nobody reads, must not keep the supervisor from its session.
     """
 
     def __init__(self) -> None:
-        # Only now: the processes of the session are on their way.
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-        from rich.theme import Theme
-
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:3.0f} %"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[counts]}"),
-            console=Console(stderr=True, theme=Theme(BAR_STYLES)),
-            transient=True,
-            auto_refresh=False,
+        self._progress = progress_bar(
+            "{task.percentage:3.0f} %", "{task.fields[counts]}", auto_refresh=False
         )
         self._task = self._progress.add_task("preparing", total=None, counts="")
         self._lock = threading.Lock()

@@ -228,7 +228,7 @@ def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
         looks.attend()
     if looks.busy and not skipped:
         _tell("The quick look took too long and was skipped.", err=True)
-    stop.requested = before  # what was skipped is no session
+    stop.requested = before  # what was skipped is not a session
 
 
 def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:

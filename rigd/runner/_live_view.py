@@ -79,7 +79,7 @@ class LiveView:
         # So that it is there from the first sample on; a session does not depend on it.
         self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
         if self._lost:
-            return f"No live view: {self._lost} The session goes on without it."
+            return f"No live view: {self._lost} The session continues without it."
         if self.address is None:
             return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
@@ -154,7 +154,7 @@ class LiveView:
                 self._lost = answer.reason if isinstance(answer, Failed) else str(answer)
                 self.address = None
                 if self._session is not None:
-                    self._note("warning", f"No live view: {self._lost} The session goes on.")
+                    self._note("warning", f"No live view: {self._lost} The session continues.")
 
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
@@ -167,9 +167,9 @@ class LiveView:
         self._restarts += 1
         if self._restarts > _MOST_RESTARTS:
             self._lost, self.address = why, None
-            self._note("warning", f"{why} It is not started again; the session goes on.")
+            self._note("warning", f"{why} It is not restarted; the session continues.")
             return
-        self._note("warning", f"{why} It is started again; the session goes on.")
+        self._note("warning", f"{why} It is restarted; the session continues.")
         self._crew[LIVE].kill()
         self._start()
 

@@ -162,9 +162,7 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
         largest_rad = largest_amplitude(profile, excitation, force=force)
         lower = "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
         refusals = [f"{finding}; {lower}." for finding in firm]
-        refusals += [
-            f"{finding}; {lower}, or let it be clipped with --force." for finding in forcible
-        ]
+        refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
     clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
     return Plan(
         prediction,
@@ -355,7 +353,7 @@ _KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class _Limited:
-    """A predicted peak and its limit; a peak that is no number violates it."""
+    """A predicted peak and its limit; a peak that is not a number violates it."""
 
     name: str
     value: float
@@ -410,7 +408,7 @@ def _limited(
 
 
 def _share(channels: tuple[_Limited, ...]) -> float:
-    """Return the largest share of a limit that a predicted peak takes; NaN if one is no number."""
+    """Return the largest predicted peak as a share of its limit; NaN if one is not a number."""
     shares = [channel.value / channel.limit for channel in channels]
     return math.nan if any(map(math.isnan, shares)) else max(shares)
 

@@ -1,12 +1,11 @@
 """Quick looks: a program that looks at each session that has ended, and never while one runs.
 
-The program is ``python -m analysis.quick_look``, a process of its own at the lowest priority. One
+The program is ``python -m analysis.quick_look``, a separate process at the lowest priority. One
 runs at a time. It is suspended before a session begins and goes on when that has ended; one that
 takes too long is killed, and all end with the process that started them.
 """
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -22,7 +21,7 @@ from typing import Any, Final
 from rigd.printable import printable
 from rigd.runner._session import SessionResult
 from rigd.runtime import SINGLE_THREADED
-from rigd.session import look_path
+from rigd.session import look_path, read_look
 
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0
@@ -31,7 +30,6 @@ _END_S: Final = 0.5
 """Longest wait, when this process ends, for a look that was killed."""
 _MOST_WAITING: Final = 3
 """Looks that wait; of more, the oldest is left out. Only sessions on each other's heels need it."""
-_MOST_BYTES: Final = 1_000_000
 _MOST_SAID: Final = 500
 
 
@@ -204,12 +202,8 @@ class QuickLooks:
 
     def _done(self) -> QuickLook:
         path = look_path(self._session)
-        try:
-            with path.open("rb") as file:
-                look = json.loads(file.read(_MOST_BYTES))
-            if not isinstance(look["text"], list):
-                raise TypeError
-        except (OSError, ValueError, TypeError, KeyError):
+        look = read_look(path)
+        if look is None:
             return QuickLook.failed(self._session, f"{path} cannot be read.")
         return QuickLook(self._session, path, look, "")
 

@@ -95,21 +95,22 @@ def load_rig(
     moving = reality(profile.rig)
     if hardware and moving is not WhatMoves.HARDWARE:
         raise RefusedError(
-            f"--hardware: {what_moves(profile.rig, moving)} Leave the option out, or end what "
-            "stands in for the hardware."
+            f"--hardware: {what_moves(profile.rig, moving)} Omit the option, or end the simulated "
+            "rig."
         )
     if moving is WhatMoves.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
     if fast and not moving.any_clock:
         raise RefusedError(
             f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
-            "skipped; leave the option out."
+            "skipped; omit the option."
             + (" Or start rigd simulate with --lock-step." if moving is WhatMoves.SIMULATOR else "")
         )
     if seed is not None:
         if moving is not WhatMoves.SIMULATED:
             raise RefusedError(
-                f"--seed: the noise of {moving.value} of {profile.path} is not made here; omit "
+                f"--seed: the noise of {moving.value} of {profile.path} is not simulated here; "
+                "omit "
                 "the option."
             )
         assert profile.rig.simulation is not None
@@ -137,7 +138,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
 
 
 def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
-    """See that a session is given all that its profile requires.
+    """Check that a session is given all that its profile requires.
 
     Parameters
     ----------
@@ -192,7 +193,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
-    """Make the folder, and see that a session fits on its disk and leaves room there.
+    """Make the folder, and check that a session fits on its disk and leaves room there.
 
     Parameters
     ----------
@@ -276,12 +277,12 @@ def what_is_kept(path: Path | None) -> str:
     from rigd.session import holds_samples
 
     if path is None:
-        return "There is no file of it."
+        return "It has no file."
     part = part_of(path)
     try:
         kept, whole = part.exists(), path.exists()
     except OSError as error:
-        return f"Its folder {path.parent} cannot be looked into ({error.strerror})."
+        return f"Its folder {path.parent} cannot be read ({error.strerror})."
     if not kept:
         return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
     if not holds_samples(part):
@@ -390,7 +391,7 @@ def software_commit() -> dict[str, str]:
 
 
 def _text(value: float | str) -> str:
-    # A file's name may be no text; nothing of it may keep the session from being written.
+    # A file's name may not be text; nothing of it may keep the session from being written.
     return (
         value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
     )

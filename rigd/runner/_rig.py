@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, WhatMoves, reset_drive
+from rigd.devices import DeviceError, WhatMoves
 from rigd.engine import (
     CONTROL,
     LIVE,
@@ -47,7 +47,7 @@ class RigError(FailureError):
 
 
 class Rig:
-    """The devices of one profile, in processes of their own.
+    """The devices of one profile, in separate processes.
 
     All but :meth:`status` is called from one thread.
 
@@ -210,7 +210,7 @@ class Rig:
         """
         crew = self._require()
         if self._view is None:
-            return "No live view was asked for."
+            return "No live view was requested."
         _wipe(crew.channels.board)
         return self._view.show(order, stop)
 
@@ -247,7 +247,7 @@ class Rig:
         return answer
 
     def watch(self) -> None:
-        """See whether the control process is well; call it some times a second between sessions.
+        """Check whether the control process is well; call it some times a second between sessions.
 
         Raises
         ------
@@ -287,7 +287,7 @@ class Rig:
     def signals(self) -> list[SignalBlock]:
         """Return what has come of the record since the last call, from any thread.
 
-        It begins with the first call, or anew where the last one is more than 1 s ago.
+        It begins with the first call, and again if the last one is more than 1 s ago.
         """
         with self._looking:
             crew = self._crew
@@ -318,6 +318,8 @@ class Rig:
 
     def _reset_fault(self, moving: WhatMoves | None) -> None:
         try:
+            from rigd.devices import reset_drive  # loads the drivers, which no other order needs
+
             reset_drive(self._profile.rig, moving)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None
@@ -355,7 +357,7 @@ class Rig:
         answer = self._crew.control.poll(patience_s)
         if answer is None:
             raise RigError(
-                f"The control process does not answer within {patience_s:g} s; see whether the "
+                f"The control process does not answer within {patience_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
         if isinstance(answer, Ended):

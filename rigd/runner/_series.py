@@ -66,7 +66,7 @@ class SessionRig(Protocol):
         """
 
     def watch(self) -> None:
-        """See whether the rig is well; called some times a second between sessions."""
+        """Check whether the rig is well; called some times a second between sessions."""
 
 
 class SeriesWatcher(Protocol):

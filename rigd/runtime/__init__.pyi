@@ -4,6 +4,9 @@ from ._addresses import answers as answers
 from ._addresses import file_name as file_name
 from ._addresses import read_address as read_address
 from ._addresses import started_at as started_at
+from ._background import end_with as end_with
+from ._background import give_way as give_way
+from ._background import killed_first as killed_first
 from ._folder import runtime_folder as runtime_folder
 from ._linear_algebra import SINGLE_THREADED as SINGLE_THREADED
 from ._linear_algebra import use_one_thread as use_one_thread
@@ -14,7 +17,6 @@ from ._locks import RigLock as RigLock
 from ._signals import StopRequest as StopRequest
 from ._signals import held_back as held_back
 from ._signals import ignore as ignore
-from ._signals import killed_first as killed_first
 from ._signals import let_pass as let_pass
 from ._signals import raise_on as raise_on
 from ._signals import signal_when_orphaned as signal_when_orphaned

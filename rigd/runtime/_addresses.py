@@ -87,7 +87,7 @@ def answers(path: str | Path) -> bool:
             probe.connect(os.fspath(path))
         except (BlockingIOError, TimeoutError):
             return True  # its queue is full
-        except (OSError, ValueError):  # the latter where it can be no path
+        except (OSError, ValueError):  # the latter where it is not a path
             return False
     return True
 

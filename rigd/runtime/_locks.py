@@ -84,7 +84,7 @@ class HeldFile:
         fd = os.open(self.path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
-            raise OSError(errno.EINVAL, f"{self.path.name} there is no plain file")
+            raise OSError(errno.EINVAL, f"{self.path.name} there is not a plain file")
         return fd
 
 

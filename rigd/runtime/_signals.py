@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 from typing import Final, NoReturn
 
@@ -77,15 +76,6 @@ def signal_when_orphaned(number: int) -> None:
     """
     with contextlib.suppress(AttributeError):  # Linux has it, others do without
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-
-
-def killed_first() -> None:
-    """Have the system kill this process before any other when memory runs out (OOM killer).
-
-    What it starts inherits that.
-    """
-    with contextlib.suppress(OSError):  # not on Linux
-        Path("/proc/self/oom_score_adj").write_text("1000")
 
 
 # In the processes of a rig

@@ -2,7 +2,7 @@
 
 Offers the table of interlocks (`INTERLOCKS`), the levels of a profile (`Limits`), and the check of
 every tick (`LimitWatch`), which the loop calls. The software stops a session that leaves its
-limits; it is no safety function. That is the wired STO of the drive (docs/safety.md).
+limits; it is not a safety function. That is the wired STO of the drive (docs/safety.md).
 """
 
 import lazy_loader as lazy

@@ -83,7 +83,7 @@ class Violation:
     --------
     >>> from rigd.safety import Violation
     >>> print(Violation("angle", 1.02, 1.0, "rad", key="limits.angle_rad"))
-    The angle of 1.02 rad exceeds its limit of 1 rad (limits.angle_rad).
+    Angle 1.02 rad exceeds limit 1 rad (limits.angle_rad).
     """
 
     channel: str
@@ -100,19 +100,17 @@ class Violation:
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
         remedy = f" {self.remedy}" if self.remedy else ""
+        told = f"{self.channel[0].upper()}{self.channel[1:]} {self.value:.4g} {self.unit}"
         if self.warning is not None:
+            side = "below" if self.below else "above"
             where = f", {self.key}" if self.key else ""
             return (
-                f"{self.channel[0].upper()}{self.channel[1:]} {self.value:.4g} {self.unit} "
-                f"{'below' if self.below else 'above'} warning level {self.warning:.4g} "
-                f"{self.unit} (limit {self.limit:.4g}{where}).{remedy}"
+                f"{told} {side} warning level {self.warning:.4g} {self.unit} "
+                f"(limit {self.limit:.4g}{where}).{remedy}"
             )
-        how = "is below" if self.below else "exceeds"
+        how = "below" if self.below else "exceeds"
         where = f" ({self.key})" if self.key else ""
-        return (
-            f"The {self.channel} of {self.value:.4g} {self.unit} {how} its limit of "
-            f"{self.limit:.4g} {self.unit}{where}.{remedy}"
-        )
+        return f"{told} {how} limit {self.limit:.4g} {self.unit}{where}.{remedy}"
 
 
 # Table of interlocks
@@ -196,7 +194,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "Look for what disturbed the loop, or lower the amplitude.",
+        "Find what disturbed the loop, or lower the amplitude.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -207,12 +205,12 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "See that nothing holds the beam, or lower the amplitude.",
+        "Check that nothing holds the beam, or lower the amplitude.",
         follows_missed_ticks=True,
     ),
     Interlock(
         "encoder jump",
-        "encoder's jump",
+        "encoder jump",
         "rad",
         "limits.acceleration_rad_s2",
         0.8,
@@ -223,13 +221,13 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "torque command",
-        "torque command of the controller",
+        "torque command",
         "N·m",
         "limits.torque_command_nm",
         "motor.peak_torque_nm",
         Checked.TICK,
         Action.FAULT,
-        "See that nothing holds the beam, and check the loop with rigd check.",
+        "Check that nothing holds the beam; check the loop with rigd check.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -250,7 +248,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "See that nothing holds or pulls the beam.",
+        "Check that nothing holds or pulls the beam.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -261,7 +259,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "See that nothing holds or pulls the beam, then look at the sensor's cable.",
+        "Check that nothing holds or pulls the beam, then check the sensor cable.",
     ),
     Interlock(
         "tare drift",
@@ -271,7 +269,7 @@ INTERLOCKS: Final = (
         "session.tare_drift_nm",
         Checked.REST,
         Action.FAULT,
-        "See that nothing leans on the beam and let the sensor warm up.",
+        "Check that nothing leans on the beam and let the sensor warm up.",
     ),
     Interlock(
         "stale angle",
@@ -281,7 +279,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "Look at drive, cable and bus.",
+        "Check drive, cable and bus.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -292,7 +290,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "Look at sensor, cable and line.",
+        "Check sensor, cable and line.",
         follows_missed_ticks=True,
     ),
     Interlock(
@@ -303,7 +301,7 @@ INTERLOCKS: Final = (
         0.5,
         Checked.TICK,
         Action.FAULT,
-        "Look at drive (inhibit time of its TPDO), cable and bus, or allow the replies more time "
+        "Check the drive (inhibit time of its TPDO), cable and bus, or allow the replies more time "
         "(acquisition.deadline_us).",
     ),
     Interlock(
@@ -314,7 +312,7 @@ INTERLOCKS: Final = (
         0.5,
         Checked.TICK,
         Action.FAULT,
-        "Look at sensor, cable and line, or allow the replies more time (acquisition.deadline_us).",
+        "Check sensor, cable and line, or allow the replies more time (acquisition.deadline_us).",
     ),
     Interlock(
         "missed ticks",
@@ -344,7 +342,7 @@ INTERLOCKS: Final = (
         None,
         Checked.DRIVE,
         Action.FAULT,
-        "Look at cable, termination and bit rate.",
+        "Check cable, termination and bit rate.",
     ),
     Interlock(
         "emergency message",
@@ -368,17 +366,17 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "recorder lag",
-        "recorder's lag",
+        "recorder backlog",
         "s",
         "limits.recorder_lag_s",
         0.5,
         Checked.LOOK,
         Action.FAULT,
-        "The disk is too slow, or the computer is overloaded: see what else writes to it.",
+        "The disk is too slow, or the computer is overloaded: check what else writes to it.",
     ),
     Interlock(
         "disk space",
-        "free space of the session's disk",
+        "free space on the session's disk",
         "MB",
         "limits.disk_free_mb",
         10.0,

@@ -11,7 +11,7 @@ LOOK_EVERY = 64
 
 SHARE_WINDOW_S = 10.0
 """Missed ticks and old readings are counted against at least this much time, so that one early
-burst is no fault."""
+burst is not a fault."""
 
 REARM_S = 1.0
 """How long a channel has to stay clear of its limit before it is announced as near it again."""

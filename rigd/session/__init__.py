@@ -3,7 +3,7 @@
 Offers the messages' byte layout (`SAMPLE_TYPES`, `pack_sample_into`, `Status`), the writer
 (`SessionWriter`), readers (`read_session`, `read_controls`, `read_timings`; `read_summary` without
 the samples), a description for people (`describe`), the rules of what users add to the metadata
-(`metadata_keys`), and the recovery of torn files (`recover`). It knows of no devices and no loop.
+(`metadata_keys`), and recovery (`recover`). It knows of no devices and no loop.
 Names are imported on first use, so that the control process, which packs messages only, does not
 pay for the rest.
 """

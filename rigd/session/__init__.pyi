@@ -14,11 +14,15 @@ from ._format import field_tag as field_tag
 from ._format import pack_control_into as pack_control_into
 from ._format import pack_sample_into as pack_sample_into
 from ._format import pack_timing_into as pack_timing_into
-from ._info import LOOK_SUFFIX as LOOK_SUFFIX
 from ._info import SessionInfo as SessionInfo
 from ._info import describe as describe
-from ._info import look_path as look_path
 from ._info import readable_texts as readable_texts
+from ._quick_look import LOOK_SUFFIX as LOOK_SUFFIX
+from ._quick_look import LOOK_VERSION as LOOK_VERSION
+from ._quick_look import last_look as last_look
+from ._quick_look import look_path as look_path
+from ._quick_look import modes_of as modes_of
+from ._quick_look import read_look as read_look
 from ._reader import Event as Event
 from ._reader import Session as Session
 from ._reader import check_beginning as check_beginning

@@ -362,7 +362,7 @@ def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
     Raises
     ------
     ValueError
-        If the length is no multiple of ``SAMPLE_SIZE`` or a tag byte is not the expected one.
+        If the length is not a multiple of ``SAMPLE_SIZE`` or a tag byte is not the expected one.
     """
     return _decode(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
 

@@ -16,8 +16,6 @@ from rigd.session._format import SessionError, Status
 from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
 from rigd.units import suffix_of, unit_of
 
-LOOK_SUFFIX: Final = ".look.json"
-"""Ending of the file of a quick look, in place of the session file's."""
 _RECOVERED: Final = "recovered_"
 _MOST_CHARACTERS: Final = 200_000
 _AROUND: Final = 120
@@ -133,19 +131,6 @@ class SessionInfo:
         ]
         width = min(max(len(key) for key, _ in rows), _WIDEST_KEY)
         return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
-
-
-def look_path(path: Path) -> Path:
-    """Return where the quick look at a session is, which is written beside its file.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from rigd.session import look_path
-    >>> print(look_path(Path("sessions/20261120-101500-chirp.mcap")))
-    sessions/20261120-101500-chirp.look.json
-    """
-    return path.with_suffix(LOOK_SUFFIX)
 
 
 def describe(path: str | PathLike[str]) -> SessionInfo:

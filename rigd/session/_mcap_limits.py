@@ -123,7 +123,7 @@ class Allowance:
         ):
             if amount > most:
                 raise McapError(
-                    "declares channels, schemas, metadata and attachments without end: more than "
+                    "declares channels, schemas, metadata and attachments without limit: more than "
                     f"{most >> 20} {of_what}{where}"
                 )
         if self._entries > MAX_ENTRIES:

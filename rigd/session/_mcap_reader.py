@@ -562,7 +562,7 @@ class _Reader:
                 found = self.contents.message_counts
                 counts = statistics.channel_message_counts
                 if any(found[channel] != count for channel, count in counts.items()):
-                    raise McapDamageError("has not the messages that its statistics count")
+                    raise McapDamageError("does not contain the messages that its statistics count")
 
     def _summary_records(self, start: int, footer: int) -> Iterator[tuple[int, memoryview]]:
         """Yield opcode and content of the summary's records."""

@@ -283,8 +283,8 @@ class MessageDecoder:
         if size > MAX_MESSAGE_BYTES:
             raise SessionError(
                 f"{self._path}: a message of {layout.topic} has {size} bytes, more than the "
-                f"{MAX_MESSAGE_BYTES} that are read. The writing program must write one sample "
-                "a message."
+                f"{MAX_MESSAGE_BYTES} that are read. The writing program must write one sample per "
+                "message."
             )
         if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
             wire = np.frombuffer(records, layout.record_dtype)["wire"]

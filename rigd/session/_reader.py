@@ -369,7 +369,7 @@ def _load(path: Path, topics: Sequence[str], take: Taker) -> McapContents:
 def no_session(path: Path) -> SessionError:
     """Return the error of an MCAP file without samples' channel."""
     return SessionError(
-        f"{path} is an MCAP file without the channel {SAMPLE_TOPIC}, so it is no session. "
+        f"{path} is an MCAP file without the channel {SAMPLE_TOPIC}, so it is not a session. "
         "Give a file that `rigd run` or a program following docs/session_format.md recorded."
     )
 
@@ -402,7 +402,7 @@ def load_contents(
 
 
 def check_beginning(path: Path) -> None:
-    """See that a file begins as session files do.
+    """Check that a file begins as session files do.
 
     Raises
     ------

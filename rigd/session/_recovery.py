@@ -1,4 +1,4 @@
-"""Recovery of damaged session files: what is intact of a torn one, made into a sound one.
+"""Recovery of damaged session files: the intact part of one is written to a valid file.
 
 Nothing is taken that is not proven: messages, channels and schemas stand in chunks with a checksum
 each, the records ``session`` and ``segments`` are taken from the copy in such a chunk, attachments
@@ -106,10 +106,11 @@ class Recovery:
     def lines(self) -> list[str]:
         """Return it as lines of text."""
         if self.path is None:
-            return [f"{self.source} is complete and sound; there is nothing to recover."]
+            return [f"{self.source} is complete and intact; there is nothing to recover."]
         if self.damage is None:
             return [
-                f"{self.path}: {self.source} is complete and sound, and was copied under this name."
+                f"{self.path}: {self.source} is complete and intact, and was copied under this "
+                "name."
             ]
         lines = [
             f"{self.path}: {self.samples} samples recovered from {self.source}, which "
@@ -141,7 +142,7 @@ def recover(
 
     Parameters
     ----------
-    path : a torn ``.part`` or a damaged session file
+    path : an incomplete ``.part`` or a damaged session file
     on_progress : called now and then with the share of the work that is done
 
     Raises
@@ -301,7 +302,7 @@ def remedy(path: Path, *, was_whole: bool) -> str:
         nothing = ", so there is nothing to recover"
         if was_whole:
             return f"{readable}{nothing}{again}."
-        return f"{readable}{nothing}. Copy it again if there is a whole one, or record it again."
+        return f"{readable}{nothing}. Copy it again if there is a complete one, or record it again."
     target = recovered_path(path)
     command = f"`rigd recover {shlex.quote(str(path))}`"
     if os.path.lexists(target):
@@ -601,7 +602,7 @@ class _Copy:
         return self._digest
 
     def _flush(self) -> None:
-        """Write a chunk, with an index made anew."""
+        """Write a chunk, with a rebuilt index."""
         if not self._runs:
             return
         data = b"".join(self._pieces)

@@ -38,7 +38,7 @@ class SessionSummary:
     """Metadata and counts of a session file."""
 
     metadata: dict[str, str]
-    """The record ``session``; empty if a torn file has lost it."""
+    """The record ``session``; empty if an incomplete file has lost it."""
     outcome: dict[str, str] | None
     """How the session ended; None if the file does not tell."""
     samples: int | None
@@ -55,7 +55,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     Raises
     ------
     SessionError
-        If the file cannot be read, or is no session.
+        If the file cannot be read, or is not a session.
 
     Examples
     --------
@@ -80,7 +80,7 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     elif contents is None:
         contents, recording = beginning, is_being_written(path)
         problem = (
-            "The session is being recorded." if recording else f"The file has no end; {remedy}."
+            "The session is being recorded." if recording else f"The file is incomplete; {remedy}."
         )
     sampled = SAMPLE_TOPIC in {channel.topic for channel in contents.channels.values()}
     if not sampled and not problem:

@@ -12,7 +12,7 @@ from rigd.errors import UserError
 from rigd.units import unit_of
 
 NOTES: Final = ("operator", "specimen", "note")
-"""Texts that have options and keys of their own."""
+"""Texts with separate options and keys."""
 META_PREFIX: Final = "meta_"
 """Begins the key in the record ``session``."""
 
@@ -27,7 +27,7 @@ class MetadataError(UserError, ValueError):
 
 
 def check_name(name: str) -> None:
-    """See that metadata may have a name.
+    """Check that metadata may have a name.
 
     Raises
     ------

@@ -120,7 +120,8 @@ class SessionWriter:
                 descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             except FileExistsError:
                 raise SessionExistsError(
-                    f"{self.part} exists: another session is being recorded to it or was cut off. "
+                    f"{self.part} exists: another session is being recorded to it or was "
+                    "interrupted. "
                     "Choose another name or move that file away; nothing is overwritten."
                 ) from None
             self._stream = os.fdopen(descriptor, "wb")
@@ -263,8 +264,8 @@ class SessionWriter:
                 rename_new(self.part, self.path)
             except FileExistsError:
                 raise SessionExistsError(
-                    f"{self.path} has appeared while the session was recorded and is not "
-                    f"overwritten; the complete session is {self.part}, to be renamed."
+                    f"{self.path} was created during the session and is not overwritten; the "
+                    f"complete session is {self.part}, to be renamed."
                 ) from None
             fsync_directory(self.path.parent)
         return self.path
@@ -311,8 +312,8 @@ class SessionWriter:
         """Notice that the file has gone from under its name; writing to it would still succeed."""
         if not self._is_in_place():
             raise SessionError(
-                f"{self.part} was removed or moved while it was recorded. Leave the folder of a "
-                "running session alone."
+                f"{self.part} was removed or moved while it was recorded. Do not change the folder "
+                "of a running session."
             )
 
     def _is_in_place(self) -> bool:

@@ -32,7 +32,7 @@ _MEAN_OF_PARABOLA = (23 / 12, -16 / 12, 5 / 12)
 
 
 class AirBrake:
-    """Air round a beam.
+    """Air around a beam.
 
     Parameters
     ----------

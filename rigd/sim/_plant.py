@@ -1,7 +1,7 @@
 """Physics of the simulated rig: motor, clamp and beam between two ticks.
 
 Motor and beam are one linear model, stepped exactly for torques that are constant between the
-instants at which commands arrive. Coulomb friction, saturation and delays stand round it. Nothing
+instants at which commands arrive. Coulomb friction, saturation and delays stand around it. Nothing
 here quantises or adds noise: that is what the simulated devices do with the values at a tick.
 """
 

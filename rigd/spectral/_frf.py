@@ -426,7 +426,7 @@ def welch_response(
         )
     bins = nfft // 2 + 1
     sums = CrossSpectra.of_nothing(bins)
-    # Held, because memory of this size is dear to get anew.
+    # Kept, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bins), dtype=np.complex128)
     # One segment at a time stays in the cache, which a whole batch does not.
     for k in range(count):

@@ -58,7 +58,7 @@ class RunningResponse:
     """H1 of a record that grows; at its end it is that of `welch_response`, to rounding.
 
     Whole segments are averaged as Welch does, each under a Hamming window. Until the end the newest
-    samples, as many as make a segment or as there are, count as one more with a window of its own
+    samples, as many as make a segment or as there are, count as one more with its own window
     length: so the response reaches as far as the record, not as the last whole segment.
 
     Parameters
@@ -180,7 +180,7 @@ class Segments:
     Parameters
     ----------
     channels : int
-        Values a tick.
+        Values per tick.
     length, hop : int
         Length of a segment, and distance from its start to the next one's, in ticks.
     longest_gap : int
@@ -398,7 +398,7 @@ class LowBins:
         kernel[:bins] = self._chirp[:bins].conj()
         kernel[size - length + 1 :] = self._chirp[length - 1 : 0 : -1].conj()
         self._kernel = np.fft.fft(kernel)
-        # Held, because memory of this size is dear to get anew.
+        # Kept, because allocating this much memory again is slow.
         self._work = np.empty(size, dtype=np.complex128)
         self._transform = np.empty(size, dtype=np.complex128)
 

@@ -1,4 +1,4 @@
-"""Builders for tests of devices, excitations and analyses of one's own.
+"""Builders for tests of your own devices, excitations and analyses.
 
 Offers a profile with other values than a shipped one (`write_profile`), records of a beam whose
 parameters are known (`chirp_signals`, `beam_torque`, `write_session`, with the paper's `PAPER_BEAM`

@@ -22,7 +22,7 @@ _START_UTC_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a session, one value a tick, and the segments they fall into.
+    """Signals of a session, one value per tick, and the segments they fall into.
 
     Attributes
     ----------

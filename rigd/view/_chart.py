@@ -487,24 +487,32 @@ class Thinning:
         values
             (n,) on the grid.
         """
-        grouped = values[self.groups]
-        unknown = np.isnan(grouped)
-        rows = np.flatnonzero(~unknown.all(axis=1))
+        rows, kept = self._extremes(values)
         if rows.size == 0:
             return []
-        grouped, unknown = grouped[rows], unknown[rows]
-        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-        pair = np.sort(np.stack([least, greatest], axis=1), axis=1)
-        kept = np.take_along_axis(self.groups[rows], pair, axis=1)
         breaks = np.flatnonzero(np.diff(rows) > 1) + 1
         return [
             np.column_stack([self.grid[part], values[part]])
-            for part in (_without_repeats(piece.ravel()) for piece in np.split(kept, breaks))
+            for part in map(np.unique, np.split(kept, breaks))
         ]
 
+    def extremes(self, values: Real) -> npt.NDArray[np.intp]:
+        """Return where the least and the greatest value of every group are, in order.
 
-def _without_repeats(indices: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Leave out what follows itself: where a group has but one point."""
-    kept: npt.NDArray[np.intp] = indices[np.insert(np.diff(indices) != 0, 0, True)]
-    return kept
+        Parameters
+        ----------
+        values
+            (n,) on the grid; NaN where they are not known.
+        """
+        return np.unique(self._extremes(values)[1])
+
+    def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+        """Return the groups in which anything is known, and the places of both extremes of each."""
+        grouped = values[self.groups]
+        unknown = np.isnan(grouped)
+        rows = np.flatnonzero(~unknown.all(axis=1))
+        grouped, unknown = grouped[rows], unknown[rows]
+        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
+        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
+        pair = np.stack([least, greatest], axis=1)
+        return rows, np.take_along_axis(self.groups[rows], pair, axis=1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.beam import Damping, transfer
+from rigd.beam import Beam, Damping, transfer
 from rigd.session import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
 from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
@@ -66,7 +66,7 @@ class SweepResponse:
             self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
             self._at_rest = []
         swept = samples[before:]
-        # What is held from an earlier tick is no measurement: the gap is filled like any other.
+        # What is held from an earlier tick is not a measurement: the gap is filled like any other.
         known = np.where(swept["status"] & _HELD, np.nan, 1.0)
         self._running.feed(
             ticks[before:],
@@ -177,8 +177,9 @@ class ResponseCharts:
     """
 
     def __init__(self, subject: "Subject", last: LastResponse | None = None) -> None:
-        frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
-        model = _measured_model(subject, frequency_hz, subject.damping or _FAINT)
+        frequency_hz, model = nominal_response(
+            subject.beam, subject.damping or _FAINT, subject.tool_inertia_kg_m2
+        )
         model_db = magnitude_db(model)
         magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         known = subject.damping is not None
@@ -198,7 +199,7 @@ class ResponseCharts:
             "input_delay_s": subject.angle_delay_s,
             "output_delay_s": subject.torque_delay_s,
         }
-        thinning = Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
+        thinning = response_thinning(frequency_hz)
         of_magnitude = thinning.strips(model_db)
         self._models = (
             {
@@ -247,7 +248,7 @@ class ResponseCharts:
         response = estimate.response.without_delays(**self._delays_s)
         grid = response.frequency_hz
         if self._thinning is None or self._thinning.grid.size != grid.size:
-            self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
+            self._thinning = response_thinning(grid)
         excited = estimate.excited
         self._t_ns = t_ns
         self._known = grid, np.where(excited, response.response, np.nan)
@@ -299,7 +300,7 @@ class ResponseCharts:
 
 def _curves_of(last: LastResponse, graphs: "Sequence[_Graph]") -> dict[str, Sequence[Real]]:
     """Return the curves of a response by the entities of the charts that show it."""
-    thinning = Thinning.logarithmic(last.frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
+    thinning = response_thinning(last.frequency_hz)
     return {
         graph.chart.entity: thinning.strips(graph.of_response(last.response))
         for graph in graphs
@@ -342,11 +343,37 @@ def _coherence(response: "FrequencyResponse") -> Real:
     return response.coherence
 
 
-def _measured_model(subject: "Subject", frequency_hz: Real, damping: Damping) -> Complex:
-    """Return what the sensor measures per angle of a beam so damped, in N·m/rad, (n,)."""
+def nominal_response(
+    beam: Beam, damping: Damping, tool_inertia_kg_m2: float
+) -> tuple[Real, Complex]:
+    """Return the response that the sensor would measure of a beam, in the band that is shown.
+
+    Parameters
+    ----------
+    beam, damping
+        The specimen.
+    tool_inertia_kg_m2
+        Inertia between sensor and beam.
+
+    Returns
+    -------
+    tuple of two arrays (n,)
+        Frequencies in Hz; torque over angle in N·m/rad, complex.
+    """
+    frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
     s = 2j * np.pi * frequency_hz
-    model: Complex = transfer(s, subject.beam, damping) + subject.tool_inertia_kg_m2 * s * s
-    return model
+    return frequency_hz, transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
+
+
+def response_thinning(frequency_hz: Real) -> Thinning:
+    """Return the groups of frequencies of which a response's extremes are shown.
+
+    Parameters
+    ----------
+    frequency_hz
+        (n,), increasing; what is outside of the band that is shown is left out.
+    """
+    return Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
@@ -454,7 +481,7 @@ class SpectrogramChart:
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
             left=width - _BAR - 24.0,
         )
-        # Row 0 is on top. Without the mean of the torque, which is no motion.
+        # Row 0 is on top. Without the mean of the torque, which is not a motion.
         self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
         self._filled = 0
         self._t_ns = 0

@@ -231,7 +231,7 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         overrides=visualizers,
         # The title says it all where there is but one curve.
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
-        # Left to itself it shows a minute round the cursor, half of it yet to come.
+        # Left to itself it shows a minute around the cursor, half of it yet to come.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
@@ -401,7 +401,7 @@ class _Axis:
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
         below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
-        # When either extreme leaves, it is seen anew what is missing.
+        # When either extreme leaves, what is missing is determined again.
         earlier_ns = min(low_ns, high_ns)
         added = []
         if above is not None and self._lacks(self._above, above, t_ns):

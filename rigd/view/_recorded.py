@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 
 _BLOCK_S: Final = 1.0
-"""Part of the session that is drawn at a time: as often as the charts are drawn anew."""
+"""Part of the session that is drawn at a time: as often as the charts are redrawn."""
 _MOST_SPAN: Final = 10
 """Ticks per sample: what lies between few samples would be made up, and fill the disk."""
 _LAST_UTC_NS: Final = 2**63 - 1

@@ -82,7 +82,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
 
 
 def check_new(path: Path) -> None:
-    """Raise RrdFileError if something has that name, or it is no name of such a file."""
+    """Raise RrdFileError if something has that name, or it is not a name of such a file."""
     if path.suffix != SUFFIX:
         raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
     try:
@@ -99,7 +99,7 @@ def check_new(path: Path) -> None:
 
 
 def check_rrd_file(path: Path) -> None:
-    """Raise RrdFileError if a file is no recording of Rerun's, as far as its beginning tells."""
+    """Raise RrdFileError if a file is not a Rerun recording, as far as its beginning tells."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
@@ -111,7 +111,7 @@ def check_rrd_file(path: Path) -> None:
         ) from None
     if found != _MAGIC:
         raise RrdFileError(
-            f"{path} is no recording of Rerun's, though its name says so. Give a session file "
+            f"{path} is not a Rerun recording, though its name says so. Give a session file "
             "(*.mcap), or what `rigd replay … --save` or `analyze … --rerun` wrote."
         )
 

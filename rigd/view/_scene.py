@@ -46,7 +46,7 @@ Drawing = Callable[["RecordingStream"], None]
 _BLOCK_S: Final = 0.1
 """Records are drawn in blocks of at least so much: what a block costs hardly grows with it."""
 _CHARTS_S: Final = 1.0
-"""Session time between drawings of the charts: a response is computed anew for each."""
+"""Session time between drawings of the charts: a response is recomputed for each."""
 _STEP_S: Final = 0.5
 """Time between columns of the spectrogram."""
 _MOST_NOTES: Final = 200

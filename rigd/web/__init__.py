@@ -1,4 +1,4 @@
-"""The operator's page: a server on loopback, in a process of its own beside the daemon.
+"""The operator's page: a server on loopback, in its own process beside the daemon.
 
 It speaks to the daemon by the public control socket only (docs/control_socket.md) and reads session
 files; loop, recorder and daemon do not depend on it. `run_page` is its program: `_server` puts the

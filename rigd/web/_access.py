@@ -183,7 +183,7 @@ def _refusal(request: web.Request) -> web.Response | None:
 
 
 def _name_of(host: str) -> str:
-    """Return the name in a Host header; empty if it is no plain name and port."""
+    """Return the name in a Host header; empty if it is not a plain name and port."""
     try:
         split = urlsplit(f"//{host}")
         port = split.port
@@ -222,7 +222,7 @@ class Connections:
         asyncio.get_running_loop().call_later(_LOOK_S, self.look_after)
 
     def welcome(self) -> asyncio.Protocol:
-        """Make the protocol of a new connection; the oldest that is no open page makes room."""
+        """Make the protocol of a new connection; the oldest that is not an open page makes room."""
         open_now = [
             (each, each.transport)
             for each in self.serving.connections

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.runtime import SINGLE_THREADED
+from rigd.runtime import SINGLE_THREADED, give_way
 
 Document = dict[str, Any]
 
@@ -24,20 +24,18 @@ MOST_JOBS: Final = 16
 _PROGRAM: Final = (sys.executable, "-P", "-m", "analysis")
 _MORTAL: Final = """
 import os, signal, sys
-from rigd.runtime import killed_first, signal_when_orphaned
+from rigd.runtime import end_with, killed_first
 
+end_with(int(sys.argv[1]))
 killed_first()
-signal_when_orphaned(signal.SIGKILL)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
-if os.getppid() == int(sys.argv[1]):
-    os.execv(sys.argv[2], sys.argv[2:])
+os.execv(sys.argv[2], sys.argv[2:])
 """
 """Program that becomes another one, which ends with the process that is named first, or if memory
 runs out."""
 _LOOK_S: Final = 0.2
 _MOST_SAID: Final = 1000
 _MOST_LINES: Final = 3
-_LOWEST_PRIORITY: Final = 19
 
 
 class JobError(Exception):
@@ -173,7 +171,7 @@ class Jobs:
             # page ends the system wakes and ends (SIGHUP) suspended groups of the same one only.
             process_group=0,
         )
-        _give_way(process.pid)
+        give_way(process.pid)
         ending = asyncio.create_task(process.communicate())
         stopped = False
         try:
@@ -193,13 +191,6 @@ class Jobs:
             words = said.decode(errors="replace").strip()[-_MOST_SAID:].splitlines()[-_MOST_LINES:]
             why = " ".join(words) or f"exit code {process.returncode}"
             raise JobError(f"The {job.kind} was not made: {why}")
-
-
-def _give_way(pid: int) -> None:
-    """Have a process, and what it starts, give way to everything else."""
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST_PRIORITY)
-        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _signal(group: int, number: int) -> None:

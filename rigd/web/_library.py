@@ -4,17 +4,18 @@ A session is named by its file's stem; no address of the page has a path in it.
 """
 
 import asyncio
-import json
 import re
 import tempfile
 from contextlib import suppress
-from math import isfinite
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
 from aiohttp import web
 
 from rigd.library import SessionRow, list_sessions
+from rigd.session import LOOK_SUFFIX, last_look, read_look
 from rigd.web._access import REPORT_POLICY, Access, object_of, refused
 from rigd.web._jobs import JobError, Jobs
 
@@ -24,7 +25,6 @@ _MOST_ROWS: Final = 1000
 _ROWS: Final = 50
 _MOST_IDS: Final = 100
 _MOST_CURVES: Final = 12
-_MOST_LOOK: Final = 4 << 20
 _FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
 _EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
 _REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
@@ -93,13 +93,14 @@ class Library:
         but
             The session that is left out: the one that runs.
         """
-        for row in await self.rows(specimen=specimen or None):
-            if row.id == but or row.specimen != specimen:
-                continue
-            if response := self._response_of(row.id):
-                where = {"type": "last", "path": str(row.path), "specimen": row.specimen}
-                return {**response, **where, "id": row.id}
-        return None
+        found = await asyncio.to_thread(
+            partial(last_look, self._folder, specimen, but=but, usable=itemgetter("response"))
+        )
+        if found is None:
+            return None
+        path, look = found
+        where = {"type": "last", "path": str(path), "specimen": specimen}
+        return {**look["response"], **where, "id": path.stem}
 
     # Rows
 
@@ -128,11 +129,11 @@ class Library:
             return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
         responses, errors = [], []
         for name in ids:
-            response = self._response_of(self._path(name).stem)
-            if response is None:
+            look = self._look_of(self._path(name).stem)
+            if look is None or look["response"] is None:
                 errors.append(f"{name}: there is no quick look of it, and so no response.")
             else:
-                responses.append({"id": name, **response})
+                responses.append({"id": name, "specimen": look["specimen"], **look["response"]})
         return web.json_response({"responses": responses, "errors": errors})
 
     # Downloads
@@ -263,28 +264,9 @@ class Library:
 
     def _look_of(self, name: str) -> Document | None:
         """Return the quick look of a session, if there is one that can be read."""
-        with suppress(OSError, ValueError, RecursionError, web.HTTPNotFound):
-            path = self._inside(f"{name}.look.json")
-            if path.stat().st_size <= _MOST_LOOK:
-                look = json.loads(
-                    path.read_bytes(), parse_constant=lambda _: None, parse_float=_finite
-                )
-                return look if isinstance(look, dict) else None
+        with suppress(web.HTTPNotFound):
+            return read_look(self._inside(f"{name}{LOOK_SUFFIX}"))
         return None
-
-    def _response_of(self, name: str) -> Document | None:
-        """Return the response of a quick look, with its specimen."""
-        look = self._look_of(name) or {}
-        response = look.get("response")
-        if not response or not isinstance(response, dict):
-            return None
-        return {"specimen": look.get("specimen"), **response}
-
-
-def _finite(text: str) -> float | None:
-    """Return a number of a file; None of 1e999, which JSON has no number for."""
-    number = float(text)
-    return number if isfinite(number) else None
 
 
 def _download_headers(name: str) -> dict[str, str]:
@@ -298,5 +280,5 @@ def _download_headers(name: str) -> dict[str, str]:
 
 def _whole(text: str, name: str) -> int:
     if not text.isdecimal() or len(text) > len(str(_MOST_ROWS)) + 3:
-        raise web.HTTPBadRequest(reason=f"{name} is no whole number.")
+        raise web.HTTPBadRequest(reason=f"{name} is not a whole number.")
     return int(text)

@@ -156,7 +156,7 @@ class DaemonLink:
     async def _follow(self) -> None:
         """Read what one connection brings, to its end."""
         reader, writer = await self._connect()
-        self._heard_s, self._ended = time.monotonic(), 0  # a new daemon counts anew
+        self._heard_s, self._ended = time.monotonic(), 0  # a new daemon counts from 0
         beside = [
             asyncio.create_task(self._keep_asking(writer)),
             asyncio.create_task(self._note_silence()),

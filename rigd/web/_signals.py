@@ -12,8 +12,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.beam import Beam, Damping, transfer
-from rigd.view import Subject, SweepResponse, Thinning
+from rigd.beam import Beam, Damping
+from rigd.view import (
+    LAST_HZ,
+    Subject,
+    SweepResponse,
+    Thinning,
+    nominal_response,
+    response_thinning,
+)
 
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
@@ -21,13 +28,8 @@ Real = npt.NDArray[np.float64]
 STRIP_S: Final = 0.05
 """Time that a point of a strip stands for."""
 _KEPT_S: Final = 10.0
-FIRST_HZ: Final = 0.5
-LAST_HZ: Final = 60.0
-_GROUPS: Final = 200
-"""Groups of frequencies of which the extremes are told: at most twice as many points."""
 _EVERY: Final = 4
 """Of `analyze`'s bins of 1/160 Hz: still more than two a segment's resolution of 1/17 Hz."""
-_MODEL_STEP_HZ: Final = 0.01
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
 _NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
@@ -187,9 +189,9 @@ class SessionResponse:
         )
         grid = response.frequency_hz
         if self._thinning is None:
-            self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
+            self._thinning = response_thinning(grid)
         shown = np.where(estimate.excited, response.response, np.nan)
-        kept = _extremes(self._thinning, np.abs(shown))
+        kept = self._thinning.extremes(np.abs(shown))
         coherence = None
         if response.coherence is not None:
             coherence = _known(np.round(response.coherence[kept], 4))
@@ -210,10 +212,8 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     """
-    grid = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
-    s = 2j * np.pi * grid
-    model = transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
-    kept = _extremes(Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS), np.abs(model))
+    grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
+    kept = response_thinning(grid).extremes(np.abs(model))
     return {"type": "nominal", **_curve(grid[kept], model[kept])}
 
 
@@ -223,16 +223,3 @@ def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document
         "magnitude": [float(f"{value:.4g}") for value in np.abs(response)],
         "phase_rad": np.round(np.angle(response), 4).tolist(),
     }
-
-
-def _extremes(thinning: Thinning, magnitude: Real) -> npt.NDArray[np.intp]:
-    """Return where each group's least and greatest magnitude are, without those not known."""
-    grouped = magnitude[thinning.groups]
-    unknown = np.isnan(grouped)
-    rows = ~unknown.all(axis=1)
-    grouped, unknown, groups = grouped[rows], unknown[rows], thinning.groups[rows]
-    least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-    greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-    places = np.stack((least, greatest), axis=1)
-    kept: npt.NDArray[np.intp] = np.unique(np.take_along_axis(groups, places, axis=1))
-    return kept

@@ -132,7 +132,7 @@ def test_a_scheduler_that_goes_away_is_told():
 
     with (
         processes,
-        pytest.raises(CampaignError, match="went away; look at its log"),
+        pytest.raises(CampaignError, match="went away; check its log"),
         dask_cluster(processes.scheduler_address) as workers,
     ):
         workers.run(until_it_is_gone, [(0,), (1,), (2,)], close)

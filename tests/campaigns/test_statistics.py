@@ -98,7 +98,7 @@ def test_the_paper_s_numbers_are_those_of_the_reference():
 def test_table_4_follows_from_table_3_s_means(truth):
     """The definition of the deviation, on the paper's own numbers; peaks read from its figures.
 
-    Parameters are printed with three digits and each session has peaks of its own, so not all can
+    Parameters are printed with three digits and each session has its own peaks, so not all can
     agree: 40 of 72 do within 0.1 rad/s or dB, 67 within 0.5.
     """
     link, _ = truth

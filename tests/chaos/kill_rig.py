@@ -247,7 +247,7 @@ class DriveLog:
 
 
 class Scene:
-    """A simulated rig and a session on it, in processes of their own."""
+    """A simulated rig and a session on it, in separate processes."""
 
     def __init__(self, folder: Path, *, live: bool, sweep_s: float, mode: str) -> None:
         self.folder = folder
@@ -301,7 +301,7 @@ class Scene:
         return self._start("serve", "--no-look", *self._where)
 
     def start_simulator(self) -> None:
-        """Start `rigd simulate`, with a log of its own."""
+        """Start `rigd simulate`, with its own log."""
         path = self.folder / f"drive-{time.monotonic_ns()}.jsonl"
         options = ["--lock-step"] if self.mode == "lock-step" else []
         self.simulator = self._start(
@@ -917,7 +917,7 @@ def main() -> int:
 
 
 def play_alone(case: Case, keep: Path | None) -> Verdict:
-    """Play a case in a folder of its own, of which only something wrong is kept.
+    """Play a case in its own folder, of which only something wrong is kept.
 
     Raises
     ------

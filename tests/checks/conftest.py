@@ -155,4 +155,4 @@ def stand_ins(monkeypatch):
 
 @pytest.fixture
 def silent():
-    return DeviceError("Drive: it does not answer; look at its supply.")
+    return DeviceError("Drive: it does not answer; check its supply.")

@@ -27,7 +27,7 @@ def rows_of(done):
 
 @pytest.fixture
 def profile_with(tmp_path):
-    """The shipped profile with lines of its own in the section of the drive."""
+    """The shipped profile with extra lines in the section of the drive."""
 
     def write(lines):
         path = tmp_path / "rig.toml"

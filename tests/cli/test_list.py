@@ -76,7 +76,7 @@ def test_json_has_rows_and_trends(listed):
     assert [row["id"] for row in told["sessions"]] == ["second", "first"]
     assert told["sessions"][0]["report"].endswith("second.report/report.html")
     change = told["trends"][0]["points"][1]["frequency_change"]
-    assert change == {"difference": pytest.approx(-0.03), "beyond_intervals": True}
+    assert change == {"difference": pytest.approx(-0.03), "significant": True}
 
 
 def test_specimens_are_listed_with_their_beams_and_problems(listed, tmp_path):

@@ -163,7 +163,7 @@ def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkey
     assert _follow(window, view) == 0
     assert window.connected == [2, 3, 3]
     said = capsys.readouterr().err
-    assert said.count("has ended; the window stays, and shows the next one") == 1
+    assert said.count("has ended; the window stays open and shows the next one") == 1
     assert said.count("The live view of sim has restarted.") == 2
 
 

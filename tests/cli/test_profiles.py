@@ -145,7 +145,7 @@ def test_no_file_is_overwritten(new, tmp_path):
     (tmp_path / "my_rig.toml").write_text("mine")
     done = new(eds_path("elmo_gold"))
     assert done.returncode == 2
-    assert "my_rig.toml: is there already and is left as it is" in done.stderr
+    assert "my_rig.toml: exists and is not overwritten" in done.stderr
     assert (tmp_path / "my_rig.toml").read_text() == "mine"
     (tmp_path / "link.toml").symlink_to("nowhere.toml")
     assert new(eds_path("elmo_gold"), output="link.toml").returncode == 2
@@ -315,7 +315,7 @@ def test_no_copy_takes_the_place_of_a_file(rigd_here, user_folder, tmp_path, opt
     (folder / "mine.toml").write_text("something else")
     done = rigd_here("profiles", "copy", "sim", "mine", *options)
     assert done.returncode == 2
-    assert "is there already and is left as it is" in done.stderr
+    assert "exists and is not overwritten" in done.stderr
     assert (folder / "mine.toml").read_text() == "something else"
 
 

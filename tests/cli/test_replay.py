@@ -396,7 +396,7 @@ def test_files_that_cannot_be_shown_are_told(rigd_here, short, write, tmp_path):
     refused(rigd_here("replay", quick, *out), 1, "rate_hz is 1e+09 Hz, but must be from 1 to")
     false = tmp_path / "false.rrd"
     false.write_text("no recording")
-    refused(rigd_here("replay", false, "--web"), 1, "no recording of Rerun's")
+    refused(rigd_here("replay", false, "--web"), 1, "is not a Rerun recording")
     refused(rigd_here("replay", tmp_path / "none.rrd", "--web"), 1, "none.rrd cannot be read")
     os.mkfifo(tmp_path / "pipe.rrd")
     refused(rigd_here("replay", tmp_path / "pipe.rrd", "--web"), 1, "pipe.rrd is not a file")

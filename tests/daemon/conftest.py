@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon._service import CommandError, Service
+from rigd.daemon._protocol import CommandError
+from rigd.daemon._service import Service
 from rigd.daemon._states import Peer, State
 from rigd.devices._registry import WhatMoves, open_devices
 from rigd.devices.contracts import DeviceError, Devices

@@ -11,7 +11,7 @@ from pathlib import Path
 from processes import eventually
 
 from rigd.daemon import background
-from rigd.daemon._service import CommandError
+from rigd.daemon._protocol import CommandError
 from rigd.runner import excitation_for, plan_session
 
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}

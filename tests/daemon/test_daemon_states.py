@@ -5,7 +5,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from rigd.daemon._service import CommandError
+from rigd.daemon._protocol import CommandError
 from rigd.daemon._states import Document, IllegalTransitionError, Peer, State, StateMachine
 from rigd.devices.contracts import DeviceError
 

@@ -1,4 +1,4 @@
-"""A client is newer than the daemon, which was not started anew after an update."""
+"""A client is newer than the daemon, which was not restarted after an update."""
 
 import json
 import socketserver

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from rigd.daemon import _protocol as protocol
-from rigd.daemon._service import CommandError
+from rigd.daemon._protocol import CommandError
 from rigd.daemon._states import Peer, State
 from rigd.devices._registry import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
@@ -298,7 +298,7 @@ def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
 
 
 def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(operated):
-    doubt = "Drive: it does not show that it is off; see that it is, by its STO if need be."
+    doubt = "Drive: it does not show that it is off; check that it is, by its STO if need be."
 
     def fail_both(drive):
         drive.off_doubt = doubt

@@ -231,7 +231,7 @@ def test_what_is_no_file_is_refused_and_never_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.eds")
     (tmp_path / "loop.eds").symlink_to("loop.eds")
     for name, words in {
-        "none.eds": "No such file", ".": "is a folder", "pipe.eds": "no ordinary file",
+        "none.eds": "No such file", ".": "is a folder", "pipe.eds": "not an ordinary file",
         "loop.eds": "cannot be read", "a\0b": "cannot be read",
     }.items():  # fmt: skip
         with pytest.raises(EdsError, match=words) as refused:

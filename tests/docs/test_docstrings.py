@@ -86,7 +86,7 @@ def complaints_on_class(cls):
         own = [name for name in fields if name in cls.__annotations__]
         missing = set(own) - {*found, *with_string(cls)}
         yield from (f"{each} is not described" for each in missing)
-        # A field without slots or default is no attribute of the class.
+        # A field without slots or default is not an attribute of the class.
         existing = {*fields, *dir(cls)}
         yield from (f"there is no {each}" for each in found if each not in existing)
     elif "__init__" in vars(cls) and not getattr(cls, "_is_protocol", False):

@@ -38,7 +38,8 @@ case "${0##*/} $*" in
     "rigd run chirp --fast --output sessions "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
     "rigd run modes "*) set -- "$@" --duration 20 --ring-down 3 ;;
-    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega ;;
+    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega --figures png ;;
+    "analyze "*) set -- "$@" --types VI --figures png ;;
 esac
 exec "FOLDER/${0##*/}" "$@"
 """
@@ -104,7 +105,7 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
 def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
     shells = [shell for shell in blocks("sh") if not of_one_session(shell)]
     assert len(shells) >= 6
-    # The one in real time waits most of its time: beside the others, as a rig of its own, and one
+    # The one in real time waits most of its time: beside the others, as a separate rig, and one
     # that bears a machine that stands still.
     (live,) = (shell for shell in shells if "--live" in shell)
     shells.remove(live)

@@ -194,7 +194,7 @@ def check(path: Path, *, ended: bool = False) -> tuple[int, str]:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a series of numbers, one a session, develops after the warm-up."""
+    """How a series of numbers, one per session, develops after the warm-up."""
 
     first: float
     """Median of the first third."""

@@ -302,7 +302,7 @@ def test_an_encoder_that_slips_in_a_session_loses_the_connection_and_so_the_zero
     session.drive.fault_at, session.drive.fault = 2000, lambda angle_rad: angle_rad + 0.05
     session.obey(Zero(), short(session), short(session))
     (finished,) = session.parent.said(Finished)
-    assert "encoder's jump of" in finished.reason
+    assert "ncoder jump " in finished.reason
     assert finished.device_failed is True
     assert len(session.parent.said(Ended)) == 1
     session.assert_safe()

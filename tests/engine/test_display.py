@@ -39,7 +39,7 @@ def shown(board, drive, sensor, *times_ns):
 def test_without_a_line_nothing_is_known_of_one(board):
     assert shown(board, Line(LineHealth()), Line(LineHealth()), 0, 10**9) == (-1, -1, -1)
     assert board[Word.ANGLE_NRAD] == 10**8
-    assert board[Word.COUPLING_TORQUE_NNM] == 0  # what is no number is not shown
+    assert board[Word.COUPLING_TORQUE_NNM] == 0  # what is not a number is not shown
     assert board[Word.CONTROL_BEAT] == 2
 
 

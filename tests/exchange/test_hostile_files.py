@@ -26,7 +26,7 @@ print(int(status["VmHWM"].split()[0]) // 1024)
 
 
 def refused(path, name):
-    """Read in a process of its own; return the message and the most memory it took, in MB."""
+    """Read in its own process; return the message and the most memory it took, in MB."""
     command = [sys.executable, "-c", READ, path, name]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     assert result.stderr == ""

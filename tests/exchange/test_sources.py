@@ -177,7 +177,7 @@ def test_matlab_integers_are_numbers(tmp_path):
         ("m#0", ("no channel 'm#0'",)),
         ("log", ("a struct", "log.angle")),
         ("log.b", ("no channel 'log.b'", "'log.angle'")),
-        ("m.b", ("no single struct",)),
+        ("m.b", ("is not one struct",)),
         ("text", ("real numbers",)),
         ("cell", ("real numbers",)),
         ("imaginary", ("is complex", "frequency response")),

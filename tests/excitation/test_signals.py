@@ -170,7 +170,7 @@ def test_files_that_cannot_be_read_are_named(tmp_path, content):
         (chirp, {"rest_s": -1.0}, "rest_s = -1 s must not be negative"),
         (chirp, {"ring_down_s": math.nan}, "ring_down_s = nan s is not a finite number"),
         (chirp, {"taper_s": 61.0}, "taper_s = 61 s at both ends does not fit"),
-        (step, {"amplitude_rad": 0.0}, "is no step"),
+        (step, {"amplitude_rad": 0.0}, "is not a step"),
         (step, {"amplitude_rad": math.inf}, "amplitude_rad = inf rad"),
         (hold, {"duration_s": 0.0}, "duration_s = 0 s must be more than 0 s"),
         (multisine, {"period_s": 7.0}, "is not a whole number of periods"),

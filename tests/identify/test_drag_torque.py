@@ -127,7 +127,7 @@ def test_a_small_drag_is_the_first_order(short):
 
 
 def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short):
-    """A fit's residual with another beam than that of the drag, against drag computed anew."""
+    """A fit's residual with another beam than that of the drag, against recomputed drag."""
     here, there = plant(), plant(gamma=0.0205, density=4.70015e-3, delay_s=5e-6)
     torque_nm = short.prediction.torque(there)[0]
     torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.kept]

@@ -38,7 +38,7 @@ def blade(share):
 
 @pytest.mark.parametrize(("share", "within"), [(0.05, 3e-6), (-0.3, 3e-5)])
 def test_frequency_and_damping_ratio_do_not_go_with_the_band(share, within):
-    """The second share asks for a negative inertia of the tool, which no rig has."""
+    """The second share asks for a negative tool inertia, which no rig has."""
     record = blade(share)
     for band_hz in ((0.0, 50.0), (2.0, 30.0)):
         (fit,) = fit_record(record, [STRUCTURES["VI"]], band_hz=band_hz).fits

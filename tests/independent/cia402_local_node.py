@@ -651,7 +651,7 @@ def main() -> int:
         network.send_message,
     )
     try:
-        # Drive and box are devices of their own, which no load of this computer slows down.
+        # Real drives and boxes are not slowed down by the load of this computer.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(70))
     except OSError:
         log.note("ordinary scheduling")

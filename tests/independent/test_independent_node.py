@@ -79,8 +79,9 @@ def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepte
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"x6502": (7, "ro", 0x1A5)}, "6502"),
-        ({"without": ("6071",)}, "6071"),
+        # Each is refused of a drive by script as well, in tests/devices/cia402.
+        pytest.param({"x6502": (7, "ro", 0x1A5)}, "6502", marks=pytest.mark.slow),
+        pytest.param({"without": ("6071",)}, "6071", marks=pytest.mark.slow),
         ({"without": ("1016", "1400:5")}, "1016"),
     ],
 )

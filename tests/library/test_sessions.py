@@ -48,9 +48,8 @@ def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_look, 
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"[1]", b'{"modes": 7}', b'{"modes": [7, {}, {"frequency_hz": {"value": "a"}}]}',
-     b'{"modes": [{"frequency_hz": {"value": NaN}, "damping_ratio": {"value": 1}}]}',
-     b"\xff" * 9, b"[" * 100_000],
+    [b"", b"{", b"[1]", b'{"version": 1, "modes": 7}', b"[" * 100_000,
+     b'{"version": 1, "modes": [7, {}, {"frequency_hz": {"value": "a"}}]}'],
 )  # fmt: skip
 def test_a_look_that_is_none_gives_no_modes(record_briefly, tmp_path, content):
     record_briefly("first").with_suffix(".look.json").write_bytes(content)

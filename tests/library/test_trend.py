@@ -1,4 +1,4 @@
-"""Trend of a specimen: modes are followed through sessions, and changes held against intervals."""
+"""Trend of a specimen: modes are followed through sessions, and changes against intervals."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ def row(day, *modes):
 @pytest.mark.parametrize(
     ("before", "after", "beyond"),
     [
-        (quantity(2.60, 0.03), quantity(2.64, 0.02), True),  # beyond 0.036
-        (quantity(2.60, 0.03), quantity(2.635, 0.02), False),
-        (quantity(2.64, 0.02), quantity(2.60, 0.03), True),
+        (quantity(2.60, 0.03), quantity(2.656, 0.02), True),  # beyond 0.0552, 3 / 1.96 of 0.0361
+        (quantity(2.60, 0.03), quantity(2.654, 0.02), False),
+        (quantity(2.656, 0.02), quantity(2.60, 0.03), True),
         (quantity(2.60, 0.03), {"value": 9.0, "interval_95": None}, None),
         (quantity(2.60, 0.03, flag="doubtful"), quantity(9.0, 0.03), None),
         # The halves that face each other count: 0.01 and 0.01, not 0.09 and 0.01.
@@ -25,10 +25,10 @@ def row(day, *modes):
         ({"value": 1.0, "interval_95": [0.99, 1.09]}, quantity(1.05, 0.01), False),
     ],
 )
-def test_a_change_is_real_beyond_both_intervals(before, after, beyond):
+def test_a_change_is_significant_beyond_three_standard_deviations(before, after, beyond):
     change = change_between(before, after)
     assert change.difference == pytest.approx(after["value"] - before["value"])
-    assert change.beyond_intervals is beyond
+    assert change.significant is beyond
 
 
 def test_modes_are_followed_by_their_frequency():
@@ -44,9 +44,9 @@ def test_modes_are_followed_by_their_frequency():
     assert [point.row.id for point in third.points] == ["day-1"]
     assert first.points[0].frequency_change is None
     assert first.points[1].frequency_change.difference == pytest.approx(0.1)
-    assert first.points[1].frequency_change.beyond_intervals is True
-    assert first.points[1].damping_change.beyond_intervals is False
-    assert second.points[1].frequency_change.beyond_intervals is False
+    assert first.points[1].frequency_change.significant is True
+    assert first.points[1].damping_change.significant is False
+    assert second.points[1].frequency_change.significant is False
 
 
 def test_two_modes_of_a_session_are_never_one():
@@ -58,4 +58,4 @@ def test_a_trend_is_a_document():
     (trend,) = mode_trends([row(1, mode(2.60)), row(2, mode(2.70))])
     first, second = trend.as_dict()["points"]
     assert (first["id"], first["frequency_change"]) == ("day-1", None)
-    assert second["frequency_change"]["beyond_intervals"] is True
+    assert second["frequency_change"]["significant"] is True

@@ -101,7 +101,7 @@ def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
     assert eventually(saver.has_begun)
     publisher.producer.stop()
     publisher.finish()
-    look = {"text": ["Quick look at it", "  mode 1\x1b[31m"]}
+    look = {"version": 1, "text": ["Quick look at it", "  mode 1\x1b[31m"]}
     (tmp_path / "looked at.look.json.new").write_text(json.dumps(look))
     (tmp_path / "looked at.look.json.new").rename(tmp_path / "looked at.look.json")
     time.sleep(1.5)  # it is looked for once a second

@@ -164,7 +164,7 @@ def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run):
     assert eventually(replaced)
     result, told = run("second")
     assert told[0].startswith("Live view: http://127.0.0.1:")
-    assert "The live process was killed by signal 9. It is started again" in "\n".join(told)
+    assert "The live process was killed by signal 9. It is restarted" in "\n".join(told)
     assert (result.outcome, result.live_dropped) == ("complete", 0)
 
 
@@ -187,8 +187,8 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
 
     result, told = run("watched", 3000.0, kill, stop)  # for as long as it takes
     assert len(killed) == 4
-    assert sum("It is started again" in text for text in told) == 3
-    assert sum("It is not started again" in text for text in told) == 1
+    assert sum("It is restarted" in text for text in told) == 3
+    assert sum("It is not restarted" in text for text in told) == 1
     assert result.outcome == "stopped"
     assert result.recorded == result.scheduled > given_up_at + 5000
     _, told = run("next")

@@ -10,7 +10,7 @@ from processes import eventually
 
 
 def run_session(publisher, name: str) -> tuple[int, int]:
-    """Have the producer's next quarter of a second be a session of its own.
+    """Make the producer's next quarter of a second a separate session.
 
     Returns with which sample it began, and how many there were when it was over.
     """

@@ -135,9 +135,11 @@ def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
 
 def look(folder: Path, name: str, specimen: str | None, magnitude: float = 2.0) -> None:
     response = {
-        "frequency_hz": [1.0, 2.0], "magnitude": [magnitude, None], "phase_rad": [np.pi, 0.0]
+        "frequency_hz": [1.0, 2.0], "magnitude": [magnitude, 1.0], "phase_rad": [np.pi, 0.0]
     }  # fmt: skip
-    text = json.dumps({"version": 1, "specimen": specimen, "response": response})
+    start_utc_ns = int(name.partition("-")[2][:6])
+    document = {"version": 1, "specimen": specimen, "response": response}
+    text = json.dumps(document | {"start_utc_ns": start_utc_ns})
     (folder / f"{name}.look.json").write_text(text)
 
 
@@ -160,8 +162,7 @@ def test_the_newest_quick_look_of_the_specimen_is_taken(tmp_path):
     found = last_response(asked(tmp_path, "A"), None)
     assert found.session == "20261122-110000-chirp"
     assert found.frequency_hz.tolist() == [1.0, 2.0]
-    assert found.response[0] == pytest.approx(-3.0)
-    assert np.isnan(found.response[1])
+    assert found.response == pytest.approx([-3.0, 1.0])
     assert last_response(asked(tmp_path, ""), None).session == "20261122-114000-chirp"
     assert last_response(asked(tmp_path, "C"), None) is None
 

@@ -74,7 +74,7 @@ def test_table_4_follows_from_table_3(link, paper_grid_hz, mode_hz, paper_dampin
     """Deviations of the paper's nominal models from its measured peaks.
 
     The peaks are read from its figures. Parameters are printed with three digits, each session
-    has peaks of its own, and frequencies come in bins of 0.0393 rad/s, so not all can agree.
+    has its own peaks, and frequencies come in bins of 0.0393 rad/s, so not all can agree.
     """
     measured = [
         Peak(omega / (2 * np.pi), magnitude_db)

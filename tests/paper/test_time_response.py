@@ -1,4 +1,4 @@
-"""The modelled torque against sums over modes, and the filters round it against known answers."""
+"""The modelled torque against sums over modes, and the filters around it against known answers."""
 
 from types import SimpleNamespace
 

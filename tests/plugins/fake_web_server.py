@@ -195,7 +195,7 @@ PLAN = {
 
 
 class FakeWebServer:
-    """Serves the page in a thread of its own; a test says what is told and what is answered.
+    """Serves the page in its own thread; a test says what is told and what is answered.
 
     Attributes
     ----------

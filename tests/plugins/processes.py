@@ -19,7 +19,7 @@ def eventually(
 ) -> Met | None:
     """Whether a condition comes true: its last answer. The limit only ends a test that fails.
 
-    Whoever is asked for it may be too busy to answer: that is no answer yet.
+    Whoever is asked for it may be too busy to answer: that is not an answer yet.
     """
     deadline = time.monotonic() + within_s
     while True:

@@ -113,7 +113,7 @@ class Requests:
 
 
 class Served(Requests):
-    """A page's server in a thread of its own, and the daemon behind it."""
+    """A page's server in its own thread, and the daemon behind it."""
 
     def __init__(self, folder, path, profile):
         self.folder = folder

@@ -30,7 +30,7 @@ main()
 
 
 def refused(path, share=1):
-    """Analyse in a process of its own; return its message and the most memory it took, in MB.
+    """Analyse in its own process; return its message and the most memory it took, in MB.
 
     It is given a `share`-th of the work that a file may take.
     """

@@ -32,7 +32,7 @@ if name == "hangs":
 if name == "waits":
     while not session.with_suffix(".go").exists():
         time.sleep(0.005)
-text = "{" if name == "torn" else json.dumps({"text": [f"Look at {name}"]})
+text = "{" if name == "torn" else json.dumps({"version": 1, "text": [f"Look at {name}"]})
 session.with_suffix(".look.json").write_text(text)
 """
 

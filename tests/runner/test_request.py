@@ -31,7 +31,7 @@ def test_the_sensors_serial_number_is_told_if_it_tells_one(metadata_of):
 def test_the_commit_is_that_of_the_checkout(metadata_of):
     checkout = Path(__file__).parents[2]
     if not (checkout / ".git").exists():
-        pytest.skip("this is no checkout")
+        pytest.skip("this is not a checkout")
     command = ["git", "-C", checkout, "rev-parse", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     stated = metadata_of({})["software_commit"]

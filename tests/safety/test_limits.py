@@ -114,7 +114,7 @@ def test_missed_ticks_in_a_row(watch):
     violation = watch.check_missed(51, 51, 61)
     assert violation is not None
     assert str(violation) == (
-        "The run of missed ticks of 51 ticks exceeds its limit of 50 ticks "
+        "Run of missed ticks 51 ticks exceeds limit 50 ticks "
         "(limits.missed_ticks_in_a_row). The computer is overloaded: close "
         "other programs."
     )

@@ -1,4 +1,4 @@
-"""Files that are no session, cut off, damaged or hostile: one error, and never a wrong number."""
+"""Files that are not sessions, cut off, damaged or hostile: one error, and never a wrong number."""
 
 import os
 import random
@@ -53,7 +53,7 @@ def test_a_file_that_is_no_mcap(tmp_path, data):
 def test_an_mcap_file_without_samples_channel(kit, tmp_path):
     messages = kit.fixed_messages(kit.make_samples(3))
     path = kit.write_foreign(tmp_path / "a.mcap", messages, topic="/other")
-    refused(path, "without the channel /rig/sample, so it is no session")
+    refused(path, "without the channel /rig/sample, so it is not a session")
 
 
 def test_samples_that_are_no_protobuf(kit, tmp_path):
@@ -282,7 +282,7 @@ def test_messages_that_the_statistics_count_must_be_there(kit, tmp_path):
     assert data[index.chunk_start_offset] == 6
     data[index.chunk_start_offset] = 0x86
     path.write_bytes(data)
-    refused(path, "has not the messages that its statistics count")
+    refused(path, "does not contain the messages that its statistics count")
 
 
 def test_a_damaged_attachment(tmp_path):

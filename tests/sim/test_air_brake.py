@@ -1,4 +1,4 @@
-"""The simulated beam in air against the analyzer's model of the drag, which is no simulation."""
+"""The simulated beam in air against the analyzer's model of the drag, which is not a simulation."""
 
 from dataclasses import replace
 

@@ -61,7 +61,7 @@ def random_damping(seed):
 
     Alone, the internal damping would give mode 2 a ratio of 0.0005…0.05, the external one would
     give mode 1 a ratio of 0.001…0.05 (log-uniform): about what metals, plastics and air do, and a
-    decade round the paper's values.
+    decade around the paper's values.
     """
     rng = np.random.default_rng(seed)
     first, second = (mode.natural_frequency_rad_s for mode in modes(BEAM, Damping(), 2))

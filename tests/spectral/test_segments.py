@@ -23,7 +23,7 @@ def cut(ticks, values, edges, end=None):
 
 
 def expected(ticks, values, end):
-    """On a grid of its own: short gaps interpolated, segments with anything unknown left out."""
+    """On its own grid: short gaps interpolated, segments with anything unknown left out."""
     known = np.isfinite(values).all(axis=0)
     ticks, values = ticks[known], values[:, known]
     grid = np.arange(end)

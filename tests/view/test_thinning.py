@@ -29,6 +29,7 @@ def test_no_extreme_is_lost_and_none_is_made_up(seed, groups, unknown):
         assert points[:, 1].min() == values[inside].min()
     # Every point is one of the curve, and they go one way.
     index = np.rint(points[:, 0] * 160.0).astype(int)
+    assert (thinning.extremes(values) == index).all()
     assert points[:, 1] == pytest.approx(values[index], abs=0.0)
     assert np.all(np.diff(points[:, 0]) > 0)
 

@@ -80,7 +80,7 @@ WITHOUT_RIGHT = {
     "host that begins like ours": RIGHT | {"Host": "127.0.0.1.evil.example"},
     "host with a user": RIGHT | {"Host": "127.0.0.1@evil.example"},
     "host with a path": RIGHT | {"Host": "evil.example/127.0.0.1"},
-    "host that is no name": RIGHT | {"Host": "[::1"},
+    "host that is not a name": RIGHT | {"Host": "[::1"},
     "no host": RIGHT | {"Host": None},
     "form of text/plain": without("X-Rigd") | {"Content-Type": "text/plain"},
     "plain text with our header": RIGHT | {"Content-Type": "text/plain"},

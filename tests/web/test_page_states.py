@@ -26,7 +26,7 @@ def page(server, open_page):
 
 
 def says(page, selector, text):
-    """See that an element says a text within a second."""
+    """Check that an element says a text within a second."""
     expect(page.locator(selector)).to_contain_text(text, timeout=1000 * TELL_S)
 
 
@@ -36,7 +36,7 @@ def change(before, after, reason):
     }  # fmt: skip
 
 
-FULL_DISK = "The free space of the session's disk of 12 MB is below its limit of 50 MB."
+FULL_DISK = "Free space on the session's disk 12 MB below limit 50 MB."
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ FULL_DISK = "The free space of the session's disk of 12 MB is below its limit of
         (change("ready", "running", "chirp was started"), "RUNNING", "Chirp was", "running"),
         (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
         (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
-        (change("running", "fault", FULL_DISK), "FAULT", "The free space", "alarm"),
+        (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
         ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
         (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
         (status(zero_lost=True), "READY", "The zero is lost", "ready"),
@@ -77,7 +77,7 @@ def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
 
 
 def test_a_fault_names_its_reason_and_the_way_out(server, page):
-    reason = "The angle of 0.51 rad exceeds its limit of 0.5 rad. " + "Turn it back. " * 20
+    reason = "Angle 0.51 rad exceeds limit 0.5 rad. " + "Turn it back. " * 20
     server.tell(status("fault", reason=reason))
     says(page, "#fault-reason", reason.strip())
     assert page.is_disabled("#start-button")

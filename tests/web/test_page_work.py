@@ -126,7 +126,7 @@ def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(ser
     assert [rows.nth(k).get_attribute("class").split()[1:] for k in range(3)] == [
         [], ["over"], ["near"],
     ]  # fmt: skip
-    # Rounded down, so that it passes; and predicted anew.
+    # Rounded down, so that it passes; and predicted again.
     page.click("#take-largest")
     assert page.input_value("#parameter-amplitude_rad") == "0.0286"
     page.wait_for_selector("#prediction:not(.outdated)")
@@ -203,7 +203,7 @@ def test_strips_show_the_last_ten_seconds(server, page):
     label = re.compile("^Angle, last 10 s: −0.02[45].* to 0.02[45].* rad$")
     expect(page.locator("#strip-angle")).to_have_attribute("aria-label", label)
     assert drawn(page, "#strip-angle") > 2 * before
-    # Gaps are none of its business, and a new record begins anew.
+    # Gaps are none of its business, and a new record starts from zero.
     gap = strip(0.0, 40)
     for name in ("angle_min", "angle_max", "reference_min", "reference_max"):
         gap[name][10] = None

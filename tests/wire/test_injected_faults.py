@@ -30,13 +30,13 @@ MESSAGES = {
     "wired stop dropped": r"Drive .*wired stop \(STO\) was dropped.*switch-on disabled",
     "controller off the bus": r"CAN bus .*bus-off",
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
-    "drive restarts": r"Drive .*it has restarted by itself; look at its supply",
-    "encoder jumps": r"encoder's jump of .* rad exceeds",
+    "drive restarts": r"Drive .*it has restarted by itself; check its supply",
+    "encoder jumps": r"Encoder jump .* rad exceeds limit",
     "statusword corrupted": r"Drive .*statusword",
     "controlword corrupted": r"Drive .*command came over the bus that this computer did not give",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
     "sensor restarts": r"Sensor .*its watchdog has reset it.*0x8001.*calibration 0",
-    "gauge at its end": r"sensor's f. of .* N exceeds its limit",
+    "gauge at its end": r"Sensor's f. .* N exceeds limit",
     "bus cut": r"CAN bus .*(cut off|takes no more frames|cannot be read)",
     "loop's frames lost": rf"{STALE} ticks",
     "loop's heartbeat lost": r"Drive .*0x8130",
@@ -81,6 +81,7 @@ def rows(heading):
 
 
 AGAIN = {
+    "angle lost",
     "bus cut",
     "controlword corrupted",
     "drive restarts",
@@ -93,6 +94,7 @@ AGAIN = {
     "sensor silent",
     "statusword corrupted",
     "stream reports an error",
+    "stream silent",
     "streaming sensor restarts",
     "torque commands lost",
     "wrench lost",

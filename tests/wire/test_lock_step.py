@@ -111,6 +111,6 @@ def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator
         leave_alone(1.5)
         refused = run("third")
         assert refused.outcome == "fault"
-        assert "look at STO" in refused.reason
+        assert "check STO" in refused.reason
     finally:
         rig.disconnect()

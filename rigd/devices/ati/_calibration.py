@@ -109,7 +109,7 @@ class Calibration:
                 if not isfinite(entry):
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry}, "
-                        "which is no number. Choose another calibration."
+                        "which is not a number. Choose another calibration."
                     )
                 if abs(entry) * per_entry > _LARGEST:
                     raise ValueError(

@@ -127,7 +127,7 @@ class AtiCanSensor:
             if self._read_matrix() != matrix:
                 raise DeviceError(
                     f"{self._name}: its calibration matrix read differently the second time; "
-                    "look at cable and termination."
+                    "check cable and termination."
                 )
             self._calibration = self._read_scale(serial_number, matrix)
             self._convert = wrench_function(self._calibration.wrench_per_wire_count())
@@ -297,7 +297,7 @@ class AtiCanSensor:
             remedy = (
                 "choose another (ati_can.calibration)"
                 if status & CAN_BAD_CALIBRATION
-                else "it does not measure properly: look at sensor, cable and supply"
+                else "it does not measure properly: check sensor, cable and supply"
             )
             raise DeviceError(
                 f"{self._name}: its status word {status:#06x} says that "
@@ -308,7 +308,7 @@ class AtiCanSensor:
         return DeviceError(
             f"{self._name}: {how}; it is back at calibration 0, and what it measures since is not "
             f"measured with calibration {self._settings.calibration} (ati_can.calibration). "
-            "Connecting anew (rigd reset, or another rigd run) selects it again. Look at the box's "
+            "Reconnecting (rigd reset, or another rigd run) selects it again. Check the box's "
             "supply and cable; if it happens again, have the box replaced."
         )
 

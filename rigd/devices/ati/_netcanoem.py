@@ -224,7 +224,7 @@ class GaugePolls:
         return self.answer
 
     def forget(self) -> None:
-        """Begin anew: nothing is on its way any more."""
+        """Start over: nothing is on its way any more."""
         self._firsts.start()
         self._seconds.start()
         self.answer = None

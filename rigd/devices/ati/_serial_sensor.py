@@ -91,7 +91,7 @@ class AtiSerialSensor:
         self._errors_in_a_row = 0
         self._arrived = 0
         self._arrived_ns = 0
-        # How many bytes should have come by this tick; a record or two less is no lag.
+        # How many bytes should have come by this tick; a record or two less is not a lag.
         self._due = 0
         self._tick_ns: int | None = None
         self._steady_ticks = 0
@@ -233,7 +233,7 @@ class AtiSerialSensor:
         return (
             f"{self._name}: {missing} records did not come, or all come later by {late_ms:.2g} ms "
             "since, and nothing on the line tells which: the wrench may be older than the file "
-            "states. Look at cable and adapter; connecting anew (rigd reset, or another rigd run) "
+            "states. Check cable and adapter; reconnecting (rigd reset, or another rigd run) "
             "ends it."
         )
 
@@ -323,8 +323,8 @@ class AtiSerialSensor:
             self._errors_in_a_row = self._errors_in_a_row + 1 if check & ERROR_BIT else 0
             if self._errors_in_a_row >= _ERRORS_IN_A_ROW:
                 raise DeviceError(
-                    f"{self._name}: its records say that it has an error. Its status word says "
-                    "which: run rigd check."
+                    f"{self._name}: its records report an error. Run rigd check to read its status "
+                    "word."
                 )
 
     def _unpack(self, records: bytes) -> tuple[int, ...]:
@@ -357,7 +357,7 @@ class AtiSerialSensor:
             raise DeviceError(
                 f"{self._name}: its status word {word:#06x} says that "
                 f"{'; '.join(serial_status(word & SERIAL_CRITICAL))}. It does not measure "
-                "properly: look at sensor, cable and supply."
+                "properly: check sensor, cable and supply."
             )
 
     def _start_streaming(self, setup: SerialSetup) -> None:

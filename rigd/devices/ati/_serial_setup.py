@@ -165,7 +165,7 @@ class SerialLine:
 
     def _gone(self, why: str | None) -> DeviceError:
         return DeviceError(
-            f"{self._device}: the serial port {self._serial.port} has failed ({why}); look at "
+            f"{self._device}: the serial port {self._serial.port} has failed ({why}); check "
             "adapter and cable, then connect again."
         )
 
@@ -183,9 +183,9 @@ def _reason(error: Exception) -> str:
 
 def _remedy(error: Exception) -> str:
     if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
-        return "another program has it open: end that first"
+        return "another program has it open: close that first"
     if isinstance(error, ValueError):
-        return "check ati_serial.baud, and whether the adapter can make it"
+        return "check ati_serial.baud, and whether the adapter supports it"
     return (
         "check ati_serial.port, whether the adapter is plugged in and whether you may use it "
         "(group dialout), or start the simulated rig: rigd simulate --profile PROFILE"

@@ -174,7 +174,7 @@ def bus_load(rig: RigParameters) -> BusLoad:
     Parameters
     ----------
     rig
-        Devices without a section of their own are not on the bus.
+        Devices without their own section are not on the bus.
 
     Raises
     ------

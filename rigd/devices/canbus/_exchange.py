@@ -82,7 +82,7 @@ class ReplyPairing:
         self.start()
 
     def start(self) -> None:
-        """Begin anew, with nothing on its way."""
+        """Start over, with nothing on its way."""
         self._inbox.replies = 0
         self._asked = self._alone = True
         self._heard = 0
@@ -307,17 +307,17 @@ class CanExchange:
         if kind & BUS_OFF:
             self._trouble = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
-                "many errors; look at cable, termination and bit rate, then bring it up again."
+                "many errors; check cable, termination and bit rate, then bring it up again."
             )
         elif kind & _NO_ACKNOWLEDGE:
             self._trouble = (
-                f"CAN bus {self.port.name}: nobody acknowledges our frames; look at cable, "
+                f"CAN bus {self.port.name}: no device acknowledges the frames sent; check cable, "
                 "termination, power and bit rate."
             )
         elif kind & _CONTROLLER and data[_CONTROLLER_STATE] & _PASSIVE:
             self._trouble = (
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
-                "disturbed; look at cable and termination."
+                "disturbed; check cable and termination."
             )
 
 

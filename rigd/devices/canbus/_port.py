@@ -69,7 +69,7 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     (16, (385, b'rigd'))
     """
     if not 0 <= can_id <= SFF_MASK:
-        raise ValueError(f"{can_id:#x} is no CAN identifier of 11 bits.")
+        raise ValueError(f"{can_id:#x} is not an 11-bit CAN identifier.")
     if len(data) > 8:
         raise ValueError(f"{len(data)} bytes do not fit into a CAN frame, which has 8.")
     return _FRAME.pack(can_id, len(data), data)
@@ -163,7 +163,7 @@ class SocketPort:
     """
 
     def __init__(
-        self, link: socket.socket, name: str, remedy: str = "look at cable and adapter"
+        self, link: socket.socket, name: str, remedy: str = "check cable and adapter"
     ) -> None:
         link.setblocking(False)
         self._link = link
@@ -226,7 +226,7 @@ class SocketPort:
         if isinstance(error, OSError):
             reason, number = error.strerror or reason, error.errno
         remedy = (
-            "no other device acknowledges: look at cable, termination, power and bit rate"
+            "no other device acknowledges: check cable, termination, power and bit rate"
             if number in (errno.ENOBUFS, errno.EAGAIN)
             else self._remedy
         )
@@ -260,7 +260,7 @@ class PythonCanPort:
             self._bus.send(self._to_message(frame), timeout=0.0)
         except Exception as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it takes no more frames ({_words(error)}); look at cable "
+                f"CAN bus {self.name}: it takes no more frames ({_words(error)}); check cable "
                 "and adapter."
             ) from None
 
@@ -296,7 +296,7 @@ class PythonCanPort:
             raw = None if message is None else self._from_message(message)
         except (self._error, OSError) as error:
             raise DeviceError(
-                f"CAN bus {self.name}: it cannot be read ({_words(error)}); look at cable and "
+                f"CAN bus {self.name}: it cannot be read ({_words(error)}); check cable and "
                 "adapter."
             ) from None
         except Exception as error:
@@ -306,7 +306,7 @@ class PythonCanPort:
             self._damaged_in_a_row = 0
             raise DeviceError(
                 f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
-                f"{_DAMAGED_IN_A_ROW} times in a row ({_words(error)}); look at the adapter, its "
+                f"{_DAMAGED_IN_A_ROW} times in a row ({_words(error)}); check the adapter, its "
                 "cable and its firmware."
             ) from None
         if raw is not None and not read_head(raw)[0] & ERROR_FLAG:
@@ -346,7 +346,7 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
                 f"CAN bus {name}: the simulated rig does not answer ({error.strerror}); start "
                 "rigd simulate again."
             ) from None
-        return SocketPort(link, f"{name}, simulated", "see whether rigd simulate still runs")
+        return SocketPort(link, f"{name}, simulated", "check whether rigd simulate still runs")
     if settings.interface == "socketcan":
         return SocketPort(_open_socketcan(settings), name)
     import can

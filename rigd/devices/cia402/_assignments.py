@@ -78,7 +78,7 @@ def parse_assignment(text: str) -> Assignment:
         value = int(match[4], 0)
     except ValueError:
         raise ValueError(
-            f"has a value that is no whole number ({match[4]}); write 2500, -3 or 0x9C4"
+            f"has a value that is not a whole number ({match[4]}); write 2500, -3 or 0x9C4"
         ) from None
     low, high = KINDS[kind]
     if not low <= value <= high:

@@ -128,7 +128,7 @@ class Cia402Drive:
         has_torque = outfit.has(ACTUAL_TORQUE)
         self._inbox.with_torque = has_torque
         self._following.compares = has_torque
-        # Without a heartbeat of its own the drive is heard by its TPDOs alone.
+        # Without its own heartbeat the drive is heard by its TPDOs alone.
         self._listens = outfit.has(HEARTBEAT_PRODUCER_MS)
         self._keeps_deadline = outfit.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
@@ -343,13 +343,13 @@ class Cia402Drive:
         else:
             self.off_doubt = (
                 f"{self._name}: it does not show that it is off (statusword "
-                f"0x{self._inbox.statusword:04X}); see that it is, by its STO if need be. "
+                f"0x{self._inbox.statusword:04X}); check that it is, by its STO if need be. "
                 f"{self._own_end()}"
             )
         node.resume()
 
     def reset_fault(self) -> str | None:
-        """Switch off and reset a fault, for the operator; the drive has to be connected anew.
+        """Switch off and reset a fault, for the operator; the drive must then be reconnected.
 
         Returns
         -------
@@ -447,12 +447,12 @@ class Cia402Drive:
         if statusword is not None:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "
-                f"0x{statusword:04X} is not set; look at its own diagnosis, and if this drive has "
+                f"0x{statusword:04X} is not set; check its own diagnosis, and if this drive has "
                 "no such bit: cia402.follows_target_bit = false."
             )
         silence_s = (node.now_ns - self._heard_ns) * 1e-9
         raise DeviceError(
             f"{self._name}: no heartbeat for {silence_s:.3g} s, more than "
             f"cia402.drive_heartbeat_timeout_s = {node.settings.drive_heartbeat_timeout_s:g} s; "
-            "look at its supply and at the cable."
+            "check its supply and the cable."
         )

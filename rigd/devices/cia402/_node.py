@@ -163,7 +163,7 @@ class ReceivedFrames:
         self.heard = True
         if self.watching and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
-                what = "it has restarted by itself; look at its supply"
+                what = "it has restarted by itself; check its supply"
             else:
                 words = NMT_STATES.get(state, f"state {state}")
                 what = (
@@ -273,7 +273,7 @@ class Node:
             )
             raise DeviceError(
                 f"{self.name}: it does not become operational ({told}, {OPERATIONAL} was "
-                "expected); look at its own diagnosis."
+                "expected); check its own diagnosis."
             )
         inbox.watching = True
 
@@ -297,16 +297,16 @@ class Node:
         if best_ns is None:
             raise DeviceError(
                 f"{self.name}: it does not answer SYNC with its TPDO, although it is operational; "
-                "look at its own diagnosis."
+                "check its own diagnosis."
             )
         raise DeviceError(
             f"{self.name}: it answers SYNC only after {best_ns * 1e-6:.2g} ms, more than the "
-            f"period of {self.period_ns * 1e-6:g} ms; look at bit rate and adapter, or choose a "
+            f"period of {self.period_ns * 1e-6:g} ms; check bit rate and adapter, or choose a "
             "lower rig.rate_hz."
         )
 
     def send_sync(self) -> None:
-        """Send SYNC; what came before it is no answer to it."""
+        """Send SYNC; what came before it is not an answer to it."""
         self.exchange.drain()
         self.pairing.ask()
         self.sync_ns = time.monotonic_ns()
@@ -328,7 +328,7 @@ class Node:
             self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
 
     def resume(self) -> None:
-        """Go on with the ticks after a time that they have not seen: both heartbeats start anew."""
+        """Resume the ticks after a gap: both heartbeats restart."""
         self._next_heartbeat_ns = _LONG_AGO_NS
         self.inbox.heard = True
 
@@ -345,7 +345,7 @@ class Node:
     def sync_if_possible(self) -> bool:
         """Send SYNC whatever the bus reports, and return whether it was answered; never raises."""
         with self.exchange.regardless():
-            self.exchange.drain()  # what has come is no answer
+            self.exchange.drain()  # what has come is not an answer
             self.pairing.ask()
             self.sync_ns = time.monotonic_ns()
             return self.send_if_possible(self.frames.sync) and self.await_reply()

@@ -139,17 +139,15 @@ class Requirement:
         if not self.core and (not self.accept or self.accept in accepted):
             return ""
         remedy = (
-            f' To run without it all the same: cia402.accept_without = ["{self.accept}"].'
-            if self.accept
-            else ""
+            f' To run without it: cia402.accept_without = ["{self.accept}"].' if self.accept else ""
         )
         return f"it has no object {self.place} ({self.name}). {self.sentence}{remedy}"
 
 
 _R, _W = Access.READ, Access.WRITE
-_NOT_USABLE: Final = "Without it the drive cannot be used: see whether its firmware offers it."
+_NOT_USABLE: Final = "Without it the drive cannot be used: check whether its firmware offers it."
 _DYNAMIC: Final = (
-    "Its PDOs have to be mapped as rigd needs them, or be mapped so already: RPDO1 with "
+    "Its PDOs must be mappable as rigd needs them, or be mapped so already: RPDO1 with "
     "controlword and target torque, TPDO1 with statusword, position and actual torque."
 )
 _FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
@@ -165,7 +163,7 @@ CORE: Final = (
         "Modes of operation",
         True,
         _R | _W,
-        sentence="It has to take 10, cyclic synchronous torque mode.",
+        sentence="It must accept 10, cyclic synchronous torque mode.",
     ),
     Requirement(
         objects.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
@@ -192,7 +190,7 @@ CORE: Final = (
         "Supported drive modes",
         True,
         _R,
-        sentence="Its bit 9 has to say that the drive has cyclic synchronous torque mode.",
+        sentence="Its bit 9 must say that the drive has cyclic synchronous torque mode.",
     ),
     Requirement(objects.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(
@@ -201,7 +199,7 @@ CORE: Final = (
         "Transmission type of RPDO1",
         True,
         _R | _W,
-        sentence="It has to be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
+        sentence="It must be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
     Requirement(objects.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(objects.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC),
@@ -211,7 +209,7 @@ CORE: Final = (
         "Transmission type of TPDO1",
         True,
         _R | _W,
-        sentence="It has to be 1: an angle at every SYNC.",
+        sentence="It must be 1: an angle at every SYNC.",
     ),
     Requirement(objects.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
 )
@@ -242,7 +240,7 @@ OPTIONAL: Final = (
         "COB-ID SYNC",
         False,
         _R | _W,
-        "0x080, which CiA 301 sets beforehand",
+        "0x080, the default of CiA 301",
     ),
     Requirement(
         objects.SYNC_PERIOD_US,
@@ -251,7 +249,7 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "transmission type 1: the drive goes by the SYNCs that come",
-        "It has to be the period of rig.rate_hz in microseconds, or 0.",
+        "It must be the period of rig.rate_hz in microseconds, or 0.",
         Fit.EQUAL_OR_UNUSED,
     ),
     Requirement(
@@ -300,8 +298,8 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
-        "Nothing in the drive would take the torque off when this computer falls silent. If the "
-        "drive has a watchdog of its own, set that up and state its time: cia402.own_watchdog_s.",
+        "Nothing in the drive would remove the torque if this computer stops communicating. If the "
+        "drive has its own watchdog, set that up and state its time: cia402.own_watchdog_s.",
         accept=WATCHDOG,
     ),
     Requirement(
@@ -330,8 +328,8 @@ OPTIONAL: Final = (
         "Error behaviour on communication error",
         False,
         _R | _W,
-        "what CiA 301 sets beforehand: to pre-operational",
-        "It has to be cia402.communication_error_option.",
+        "the default of CiA 301: to pre-operational",
+        "It must be cia402.communication_error_option.",
     ),
     Requirement(
         objects.HEARTBEAT_PRODUCER_MS,
@@ -340,7 +338,7 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "the TPDO of every SYNC, and limits.stale_ticks_in_a_row",
-        "It has to be cia402.drive_heartbeat_period_s in milliseconds.",
+        "It must be cia402.drive_heartbeat_period_s in milliseconds.",
     ),
     Requirement(
         objects.EMERGENCY_COB_ID,
@@ -348,7 +346,7 @@ OPTIONAL: Final = (
         "COB-ID EMCY",
         False,
         _R | _W,
-        "0x080 + node id, which CiA 301 sets beforehand",
+        "0x080 + node id, the default of CiA 301",
         "Its emergency messages would not be heard.",
     ),
     # Torque and speed.
@@ -555,8 +553,8 @@ def sync_period_us(rate_hz: float) -> int:
         from rigd.devices import DeviceError  # which loads numpy
 
         raise DeviceError(
-            f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
-            "a CANopen drive needs; choose another rate, such as 1000 Hz."
+            f"rig.rate_hz = {rate_hz:g} Hz: the period of a CANopen drive must be a whole "
+            "number of microseconds; choose another rate, such as 1000 Hz."
         )
     return round(period_us)
 

@@ -163,7 +163,7 @@ class SdoAccess:
             others = sorted(set(self._network.scanner.nodes) - {self._node.id})
             heard = f"; heard of node {', '.join(map(str, others))}" if others else ""
             raise DeviceError(
-                f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
+                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{heard}."
             ) from None
 
     def use_eds(self, path: str) -> tuple[int, int]:
@@ -350,7 +350,7 @@ def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int
         theirs = read_eds(Path(eds), node_id)
     except EdsError as error:
         raise DeviceError(
-            f"{error} Get it anew from the maker, or remove cia402.eds from the profile."
+            f"{error} Get it again from the maker, or remove cia402.eds from the profile."
         ) from None
     for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
         entry, mine = theirs.get(*place), own.get_variable(*place)

@@ -38,7 +38,7 @@ _PRESS_STO = (
 
 
 def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
-    """Switch the drive off, see that it is, reset its fault, and see that it would get ready.
+    """Switch the drive off, check that it is, reset its fault, and check that it would get ready.
 
     No torque on any way. The drive is left pre-operational and disabled. Its watch over our
     heartbeat is taken away only after its statusword has shown it off.
@@ -199,7 +199,7 @@ def _reset(sdo: SdoAccess, name: str, patience_s: float) -> str:
 def _see_ready(
     sdo: SdoAccess, name: str, patience_s: float, fault: str | None, command: str
 ) -> None:
-    """See that the drive gets to ready to switch on, where it has no torque yet, and back.
+    """Check that the drive gets to ready to switch on, where it has no torque yet, and back.
 
     Raises
     ------

@@ -286,7 +286,7 @@ class _Judge:
             if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
                 sentence = (
                     f"its object {needed.place} ({needed.name}) is read-only, so that the PDO "
-                    f"cannot be switched off to be mapped anew. {needed.sentence}"
+                    f"cannot be switched off to be remapped. {needed.sentence}"
                 )
                 return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
         else:

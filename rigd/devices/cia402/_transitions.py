@@ -25,9 +25,7 @@ from rigd.devices.cia402._protocol import (
 _FOREIGN_COMMAND: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"
 )
-_LOOK_AT_THE_BUS: Final = (
-    "look at the cable of the bus, its termination, and at who else is connected to it"
-)
+_LOOK_AT_THE_BUS: Final = "check the bus cable, its termination, and what else is connected to it"
 
 
 # Why a drive has left operation
@@ -51,7 +49,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
     if state is DriveState.SWITCH_ON_DISABLED:
         # It has lost its supply there, mostly; a command leaves that on.
         supplied = bool(statusword & VOLTAGE_ENABLED)
-        hint = ", and its bit 4 says that the supply is there, which speaks for such a command"
+        hint = ", and its bit 4 says that the supply is there, which indicates such a command"
         dropped = wired_stop_dropped(
             name,
             f", or the motor's supply failed, or {_FOREIGN_COMMAND}: {left}"
@@ -61,7 +59,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
     if state in (DriveState.READY, DriveState.SWITCHED_ON):
         return DeviceError(f"{name}: {left}: {_FOREIGN_COMMAND}; {_LOOK_AT_THE_BUS}.")
     return DeviceError(
-        f"{name}: {left}, by itself or because {_FOREIGN_COMMAND}; look at STO, supply and its "
+        f"{name}: {left}, by itself or because {_FOREIGN_COMMAND}; check STO, supply and its "
         f"own diagnosis. If these tell nothing, {_LOOK_AT_THE_BUS}."
     )
 
@@ -139,8 +137,8 @@ class TorqueFollowing:
             raise DeviceError(
                 f"{self._name}: it exerts {actual_per_mille / 10:g} % of the rated torque (object "
                 f"6077) where {self._commanded / 10:g} % were commanded, for {_TICKS} ticks; "
-                "commands are lost, or the drive limits them. Look at its own diagnosis, and at "
-                "cia402.torque_tolerance_percent; where it measures this torque, at "
+                "commands are lost, or the drive limits them. Check its diagnosis and "
+                "cia402.torque_tolerance_percent; where it measures this torque, check "
                 "cia402.torque_response_s."
             )
 
@@ -188,7 +186,7 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
             return (
                 f'it does not get to "{state.value}" and stays in '
                 f'"{state_of(inbox.statusword).value}" (statusword 0x{inbox.statusword:04X}); '
-                "look at STO, motor supply and its own diagnosis"
+                "check STO, motor supply and its own diagnosis"
             )
 
         def reached(state: DriveState = state) -> bool:
@@ -203,7 +201,7 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
             lambda: inbox.statusword & FOLLOWS_TARGET != 0,
             lambda: (
                 "it is enabled and ignores the target torque: bit 12 of its statusword "
-                f"0x{inbox.statusword:04X} is not set; look at its own diagnosis, and if this "
+                f"0x{inbox.statusword:04X} is not set; check its own diagnosis, and if this "
                 "drive has no such bit: cia402.follows_target_bit = false"
             ),
             stop,
@@ -290,8 +288,8 @@ def _turn_until(
         silent = 0 if answered else silent + 1
         if silent >= limit:
             raise DeviceError(
-                f"{node.name}: it has stopped answering SYNC while being enabled; look at its "
-                "supply and at the cable."
+                f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
+                "and the cable."
             )
     raise DeviceError(f"{node.name}: {stuck()} (cia402.enable_timeout_s = {timeout_s:g} s).")
 

@@ -148,7 +148,7 @@ class AtiCanNode:
         """Nothing here takes time: the box only answers."""
 
     def reset(self) -> None:
-        """Start anew, as its watchdog or a request has it."""
+        """Restart, by its watchdog or on request."""
         self._active = 0
         self._was_reset = True
         self._log("sensor", "reset")

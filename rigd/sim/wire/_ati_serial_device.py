@@ -157,7 +157,7 @@ class AtiSerialDevice:
             self._log("sensor", "stream stopped")
 
     def reset(self) -> None:
-        """Start anew by itself: it streams no more, and remembers no set-up."""
+        """Restart by itself: it streams no more, and remembers no set-up."""
         self.streaming = self._unlocked = False
         self._holding = dict(self._at_power_up)
         self._unset = list(range(6))
@@ -166,7 +166,7 @@ class AtiSerialDevice:
         self._log("sensor", "restart")
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which is no different here."""
+        """Take its power away and give it back, which makes no difference here."""
         self.reset()
 
     def tick(self, now_s: float) -> None:

@@ -87,7 +87,7 @@ class WallClock:
 class LockStep:
     """One period per SYNC; simulated time waits for the next one.
 
-    It does not wait for ever: five seconds after the last SYNC, and at once where nobody is left
+    It does not wait forever: five seconds after the last SYNC, and at once where nobody is left
     who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
     the first SYNC it goes on too.
 
@@ -149,7 +149,7 @@ class Node(Protocol):
     frozen: bool
 
     def reset(self) -> None:
-        """Start anew by itself."""
+        """Restart by itself."""
 
     def power_cycle(self) -> None:
         """Start as when its power comes back."""
@@ -167,7 +167,7 @@ class SerialDevice(Protocol):
     frozen: bool
 
     def reset(self) -> None:
-        """Start anew by itself."""
+        """Restart by itself."""
 
     def power_cycle(self) -> None:
         """Start as when its power comes back."""
@@ -458,7 +458,7 @@ class BusSimulation:
             raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
         if fault.kind == "cut" and device == "sensor" and not on_serial:
             raise FaultError(
-                f"Fault '{fault}': this rig's sensor has no line of its own; take "
+                f"Fault '{fault}': this rig's sensor has no serial line; use "
                 "freeze,device=sensor, or cut for the whole bus."
             )
         for word in _WORDS_ON_CAN if on_serial else _WORDS_ON_SERIAL:
@@ -469,7 +469,7 @@ class BusSimulation:
                 )
         if fault.kind == "corrupt" and not on_serial and int(values["byte"]) >= _CAN_BYTES:
             raise FaultError(
-                f"Fault '{fault}': byte={values['byte']} hits nothing; a CAN frame has at most "
+                f"Fault '{fault}': byte={values['byte']} has no effect; a CAN frame has at most "
                 f"the bytes 0 to {_CAN_BYTES - 1}."
             )
 

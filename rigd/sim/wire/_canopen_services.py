@@ -195,7 +195,7 @@ def add_watches(
     count
         Number of nodes that can be watched; with 0 there is no such object.
     restarted
-        Called after a watch was set anew, and so is not lost.
+        Called after a watch was set again, and so is not lost.
     """
     entries = {sub: Entry("I") for sub in range(1, count + 1)}
     watches = [HeartbeatWatch(entry) for entry in entries.values()]

@@ -272,11 +272,11 @@ class DriveNode:
         self._fail(code, register, vendor)
 
     def reset(self) -> None:
-        """Start anew by itself: it boots, and remembers nothing."""
+        """Restart by itself: it boots, and remembers nothing."""
         self._boot()
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which is no different here."""
+        """Take its power away and give it back, which makes no difference here."""
         self.reset()
 
     @property
@@ -413,7 +413,7 @@ class DriveNode:
             self._sdo.receive(data)
 
     def _on_heartbeat(self, node_id: int, data: bytes) -> None:
-        if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is no heartbeat
+        if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is not a heartbeat
             return
         for watch in self._watches:
             if watch.node_id == node_id:

@@ -151,7 +151,7 @@ def parse_fault(spec: str) -> Fault:
     body, at, time = spec.partition("@")
     kind, *words = (word.strip() for word in body.split(","))
     if kind not in KINDS:
-        raise FaultError(_complaint(spec, f"'{kind}' is no fault; choose {', '.join(KINDS)}"))
+        raise FaultError(_complaint(spec, f"unknown fault '{kind}'; choose {', '.join(KINDS)}"))
     keys = KINDS[kind]
     values: dict[str, Value] = {}
     for word in words:

@@ -300,7 +300,7 @@ def is_virtual(channel: str) -> bool:
     if kind in _VIRTUAL_KINDS:
         return True
     raise DeviceError(
-        f"CAN bus {channel}: this is no virtual bus here, and a simulated drive must not answer "
+        f"CAN bus {channel}: this is not a virtual bus here, and a simulated drive must not answer "
         "beside real ones; simulate with a copy of the profile that has another name and another "
         "can.channel."
     )

@@ -398,7 +398,7 @@ class SdoServer:
                 self._start_download(data)
             elif specifier == _UPLOAD:
                 self._start_upload()
-            elif specifier != _ABORTED:  # block transfers, and what is no request at all
+            elif specifier != _ABORTED:  # block transfers, and what is not a request at all
                 raise Abort(AbortCode.COMMAND)
         except Abort as abort:
             self._reply(_ABORT.pack(0x80, self._index, self._sub, abort.code))
@@ -515,7 +515,7 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
     Raises
     ------
     DeviceError
-        If it cannot be read, or is no such file.
+        If it cannot be read, or is not of that kind.
     """
     try:
         eds = read_eds(path, node_id)

@@ -1,4 +1,4 @@
-"""``rigd simulate``: a simulated rig as a process of its own, on the wire.
+"""``rigd simulate``: a simulated rig as a separate process, on the wire.
 
 One thread, one loop: it waits for frames, for bytes of the serial line, and for the time to pass.
 The operator's commands come over the control socket.
@@ -76,7 +76,8 @@ def only_one(rig_name: str) -> Iterator[None]:
             running = find_simulator(rig_name)
             who = "" if running is None else f" (process {running.pid})"
             raise DeviceError(
-                f"A simulated rig of the profile {rig_name} runs already{who}; end it first, or "
+                f"A simulated rig of the profile {rig_name} is already running{who}; end it first, "
+                "or "
                 "use that one."
             ) from None
         # What a dead one left must go first: it names the sockets that are about to live again.
@@ -243,8 +244,8 @@ def check_on_wire(rig: RigParameters) -> None:
     if rig.cia402 is None or rig.can is None:
         raise WrongUseError(
             f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): its "
-            "devices are simulated within a session, so there is nothing to put on the wire and "
-            "no fault to inject there. Take a profile of a rig with a bus, such as antenna_can."
+            "devices are simulated within a session, so there are no bus messages and no faults to "
+            "inject. Use a profile of a rig with a bus, such as antenna_can."
         )
 
 
@@ -269,7 +270,7 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
         If the profile cannot be simulated on the wire, a fault is none that this rig can have, or
         the log's name is taken.
     DeviceError
-        If its simulated rig runs already, or if sockets or files cannot be made.
+        If its simulated rig is already running, or if sockets or files cannot be made.
     """
     check_on_wire(rig)
     if rig.devices.sensor != "ati_serial":

@@ -2,7 +2,7 @@
 
 const NOTHING = "–";
 
-/** A minus is no hyphen. */
+/** A minus is not a hyphen. */
 export const minus = (text) => text.replaceAll("-", "−");
 
 /** Endings of names and the units they stand for, the longer endings first; the server's table. */

@@ -192,7 +192,7 @@ export class ResponsePlot {
         return;
       }
       const at = y(value);
-      // A phase that goes round the cut is not drawn across the plot.
+      // A phase that goes around the cut is not drawn across the plot.
       const jumps = member === "phase_rad" && before !== null && Math.abs(at - before) > height / 2;
       context[before === null || jumps ? "moveTo" : "lineTo"](x(frequency), at);
       before = at;

@@ -118,7 +118,7 @@ export class StartForm {
 
   // Request
 
-  /** Value of a parameter: undefined where the default is meant, null where it is no number. */
+  /** Value of a parameter: undefined where the default is meant, null where it is not a number. */
   #parsed(name) {
     const { input, isText, unit } = this.#inputs.get(name);
     const text = input.value.trim();

@@ -206,7 +206,7 @@ def calibration_registers(matrix=MATRIX, **changes):
 
 
 class FakeDigitalFt:
-    """A sensor at one end of a pseudo-terminal, in a thread of its own."""
+    """A sensor at one end of a pseudo-terminal, in its own thread."""
 
     def __init__(self, block=1):
         self.master, slave = os.openpty()

@@ -151,7 +151,7 @@ def fuzz_can(n, seed, mode="same_tick"):
             replies = replies[: 2 - len(later)]
         elif fate < 0.45:
             replies = [reply[:4] + bytes((rng.randint(0, 8),)) + reply[5:] for reply in replies]
-        # What is no half reading of the sensor may come anywhere between.
+        # What is not half a reading of the sensor may come anywhere between.
         for _ in range(rng.choice((0, 0, 1, 3))):
             can_id = rng.choice(
                 (BASE << 4 | rng.randint(2, 15), rng.randrange(0x800), 0x80, 0x20000004)

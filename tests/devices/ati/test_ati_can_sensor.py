@@ -301,7 +301,7 @@ def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
     with pytest.raises(DeviceError, match=r"watchdog has reset it .*back at calibration 0") as told:
         bench.tick()
     assert "not measured with calibration 1 (ati_can.calibration)" in str(told.value)
-    bench.sensor.connect()  # the bit stays, and the calibration is selected anew
+    bench.sensor.connect()  # the bit stays, and the calibration is selected again
     assert bench.fake.asked.count((6, b"\x01")) == 2
     bench.tick()
     assert not bench.sensor.wrench_stale
@@ -313,7 +313,7 @@ def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
 
 
 class Restarting(Bench):
-    """A box that can be without power for some ticks; each calibration has a matrix of its own."""
+    """A box that can be without power for some ticks; each calibration has its own matrix."""
 
     def __init__(self, fakes, rig, mode):
         super().__init__(fakes, replace(rig, acquisition=replace(rig.acquisition, mode=mode)))

@@ -333,7 +333,7 @@ def test_a_sensor_that_reports_an_error_ends_the_session(
     tick(sensor)
     assert not sensor.wrench_stale, "one such bit may be a disturbed one"
     digital_ft.emit(fakes.record_of(fakes.GAUGES, error=True) * 7)
-    with pytest.raises(DeviceError, match="has an error"):
+    with pytest.raises(DeviceError, match="its records report an error"):
         tick(sensor)
     digital_ft.status = 0x0204
     sensor.close()
@@ -532,7 +532,7 @@ def test_an_adapter_unplugged_while_waiting(open_sensor, digital_ft, unhurried, 
         original(timeout_s)
 
     sensor._line.wait = wait
-    with pytest.raises(DeviceError, match="look at adapter and cable"):
+    with pytest.raises(DeviceError, match="check adapter and cable"):
         sensor.read_wrench()
 
 

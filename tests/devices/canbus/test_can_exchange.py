@@ -99,7 +99,7 @@ def test_a_deadline_that_has_passed_still_takes_what_has_arrived(ends, exchange)
     ("kind", "data", "says"),
     [
         (0x040, bytes(8), "bus-off"),
-        (0x020, bytes(8), "nobody acknowledges"),
+        (0x020, bytes(8), "no device acknowledges"),
         (0x004, b"\0\x10" + bytes(6), "error-passive"),
         (0x004, b"\0\x20" + bytes(6), "error-passive"),
         (0x044, bytes(8), "bus-off"),

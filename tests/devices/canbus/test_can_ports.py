@@ -137,7 +137,7 @@ def test_an_exchange_that_starts_lets_in_what_was_subscribed_to():
 
 def test_what_the_kernel_says_has_its_remedy():
     full = SocketPort(RecordingLink(errno.ENOBUFS), "can0")
-    with pytest.raises(DeviceError, match="no other device acknowledges: look at cable"):
+    with pytest.raises(DeviceError, match="no other device acknowledges: check cable"):
         full.send(pack_frame(1))
     down = SocketPort(RecordingLink(errno.ENETDOWN), "can0")
     with pytest.raises(DeviceError, match=r"cannot be read \(network is down\)"):

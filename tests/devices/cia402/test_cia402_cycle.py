@@ -183,7 +183,7 @@ def test_without_gaps_no_sync_is_ever_left_out(make_drive, rig, settings, script
         stale.append(drive.angle_stale)
     # Three periods with one reply each, and what is missing is taken for lost.
     assert stale == [True, True, True, True, False, False]
-    assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one a tick
+    assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one per tick
     assert "cannot be told while cia402.sync_gaps = false" in drive.health().doubt
 
 
@@ -346,7 +346,7 @@ def falls_silent(scripted):
                 "this computer did not give (a corrupt frame, a second master)",
                 'left "operation enabled"',
                 "bit 4 says that the supply is there",
-                "reset the rig. If nobody pressed it, look at the cable of the bus",
+                "reset the rig. If nobody pressed it, check the bus cable",
             ],
         ),
         (

@@ -180,7 +180,7 @@ def test_an_error_passive_controller_still_sends_the_sync_at_which_torque_zero_a
     ticks(drive, 3)
     kind, data = report
     scripted.send(0x2000_0000 | kind, data)
-    with pytest.raises(DeviceError, match=r"error-passive|nobody acknowledges"):
+    with pytest.raises(DeviceError, match=r"error-passive|no device acknowledges"):
         ticks(drive, 100)
     writes, syncs = len(scripted.writes), scripted.syncs
     drive.disable()

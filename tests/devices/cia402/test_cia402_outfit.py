@@ -373,7 +373,7 @@ PDOMapping=0
         path = tmp_path / "broken.eds"
         path.write_text(content)
         scripted.state, scripted.torque = "enabled", 200
-        with pytest.raises(DeviceError, match=r"broken\.eds: is .*Get it anew"):
+        with pytest.raises(DeviceError, match=r"broken\.eds: is .*Get it again"):
             make(eds=str(path)).connect()
         # Not even that leaves a drive turning.
         assert (scripted.state, scripted.torque) == ("switch-on disabled", 0)

@@ -339,7 +339,7 @@ class TestResettingADriveThatTurns:
     def test_whatever_an_adapter_raises_at_first_it_is_told_again(
         self, drive, turning, monkeypatch
     ):
-        """A full queue, or a library with errors of its own."""
+        """A full queue, or a library with its own errors."""
         for method, trouble in (
             ("write", RuntimeError("a library's own")),
             ("tell_pre_operational", DeviceError("CAN bus can0 takes no commands.")),

@@ -141,7 +141,7 @@ def test_a_new_base_takes_effect_at_the_next_power_up(can_host):
     assert can_host.log.entries[-1] == ("sensor", "base identifier set", {"base_id": 0x6A})
     assert can_host.ask(0xF)
     can_host.ask(0xC)
-    assert can_host.ask(0xF), "a reset is no power-up"
+    assert can_host.ask(0xF), "a reset is not a power-up"
     can_host.node.power_cycle()
     assert can_host.ask(0xF) == []
     can_host.base = 0x6A

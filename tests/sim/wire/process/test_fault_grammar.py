@@ -82,7 +82,7 @@ def test_anything_else_is_refused_with_a_sentence(text):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("dorp,from=drive", "'dorp' is no fault; choose drop, delay, corrupt, reorder, freeze"),
+        ("dorp,from=drive", "unknown fault 'dorp'; choose drop, delay, corrupt, reorder, freeze"),
         ("drop", "drop needs from: drive or sensor or host"),
         ("drop,from=cat", "from=cat: give drive or sensor or host"),
         ("drop,from=drive,colour=red", "drop has no 'colour'; choose from, id, frames, bytes"),

@@ -208,7 +208,7 @@ def test_there_is_one_for_each_rig(simulate):
     first = simulate()
     second = rigd("simulate", "--profile", "antenna_can")
     assert second.returncode == 1
-    assert f"runs already (process {first.process.pid})" in second.stderr
+    assert f"is already running (process {first.process.pid})" in second.stderr
     assert first.process.poll() is None
     assert simulate("antenna_serial").address is not None
 
@@ -302,7 +302,7 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
     assert done.stdout == "jump,counts=-500\ndrop,from=host,id=0x77f,frames=1\n"
     wrong = rigd_here("inject", "--profile", "antenna_can", "dorp")
     assert wrong.returncode == 2
-    assert "'dorp' is no fault; choose drop" in wrong.stderr
+    assert "unknown fault 'dorp'; choose drop" in wrong.stderr
     standing = rigd_here("inject", "--profile", "antenna_can")
     assert "clients: 1\n" in standing.stdout
     assert "disturbed: ['host']\n" in standing.stdout
@@ -375,15 +375,15 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("simulate", "--profile", "sim"), 2, "nothing to put on the wire"),
-        (("inject", "--profile", "sim", "sto"), 2, "Take a profile of a rig with a bus"),
+        (("simulate", "--profile", "sim"), 2, "no bus messages"),
+        (("inject", "--profile", "sim", "sto"), 2, "Use a profile of a rig with a bus"),
         (("simulate", "--profile", ""), 2, "No profile is named; known profiles are"),
         (("simulate", "--profile", "nothing"), 2, "There is no profile 'nothing'"),
         (("simulate", "--profile", "antenna_can", "--fault", "cut@x"), 2, "'@x'"),
         (
             ("simulate", "--profile", "antenna_can", "--fault", "cut,device=sensor"),
             2,
-            "no line of its own",
+            "no serial line",
         ),
         (("simulate", "--profile", "antenna_can", "--log", "/nowhere/log"), 1, "cannot be written"),
         (("inject", "--profile", "antenna_can", "cut"), 1, "start it with: rigd simulate"),

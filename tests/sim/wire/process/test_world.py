@@ -399,7 +399,7 @@ def test_the_bus_is_cut_by_who_holds_it(make_world):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("cut,device=sensor", "no line of its own"),
+        ("cut,device=sensor", "no serial line"),
         ("drop,from=sensor,bytes=3", "bytes is for a sensor on a serial line"),
         (
             "corrupt,from=drive,byte=8",

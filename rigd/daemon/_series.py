@@ -1,0 +1,123 @@
+"""Series of sessions that the daemon runs: how far one has come, and who is told of it."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rigd.daemon import _protocol as protocol
+from rigd.daemon._log import NAME
+from rigd.daemon._states import Document, State
+from rigd.engine import Event
+from rigd.runner import RigError, Series, SessionProgress, SessionResult, result_line
+from rigd.runtime import StopRequest
+
+_LOGGED = {
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
+"""Levels of events that are told, and as what they are logged."""
+
+Publish = Callable[[Document], None]
+
+_log = logging.getLogger(NAME)
+
+
+@dataclass(slots=True)
+class ServedSeries:
+    """Sessions that one request asked for, and how far they came."""
+
+    number: int
+    request: protocol.Start
+    stop: StopRequest = field(default_factory=StopRequest)
+    planned: Series | None = None
+    session: int = 0
+    """The one that is run, from 1 on."""
+    path: Path | None = None
+    results: list[SessionResult] = field(default_factory=list)
+    """Also of one that failed."""
+    reason: str = ""
+    """Why it ended before its time."""
+    running: bool = False
+    failed: bool = False
+    """Something went wrong: the sessions are fewer, or not what was asked for."""
+
+    def as_document(self) -> Document:
+        """Tell what it is and how far it came."""
+        return {
+            "series": self.number,
+            "excitation": self.request.excitation,
+            "session": self.session,
+            "repeat": self.request.repeat,
+            "notes": self.request.notes.model_dump(exclude_defaults=True),
+            "plan": None if self.planned is None else self.planned.plan_document(),
+            "path": None if self.path is None else str(self.path),
+            "running": self.running,
+            "stopped": self.stop.requested,
+            "failed": self.failed,
+            "reason": self.reason,
+            "sessions": [result.as_dict() for result in self.results],
+        }
+
+    def state_after(self, fault: str) -> tuple[State, str]:
+        """Return the state of the daemon after this series, and the reason.
+
+        Parameters
+        ----------
+        fault
+            What put the rig out of work; empty if it may go on.
+        """
+        if fault:
+            return State.FAULT, fault
+        if self.stop.requested:
+            return State.READY, f"{self.request.excitation} was stopped"
+        if self.reason:
+            return State.READY, self.reason
+        return State.READY, f"{self.request.excitation} is complete"
+
+
+class SeriesTeller:
+    """Notes, logs and publishes what becomes of a series; called in the second thread."""
+
+    def __init__(self, series: ServedSeries, publish: Publish, listens: Callable[[], bool]) -> None:
+        self._series = series
+        self._publish = publish
+        self._listens = listens
+
+    def begins(self, number: int, path: Path) -> None:
+        if not self._listens():
+            raise RigError(
+                "The daemon does not respond to requests: no further session is started."
+            )
+        self._series.session, self._series.path = number, path
+
+    def shown(self, where: str) -> None:
+        self._tell("info", where)
+
+    def update(self, progress: SessionProgress, events: list[Event]) -> None:  # noqa: ARG002
+        for event in events:
+            if event.level in _LOGGED:
+                self._tell(event.level, event.message)
+
+    def ended(self, result: SessionResult) -> None:
+        series = self._series
+        series.results.append(result)
+        line = result_line(result.as_dict())
+        _log.log(
+            logging.INFO if result.went_well else logging.WARNING,
+            "series %d: session %d of %d, %s: %s",
+            series.number,
+            series.session,
+            series.request.repeat,
+            result.path or result.part or "no file",
+            line,
+        )
+        # For lists of events, in the words of the terminal.
+        self._publish({"event": "message", "level": "info", "text": line})
+        self._publish({"event": "session", "number": series.session, **result.as_dict()})
+
+    def _tell(self, level: str, text: str) -> None:
+        _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
+        self._publish({"event": "message", "level": level, "text": text})

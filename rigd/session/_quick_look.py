@@ -1,0 +1,211 @@
+"""Quick looks: the files that the analyzer writes beside session files, and how they are read.
+
+docs/quick_look.md describes them. Anybody may have put such a file there: what is read of it is
+checked here, once for the live view, the page, the library and the analyzer.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+from rigd.printable import printable
+
+Document = dict[str, Any]
+
+LOOK_SUFFIX: Final = ".look.json"
+"""Ending of the file of a quick look, in place of the session file's."""
+LOOK_VERSION: Final = 1
+"""Version of its layout."""
+
+_MOST_BYTES: Final = 1 << 20
+_MOST_MODES: Final = 20
+_MOST_CHARACTERS: Final = 1000
+_MOST_READ: Final = 200
+"""Most looks that are read to find the last one: some thousand would take seconds."""
+_TEXTS: Final = ("file", "session_id", "specimen", "excitation")
+_TIMES: Final = ("start_utc_ns", "made_utc_ns")
+_LINES: Final = ("flags", "text")
+_CURVES: Final = ("frequency_hz", "magnitude", "phase_rad")
+
+
+def look_path(path: Path) -> Path:
+    """Return where the quick look at a session is, which is written beside its file.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rigd.session import look_path
+    >>> print(look_path(Path("sessions/20261120-101500-chirp.mcap")))
+    sessions/20261120-101500-chirp.look.json
+    """
+    return path.with_suffix(LOOK_SUFFIX)
+
+
+def read_look(path: Path) -> Document | None:
+    """Read the file of a quick look.
+
+    Parameters
+    ----------
+    path
+        The file, as of `look_path`.
+
+    Returns
+    -------
+    dict or None
+        As docs/quick_look.md has it, what is missing being empty: all numbers are finite, texts
+        printable, `modes` those that can be used, and `response` None if it cannot be. None if
+        there is no such file, it cannot be read, or is of another version.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES)
+        found = json.loads(content, parse_constant=lambda _: None, parse_float=_parsed)
+        if found["version"] != LOOK_VERSION:
+            return None
+        return dict(found) | {
+            **{name: _text(found.get(name) or "") for name in _TEXTS},
+            **{name: int(found.get(name) or 0) for name in _TIMES},
+            "modes": modes_of(found.get("modes")),
+            "response": _response(found.get("response")),
+            **{name: [_text(line) for line in found.get(name) or []] for name in _LINES},
+        }
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+
+
+def last_look(
+    folder: Path,
+    specimen: str,
+    *,
+    before_utc_ns: int | None = None,
+    but: str = "",
+    usable: Callable[[Document], object],
+) -> tuple[Path, Document] | None:
+    """Find the quick look at the last session of a specimen.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session files.
+    specimen
+        Name of the specimen; empty: sessions that name none.
+    before_utc_ns
+        The session began before this time; None: whenever.
+    but
+        Name of a session, without ending, that is left out.
+    usable
+        Whether a look is of use, by its document.
+
+    Returns
+    -------
+    tuple of Path and dict, or None
+        Path of the session file, and the look as `read_look` returns it.
+    """
+    found = [
+        (path.with_name(path.name.removesuffix(LOOK_SUFFIX) + ".mcap"), look)
+        for path in _newest(folder)
+        if path.name != but + LOOK_SUFFIX
+        and (look := read_look(path)) is not None
+        and look["specimen"] == specimen
+        and (before_utc_ns is None or look["start_utc_ns"] < before_utc_ns)
+        and usable(look)
+    ]
+    return max(found, key=lambda each: each[1]["start_utc_ns"], default=None)
+
+
+def _newest(folder: Path) -> list[Path]:
+    """Return the looks that were made last."""
+    made: list[tuple[float, Path]] = []
+    with suppress(OSError):
+        for path in folder.glob(f"*{LOOK_SUFFIX}"):
+            with suppress(OSError):
+                made.append((path.stat().st_mtime, path))
+    return [path for _, path in sorted(made, reverse=True)[:_MOST_READ]]
+
+
+def modes_of(documents: object) -> list[Document]:
+    """Return the modes of a quick look or a report that can be used.
+
+    Parameters
+    ----------
+    documents
+        What stands there as `modes`.
+
+    Returns
+    -------
+    list of dict
+        ``mode`` (its number), ``shown`` (whether the record shows it), and ``frequency_hz`` and
+        ``damping_ratio``, each with ``value``, ``std``, ``interval_95`` and ``flag``; modes
+        without finite numbers or a positive frequency are left out.
+    """
+    return list(_modes(documents)) if isinstance(documents, list) else []
+
+
+def _modes(documents: list[object]) -> Iterator[Document]:
+    for place, mode in enumerate(documents[:_MOST_MODES], start=1):
+        if isinstance(mode, dict):
+            number, shown = mode.get("mode", place), mode.get("shown") is not False
+            frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
+            if (
+                type(number) is int
+                and frequency is not None
+                and frequency["value"] > 0
+                and damping is not None
+            ):
+                known = {"frequency_hz": frequency, "damping_ratio": damping}
+                yield {"mode": number, "shown": shown, **known}
+
+
+def _quantity(document: object) -> Document | None:
+    if not isinstance(document, dict) or (value := _finite(document.get("value"))) is None:
+        return None
+    ends = document.get("interval_95")
+    interval = [_finite(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
+    flag = document.get("flag")
+    return {
+        "value": value,
+        "std": _finite(document.get("std")),
+        "interval_95": None if interval is None or None in interval else interval,
+        "flag": _text(flag) if isinstance(flag, str) else None,
+    }
+
+
+def _response(document: object) -> Document | None:
+    """Return a response with curves of one length, which is not 0."""
+    if not isinstance(document, dict):
+        return None
+    curves = {name: _finite_numbers(document.get(name)) for name in _CURVES}
+    coherence = _finite_numbers(document.get("coherence"))
+    points = len(curves["frequency_hz"])
+    if not points or any(len(curve) != points for curve in curves.values()):
+        return None
+    return {**curves, "coherence": coherence if len(coherence) == points else None}
+
+
+def _finite_numbers(values: object) -> list[float]:
+    """Return numbers; none at all if anything else is among them."""
+    numbers = [_finite(value) for value in values] if isinstance(values, list) else []
+    return [] if None in numbers else numbers  # type: ignore[return-value]
+
+
+def _parsed(text: str) -> float | None:
+    return _finite(float(text))
+
+
+def _finite(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if isfinite(number) else None
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return printable(value, _MOST_CHARACTERS)

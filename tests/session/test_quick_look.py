@@ -1,0 +1,135 @@
+"""Files of quick looks: whatever lies there, what is read of them can be used."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from library_folders import mode, quantity
+
+from rigd.session import last_look, look_path, modes_of, read_look
+
+RESPONSE = {
+    "frequency_hz": [1.0, 2.0],
+    "magnitude": [3.0, 4.0],
+    "phase_rad": [0.1, 0.2],
+    "coherence": [0.9, 0.8],
+}
+
+
+def write(folder, name, **members) -> Path:
+    path = look_path(folder / f"{name}.mcap")
+    path.write_text(json.dumps({"version": 1} | members))
+    return path
+
+
+def test_what_is_written_is_read(tmp_path):
+    written = {
+        "version": 1, "file": "a.mcap", "session_id": "a", "specimen": "antenna 3",
+        "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
+        "modes": [{"mode": 2, "shown": False, **mode(2.5)}],
+        "coherence": {"mean": None, "low_bands": []}, "flags": ["clipped"], "against_last": None,
+        "response": RESPONSE, "text": ["Quick look"],
+    }  # fmt: skip
+    assert read_look(write(tmp_path, "a", **written)) == written
+
+
+def test_what_is_missing_is_empty(tmp_path):
+    look = read_look(write(tmp_path, "a"))
+    assert (look["specimen"], look["start_utc_ns"], look["modes"], look["text"]) == ("", 0, [], [])
+    assert look["response"] is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[1]", b"{}", b'{"version": 2}', b"\xff" * 9, b"[" * 100_000,
+     b'{"version": 1, "specimen": 3}', b'{"version": 1, "start_utc_ns": "a"}',
+     b'{"version": 1, "text": 7}', b'{"version": 1, "text": [7]}',
+     b'{"version": 1, "flags": "' + b"a" * (1 << 20) + b'"}'],
+)  # fmt: skip
+def test_a_file_that_is_none_is_not_read(tmp_path, content):
+    path = look_path(tmp_path / "a.mcap")
+    path.write_bytes(content)
+    assert read_look(path) is None
+    assert read_look(tmp_path) is None
+    assert read_look(tmp_path / "missing.look.json") is None
+
+
+@pytest.mark.parametrize(
+    "modes",
+    [7, [7], [{}], [{"frequency_hz": {"value": "a"}}], [mode(2.5) | {"frequency_hz": None}],
+     [mode(-2.5)], [mode(2.5) | {"mode": "first"}],
+     [mode(2.5) | {"damping_ratio": {"value": float("nan")}}],
+     [mode(2.5) | {"damping_ratio": {"value": float("inf")}}],
+     [mode(2.5) | {"damping_ratio": {"value": 10**400}}]],
+)  # fmt: skip
+def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
+    whole = mode(16.0) | {"mode": 2, "shown": True}
+    given = [*modes, whole] if isinstance(modes, list) else modes
+    found = read_look(write(tmp_path, "a", modes=given))["modes"]
+    assert found == ([whole] if isinstance(modes, list) else [])
+    assert modes_of(given) == found
+
+
+def test_an_interval_without_two_numbers_is_none():
+    (found,) = modes_of([mode(2.5) | {"frequency_hz": quantity(2.5, 0.1) | {"interval_95": [2]}}])
+    assert (found["frequency_hz"]["interval_95"], found["mode"], found["shown"]) == (None, 1, True)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"magnitude": [3.0]}, {"phase_rad": [0.1, None]}, {"frequency_hz": []}, {"magnitude": "34"},
+     {"magnitude": [3.0, float("inf")]}],
+)  # fmt: skip
+def test_a_response_is_whole_or_none(tmp_path, wrong):
+    assert read_look(write(tmp_path, "a", response=RESPONSE | wrong))["response"] is None
+    without = read_look(write(tmp_path, "b", response=RESPONSE | {"coherence": None}))
+    assert without["response"] == RESPONSE | {"coherence": None}
+
+
+def test_numbers_beyond_all_floats_are_unknown(tmp_path):
+    path = look_path(tmp_path / "a.mcap")
+    path.write_text('{"version": 1, "took_s": 1e999, "coherence": {"mean": NaN}}')
+    look = read_look(path)
+    assert (look["took_s"], look["coherence"]) == (None, {"mean": None})
+
+
+@given(st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(
+        st.sampled_from(["version", "modes", "frequency_hz", "damping_ratio", "value", "response",
+                         "text", "flags", "specimen", "start_utc_ns", "interval_95", "std"]),
+        inner,
+    ),
+    max_leaves=30,
+))  # fmt: skip
+def test_anything_is_read_as_json_or_not_at_all(tmp_path_factory, found):
+    folder = tmp_path_factory.getbasetemp()
+    members = found if isinstance(found, dict) else {"modes": found, "response": found}
+    look = read_look(write(folder, f"any-{os.getpid()}", **members | {"version": 1}))
+    if look is not None:
+        json.dumps(look, allow_nan=False)
+
+
+# The last one
+
+
+def test_the_last_look_is_that_of_the_latest_session(tmp_path):
+    write(tmp_path, "early", start_utc_ns=5, specimen="A", response=RESPONSE)
+    write(tmp_path, "late", start_utc_ns=9, specimen="A")
+    write(tmp_path, "other", start_utc_ns=8, specimen="B")
+    write(tmp_path, "none", start_utc_ns=7)
+    look_path(tmp_path / "torn.mcap").write_text("{")
+
+    def last(specimen, usable=bool, **but):
+        found = last_look(tmp_path, specimen, usable=usable, **but)
+        return None if found is None else found[0].name
+
+    assert last("A") == "late.mcap"
+    assert last("A", but="late") == last("A", before_utc_ns=9) == "early.mcap"
+    assert last("A", usable=lambda look: look["response"]) == "early.mcap"
+    assert last("") == "none.mcap"
+    assert last("C") is None
+    assert last_look(tmp_path / "missing", "A", usable=bool) is None
