@@ -170,7 +170,7 @@ class Library:
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
         path = self._session(request)
-        found = next((row for row in await self.rows() if row.id == path.stem), None)
+        found = next((row for row in await self.rows() if row.path.name == path.name), None)
         if found is None or found.report is None:
             return refused(404, "There is no report of it.")
         return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
@@ -208,7 +208,7 @@ class Library:
             or not all(isinstance(name, str) for name in ids)
         ):
             return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
-        paths = [str(self._path(name)) for name in dict.fromkeys(ids)]
+        paths = sorted({str(self._path(name)) for name in ids})  # as they were recorded
         folder = self._free("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
         return self._queue("campaign", arguments, "", f"/api/campaign/{folder.name}/")

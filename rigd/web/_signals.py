@@ -97,10 +97,8 @@ class Strips:
         bins = waiting[:, : count * ticks].reshape(3, count, ticks)
         # Without those functions' warning of points of which nothing is known.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        columns = np.round(
-            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
-        )
-        points = [tuple(_known(column)) for column in columns.T]
+        extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DIGITS)
+        points = [tuple(_known(column)) for column in extremes.T]
         first, self._next = self._next, self._next + count
         self._points.extend(points)
         return _strip(first, points)
