@@ -15,7 +15,7 @@ SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
 """Name of the folder of a report: of which session, and which of its reports."""
-PAGE: Final = "report.html"
+REPORT_PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
 _MOST_JSON_BYTES: Final = 8 << 20
@@ -108,8 +108,8 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
     results: dict[str, Any] = {"modes": _modes(look, report)}
-    if report is not None and (report / PAGE).is_file():
-        results["report"] = report / PAGE
+    if report is not None and (report / REPORT_PAGE).is_file():
+        results["report"] = report / REPORT_PAGE
     try:
         summary = read_summary(path)
     except SessionError as error:
