@@ -261,7 +261,7 @@ def _look_of(last: Path) -> dict[str, Any]:
     look = read_look(look_path(last))
     if look is None:
         raise LookError(
-            f"--last {last}: there is no quick look beside it that can be read; make one with "
+            f"--last {last}: there is no readable quick look beside it; make one with "
             f"python -m analysis.quick_look {last}."
         )
     return look

@@ -325,8 +325,8 @@ def check_finite(
     if large.size:
         raise RecordError(
             f"{path}: {field} is {values[large[0]]:g} at tick {ticks[large[0]]} and beyond "
-            f"±{MAX_VALUE:g} in {large.size} of {len(values)} samples; no rig has such values, "
-            "correct whatever wrote the file."
+            f"±{MAX_VALUE:g} in {large.size} of {len(values)} samples; no rig has such values; "
+            "correct the program that wrote the file."
         )
 
 
@@ -348,7 +348,7 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
     if torque_nm.size > 1 and np.ptp(torque_nm) == 0.0:
         raise RecordError(
             f"{path}: coupling_torque_nm is {torque_nm[0]:g} N·m in every sample, so the sensor "
-            "gave nothing; check its connection and record the session again."
+            "delivered no data; check its connection and record the session again."
         )
 
 

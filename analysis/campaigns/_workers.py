@@ -201,7 +201,7 @@ def process_pool(jobs: int) -> Iterator[Workers]:
 
 
 class _LocalWorkers(Workers):
-    _lost = "its worker process ended by itself, twice: most often for lack of memory"
+    _lost = "its worker process ended by itself twice, most often for lack of memory"
     _hopeless = (
         "The worker processes ended by themselves, most often for lack of memory: use fewer "
         "--jobs. A script that calls campaign() must do so under if __name__ == '__main__':"
@@ -313,7 +313,7 @@ class _DaskWorkers(Workers):
     """The scheduler tries a task whose worker ended at others, and gives it up after several."""
 
     _lost = (
-        "every Dask worker that had it ended by itself: most often for lack of memory; see the "
+        "every Dask worker that ran it ended by itself, most often for lack of memory; see the "
         "workers' logs"
     )
 

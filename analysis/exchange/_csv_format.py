@@ -197,8 +197,8 @@ def _odd_cell(
             "thousands."
         )
     raise ExchangeError(
-        f"{path}: {place} is '{printable(cell, 40)}' and not a number; below the line with the "
-        "names only numbers may stand."
+        f"{path}: {place} is '{printable(cell, 40)}' and not a number; only numbers are allowed "
+        "below the line with the names."
     )
 
 

@@ -231,14 +231,14 @@ def not_in_time(path: Path, name: str) -> ExchangeError:
     """Make the error for a complex channel."""
     return ExchangeError(
         f"{path}: '{name}' is complex, so it is a frequency response or a spectrum. A session is "
-        "made of measured samples: give angle and torque over time; from a frequency response "
-        "alone no record can be had back."
+        "made of measured samples: give angle and torque over time; a record cannot be "
+        "reconstructed from a frequency response alone."
     )
 
 
 def missing_library(path: Path, library: str) -> ExchangeError:
     """Make the error for a library that is not installed."""
     return ExchangeError(
-        f"{path}: needs the package {library}, which is not installed; get all that import and "
-        "export can use with `pip install 'rigd[exchange]'`."
+        f"{path}: needs the package {library}, which is not installed; install all packages for "
+        "import and export with `pip install 'rigd[exchange]'`."
     )

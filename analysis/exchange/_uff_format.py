@@ -117,7 +117,7 @@ def _channel(path: Path, name: str, function: Mapping[str, Any]) -> SourceChanne
     if len(values) != function["num_pts"]:
         raise ExchangeError(
             f"{path}: '{name}' has {len(values)} values and states {function['num_pts']}; the file "
-            "is damaged or was written wrongly, export it again."
+            "is damaged or was written incorrectly; export it again."
         )
     check_samples(path, f"The data set '{name}'", len(values))
     even = function["abscissa_spacing"] == 1 and function["abscissa_spec_data_type"] == _TIME
@@ -191,8 +191,8 @@ def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
         even = _is_even(axis, _EVEN_IN_TEXT)
     if not even and not binary and not _six_digits_do(axis):
         raise ExchangeError(
-            f"{table.source}: its {table.axis.title.lower()} is not even enough for UFF58 in text, "
-            "which has six digits for it; write it with --binary, or as .csv or .mat."
+            f"{table.source}: its {table.axis.title.lower()} is not equidistant enough for UFF58 "
+            "in text, which has six digits for it; write it with --binary, or as .csv or .mat."
         )
     stream.write(_SI_UNITS.encode("ascii"))
     for column in table.columns:

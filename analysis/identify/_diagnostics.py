@@ -324,8 +324,8 @@ def unexplained(
             f"{low:.2f} to {high:.2f} Hz) and does not follow the motor."
         )
         remedy = (
-            "Record for as long with the motor held (rigd run hold). If it is there too, look for "
-            "machines near by, and check shield and earth of the sensor's cable."
+            "Record for as long with the motor held (rigd run hold). If it is there too, search "
+            "for machines nearby, and check shield and earth of the sensor cable."
         )
     return Finding(
         kind="unexplained",

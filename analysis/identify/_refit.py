@@ -153,7 +153,9 @@ class Refit:
         return cls(objective, found.x, found.equations, noise)
 
     def further(self, max_evaluations: int) -> Refit:
-        """Descend on from here; what was evaluated here is not evaluated again.
+        """Descend on from here, with nothing held, as `descend` does from the same point.
+
+        What was evaluated here is not evaluated again, unless torques are unknown.
 
         Parameters
         ----------

@@ -439,8 +439,8 @@ def _why_not(verdict: OrderVerdict) -> str:
     if len(profile.valleys) > 1:
         equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
         return (
-            f"{equal} fit the record equally well, each with another damping "
-            f"(95 %: {low:.3f} to {high:.3f}, with all that lies between)"
+            f"{equal} fit the record equally well, each with a different damping (95 %: {low:.3f} "
+            f"to {high:.3f}, with all that lies between)"
         )
     return (
         "any value between 0 and 2 fits"

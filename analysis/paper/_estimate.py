@@ -130,7 +130,7 @@ def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
     if band_hz[1] > nyquist_hz:
         raise SettingsError(
             f"{record.path}: the band reaches {band_hz[1]:g} Hz, but samples at "
-            f"{record.rate_hz:g} Hz tell nothing beyond {nyquist_hz:g} Hz; lower --band."
+            f"{record.rate_hz:g} Hz contain nothing above {nyquist_hz:g} Hz; lower --band."
         )
 
 
@@ -160,7 +160,7 @@ def _remedy(samples: int) -> str:
     try:
         length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
     except SpectralError:
-        return "; that is too little for any estimate."
+        return "; that is too short for any estimate."
     return (
         f"; --segment {length} --overlap {overlap} makes {PAPER_SEGMENTS} segments of it, "
         "and --frf fft needs none."

@@ -168,7 +168,7 @@ _EXTRAS: Final = {
     "second_order_filter_time_constant_s": "T is the reciprocal corner of the torque channel's "
     "filter (Butterworth)",
     "clock_rate_difference": "the torque with the time stamp t is that of t (1 + ε)",
-    "drag": "the drag ½ ρ_air C_D d v |v| per length acts on the beam besides (ρ_air 1.2 kg/m³)",
+    "drag": "the drag ½ ρ_air C_D d v |v| per length also acts on the beam (ρ_air 1.2 kg/m³)",
 }
 
 
@@ -230,7 +230,7 @@ def types_table(whole: WholeRecord) -> Table:
         (
             "Internal damping multiplies EI by 1 + the term, external damping adds the term to "
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
-            "mode with its own stiffness. The marked type is the one that the numbers are of.",
+            "mode with its own stiffness. The marked type is that of the numbers reported.",
         ),
         selected=list(STRUCTURES).index(whole.fit.structure.name),
     )

@@ -170,7 +170,7 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
             part.rename(folder)
         except OSError as error:
             raise OutputExistsError(
-                f"The report {folder} has appeared meanwhile ({error.strerror or error}); "
+                f"The report {folder} was created meanwhile ({error.strerror or error}); "
                 "nothing is overwritten, choose another name with --report."
             ) from error
     finally:
@@ -226,7 +226,8 @@ def _check_earlier(folder: Path) -> None:
     """Refuse a folder that is neither free nor an earlier report."""
     if not _is_free(folder) and not (folder.is_dir() and (folder / LIST).is_file()):
         raise OutputExistsError(
-            f"--overwrite replaces reports of an analysis, and {folder} is none: it has no list of "
+            f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
+            "of "
             f"its files ({LIST}). Choose another folder with --report, or move it away."
         )
 
@@ -237,8 +238,9 @@ def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
     for name in sums:
         if os.path.lexists(folder / name) and not _is_own(folder, name, earlier):
             raise OutputExistsError(
-                f"The report {folder} is left as it was: {name} in it is not as an analysis wrote "
-                "it, and --overwrite replaces nothing else; move it away, or choose another folder "
+                f"The report {folder} is unchanged: {name} in it was modified after the analysis, "
+                "and --overwrite does not replace such files; move it away, or choose another "
+                "folder "
                 "with --report."
             )
     try:

@@ -136,10 +136,12 @@ class SignalReader:
         # Ticks missed between two blocks belong to the second one.
         elif first - before <= _MOST_TICKS:
             first = before + 1
-        signals = {}
-        for name in _FIELDS:
-            signals[name] = np.full(last - first + 1, np.nan, dtype=np.float32)
-            signals[name][ticks - first] = samples[name]
+        signals = {name: samples[name].astype(np.float32) for name in _FIELDS}
+        if samples.size != last - first + 1:
+            for name in _FIELDS:
+                every = np.full(last - first + 1, np.nan, dtype=np.float32)
+                every[ticks - first] = signals[name]
+                signals[name] = every
         self._ungauged.append(samples)
         t_ns = int(samples["t_ns"][0]) - round((int(ticks[0]) - first) * self._period_ns)
         return SignalBlock(first, t_ns, signals)

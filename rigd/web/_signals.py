@@ -29,7 +29,7 @@ STRIP_S: Final = 0.05
 """Time that a point of a strip stands for."""
 _KEPT_S: Final = 10.0
 _EVERY: Final = 4
-"""Of `analyze`'s bins of 1/160 Hz: still more than two a segment's resolution of 1/17 Hz."""
+"""One bin in four of the 1/160 Hz of `analyze` is shown: still two in a segment's resolution."""
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
 _NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
@@ -97,10 +97,8 @@ class Strips:
         bins = waiting[:, : count * ticks].reshape(3, count, ticks)
         # Without those functions' warning of points of which nothing is known.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        columns = np.round(
-            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
-        )
-        points = [tuple(_known(column)) for column in columns.T]
+        extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DIGITS)
+        points = [tuple(_known(column)) for column in extremes.T]
         first, self._next = self._next, self._next + count
         self._points.extend(points)
         return _strip(first, points)

@@ -52,7 +52,7 @@ def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
     assert shaken.failures == ()
     (lost,) = shaken.lost_trials
     assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
-    assert "worker process ended by itself, twice" in lost.reason
+    assert "worker process ended by itself twice" in lost.reason
     assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
 
 
@@ -61,7 +61,7 @@ def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
     assert "mean of 3 of 4 sessions" in foresight
     told = shaken.verdict.sentences[-1]
     assert told.startswith("Of 4 sessions to be predicted from the others, 3 were and 1 was not")
-    assert "(1.mcap: its worker process ended by itself, twice" in told
+    assert "(1.mcap: its worker process ended by itself twice" in told
 
 
 def test_terminal_page_and_files_account_for_it(shaken):
