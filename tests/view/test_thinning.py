@@ -51,3 +51,11 @@ def test_a_curve_is_broken_where_it_is_not_known():
     assert below[-1, 0] <= 5.0
     assert above[0, 0] >= 10.0
     assert Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(np.full(GRID.size, np.nan)) == []
+
+
+@pytest.mark.parametrize("grid", [[], [0.1, 0.2]])
+def test_of_a_curve_outside_the_band_nothing_is_left(grid):
+    grid = np.array(grid)
+    thinning = Thinning.logarithmic(grid, 0.5, 60.0, 200)
+    assert thinning.extremes(np.ones(grid.size)).size == 0
+    assert thinning.strips(np.ones(grid.size)) == []

@@ -123,6 +123,7 @@ def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(op
     says(page, "#state-word", "OFFLINE")
     assert page.evaluate("() => window.told.OFFLINE") - killed_s < TELL_S
     # The page's server ends too, and the browser tells that it finds nobody.
+    page.close()
     open_page.complaints.clear()
 
 

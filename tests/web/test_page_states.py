@@ -144,7 +144,8 @@ def test_stop_works_where_the_server_answers_no_more(server, page, open_page):
     server.close()
     page.click("#stop")
     says(page, "#state-reason", "Not stopped: The page's server does not answer.")
-    # That it cannot be reached is what is tested.
+    # That it cannot be reached is what is tested; an open page would try again.
+    page.close()
     open_page.complaints.clear()
 
 
