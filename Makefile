@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Hundreds of processes start in the tests: each would compile every module once more.
 unexport PYTHONDONTWRITEBYTECODE
+# The operator's page in a browser: its driver keeps an event loop running, beside which no other
+# test can have one. So it has processes of its own, a file of tests in each.
+BROWSER := -n 2 --dist loadfile tests/web
 
 .PHONY: demo test test-all test-fast check bench fuzz chaos endurance clean
 
@@ -16,16 +19,16 @@ demo: $(VENV)/ready
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser"
+	$(BIN)/python -m pytest $(BROWSER) -m "browser and not slow"
 
 # Without what starts processes or fits models: a minute, for every edit.
 test-fast: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser and not process and not fit"
 
-# With what is shown once more at full length, or over another transport; and with the operator's
-# page in a browser, whose driver's event loop wants a process of its own.
+# With what is shown once more at full length, or over another transport.
 test-all: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not browser"
-	$(BIN)/python -m pytest -m browser
+	$(BIN)/python -m pytest $(BROWSER) -m browser
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -40,6 +40,8 @@ from analysis.report import write_campaign
 SESSIONS = 20
 JOBS = 2
 STARTS = 4
+LIMIT_S = 60.0
+"""Wall time of the campaign on two idle cores."""
 
 
 def recorded(folder: Path) -> list[Path]:
@@ -155,7 +157,10 @@ def main() -> None:
         report.mkdir()
         watch = Watch()
         found = campaign(paths, jobs=JOBS)
-        print(f"Campaign with selection on every whole record and validation: {watch}")
+        print(
+            f"Campaign with selection on every whole record and validation: {watch} "
+            f"(limit {LIMIT_S:g} s)"
+        )
         if found.verdict is not None:
             print(*(f"  {sentence}" for sentence in found.verdict.sentences), sep="\n")
         watch = Watch()

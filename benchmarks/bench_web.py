@@ -79,10 +79,11 @@ async def look_on(address: str, pages: int) -> None:
         async def follow(*, told: bool) -> None:
             async with session.ws_connect(f"{address}api/live") as socket:
                 async for message in socket:
-                    if told and message.data.startswith('{"type":"strip"'):
-                        strip = json.loads(message.data)
-                        end_s = strip["t0_s"] + strip["dt_s"] * len(strip["angle_min"])
-                        print(time.time(), end_s, flush=True)
+                    for line in message.data.split("\n"):
+                        if told and line.startswith('{"type":"strip"'):
+                            strip = json.loads(line)
+                            end_s = strip["t0_s"] + strip["dt_s"] * len(strip["angle_min"])
+                            print(time.time(), end_s, flush=True)
 
         await asyncio.gather(*(follow(told=number == 0) for number in range(pages)))
 

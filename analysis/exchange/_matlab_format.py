@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -52,7 +53,7 @@ def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
     try:
         with bounded_memory():
-            return _vectors(path, names, whosmat(path), loadmat)
+            return _vectors(path, names, whosmat(path), partial(loadmat, spmatrix=False))
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # scipy lets through whatever a damaged file provokes

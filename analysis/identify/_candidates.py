@@ -321,10 +321,10 @@ class CandidateSet:
         least = candidate.fit.cost * (1 - MISSED)
         if outlook.promised_cost > least:
             return candidate
-        first = self.descent(unknowns, outlook.x, FEW)
+        first = outlook.further(FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
             return candidate
-        found = self.descent(unknowns, first.x, MANY)
+        found = first.further(MANY)
         return candidate if found.cost > least else found.candidate()
 
     def with_orders_free(self) -> CandidateSet:

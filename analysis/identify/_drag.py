@@ -317,7 +317,7 @@ def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
         unknowns = other.unknowns(before.structure, before.uniform)
         refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
         if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
-            refit = other.descent(unknowns, refit.x, _MANY)
+            refit = refit.further(_MANY)
         candidates.append(refit.candidate())
     found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))

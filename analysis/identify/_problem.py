@@ -19,7 +19,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -383,8 +383,8 @@ class Comparison:
         the jump from the record's end to its beginning would leak into all bins.
         """
         hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
-        drift = self.spectrum(np.linspace(-0.5, 0.5, self.samples))
-        return np.concatenate([self.decays.columns(poles), hum, drift[None]])
+        drift = _drift(self.samples)[None, self.bins]
+        return np.concatenate([self.decays.columns(poles), hum, drift])
 
     def filled(self, plant: Plant) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.
@@ -429,6 +429,17 @@ class Comparison:
     def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Ticks counted from the first decimated sample on."""
         return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
+
+
+@lru_cache(maxsize=2)
+def _drift(samples: int) -> NDArray[np.complex128]:
+    """Transform of a drift of 1 over all samples, kept: every evaluation needs it.
+
+    Not to be written to.
+    """
+    drift: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
+    drift.flags.writeable = False
+    return drift
 
 
 # Whitened residual and its sum of squares

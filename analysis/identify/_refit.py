@@ -152,6 +152,25 @@ class Refit:
         )
         return cls(objective, found.x, found.equations, noise)
 
+    def further(self, max_evaluations: int) -> Refit:
+        """Descend on from here, with nothing held, as `descend` does from the same point.
+
+        What was evaluated here is not evaluated again, unless torques are unknown.
+
+        Parameters
+        ----------
+        max_evaluations : int
+            Most evaluations of the sum of squares, this one counted.
+        """
+        objective, found = self.objective.minimum(
+            self.x,
+            self.noise.weight,
+            Steps.of(self.objective.unknowns),
+            relative_tolerance=_TOLERANCE,
+            max_evaluations=max_evaluations,
+        )
+        return Refit(objective, found.x, found.equations, self.noise)
+
     @property
     def columns(self) -> NDArray[np.complex128]:
         """What was projected out beside the free decay, shape (c, K)."""

@@ -92,7 +92,7 @@ def _promising(field: CandidateSet, lead: Candidate) -> list[Refit]:
         )
         first = min(begun, key=lambda refit: refit.promised_cost)
         if doubtful:  # what a first step promises from afar means little
-            first = field.descent(first.objective.unknowns, first.x, FEW)
+            first = first.further(FEW)
         if first.promised_cost < needed:
             found.append(first)
     return sorted(found, key=lambda refit: refit.promised_cost)
@@ -129,11 +129,11 @@ def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> It
     """Candidates of one extra that are better than their structures are without it."""
     unknowns = start.objective.unknowns
     values = field.best.values
-    refit = field.descent(unknowns, start.x, FEW)
+    refit = start.further(FEW)
     most = field.best.fit.cost * math.exp(_HOPELESS / values)
     if refit.promised_cost > max(most, bare["VI"].fit.cost * math.exp(-_HOPELESS / values)):
         return
-    refit = field.descent(unknowns, refit.x, MANY)
+    refit = refit.further(MANY)
     for structure in _STRUCTURES:
         if structure.name not in bare:
             continue
@@ -142,10 +142,10 @@ def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> It
             first = field.descent(own, own.vector(refit.plant), 1)
             if first.promised_cost > most:
                 continue
-            first = field.descent(own, first.x, FEW)
+            first = first.further(FEW)
             if first.promised_cost > most:
                 continue
-            candidate = field.descent(own, first.x, MANY).candidate()
+            candidate = first.further(MANY).candidate()
         else:
             candidate = refit.candidate()
         if candidate.bic < bare[structure.name].bic:

@@ -84,7 +84,7 @@ _ORDERS: Final = (0.5, 1.5)
 class CoarseResponse:
     """Few points of the whole record's frequency response, with their weights."""
 
-    __slots__ = ("_frequency_hz", "_measured", "_response", "_weights")
+    __slots__ = ("_costs", "_frequency_hz", "_measured", "_response", "_weights")
 
     def __init__(self, comparison: Comparison) -> None:
         length = comparison.angle_rad.size
@@ -102,6 +102,7 @@ class CoarseResponse:
         self._measured = response[index]
         self._frequency_hz = hz[band][excited][index]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
+        self._costs: dict[Plant, float] = {}
 
     def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
         """Take the same points with the weights that they have under a noise.
@@ -115,11 +116,16 @@ class CoarseResponse:
         weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
         other = copy(self)
         other._weights = self._weights * weight / (self._weights @ weight)
+        other._costs = {}
         return other
 
     def cost(self, plant: Plant) -> float:
         """Weighted mean square of the deviation, in (N·m/rad)²."""
-        return self._mean_square(self._response.evaluate(plant)[0] - self._measured)
+        # Kept: structures that differ in what is free only are scanned at the same plants.
+        if plant not in self._costs:
+            deviation = self._response.evaluate(plant)[0] - self._measured
+            self._costs[plant] = self._mean_square(deviation)
+        return self._costs[plant]
 
     def distance(self, one: Plant, other: Plant) -> float:
         """Weighted mean square of the difference between two plants."""

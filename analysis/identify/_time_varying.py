@@ -238,7 +238,11 @@ def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
     half, here, hub = _UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
     for angle in shaft.tolist():
-        here = min(max(here, angle - half), angle + half)
+        # A comparison each: min and max take three times as long, at every tick of the record.
+        if here < angle - half:
+            here = angle - half
+        elif here > angle + half:
+            here = angle + half
         hub.append(here)
     lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub) - shaft)
     return lag

@@ -144,7 +144,7 @@ def _panel(
         if label.startswith("measured"):
             # Dots: a line would run up and down wherever noise wraps the phase.
             few = style.spread(at_hz, 2 * _COLUMNS)
-            phase.plot(at_hz[few], phase_deg[few], ".", markersize=1.6, color=look["color"])
+            style.dots(phase, at_hz[few], phase_deg[few], size_pt=1.8, color=look["color"])
         else:
             phase.plot(*style.envelope(at_hz, phase_deg, _COLUMNS, logarithmic=True), **look)
     for peak in analysis.peaks:

@@ -93,12 +93,8 @@ def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
     bottom = min(float(np.quantile(_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05)))
     magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
     few = style.spread(measured.frequency_hz, _POINTS)
-    phase.plot(
-        measured.frequency_hz[few],
-        style.phase_deg(seen[few]),
-        ".",
-        markersize=2.0,
-        color=style.GREY,
+    style.dots(
+        phase, measured.frequency_hz[few], style.phase_deg(seen[few]), size_pt=2.0, color=style.GREY
     )
     phase.plot(band.frequency_hz, style.phase_deg(band.response), color=style.BLUE)
     phase.set_ylabel("Phase (°)")

@@ -18,6 +18,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
 from analysis.report._folder import write_new
@@ -168,6 +170,11 @@ def rendered(figure: Figure, kind: FigureFormat) -> bytes:
         SVG has its text as text, and the same identifiers each time; PDF embeds TrueType fonts,
         as journals ask for.
     """
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.get_label_text():
+                # Else it is placed clear of the ticks, which are laid out twice more for it.
+                axis.set_label_coords(0, 0)
     buffer = io.BytesIO()
     if kind == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
@@ -268,6 +275,25 @@ def spread(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
     """Pick at most `count` points of a positive, increasing x, evenly over its logarithm."""
     targets = np.geomspace(x[0], x[-1], count)
     return np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
+
+
+def dots(
+    axes: Axes,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    *,
+    size_pt: float,
+    color: str,
+) -> None:
+    """Draw points as one stroke with round caps, which SVG writes in a third of markers' time."""
+    corners = np.repeat(np.column_stack([x, y]), 2, axis=0)
+    corners[1::2, 0] *= 1 + 1e-9  # Agg draws no caps where nothing lies between them
+    codes = np.tile([Outline.MOVETO, Outline.LINETO], len(x))
+    axes.add_artist(
+        PathPatch(
+            Outline(corners, codes), fill=False, color=color, linewidth=size_pt, capstyle="round"
+        )
+    )
 
 
 def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = True) -> None:

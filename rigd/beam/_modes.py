@@ -309,7 +309,7 @@ def _newton(
             slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
             step = residual / slope
             log_s = log_s - step
-            if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+            if not (np.abs(step) > 1e-12).any():  # nor where one is NaN
                 break
         scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _ON_THE_CUT)

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 PAGE_PORT: Final = 8720
 """Port of the page unless another is asked for."""
+_PROGRAM: Final = ("-m", "rigd.web")
 _MOST_STARTS: Final = 5
 """Starts in a row of which none has lasted."""
 _LASTING_S: Final = 60.0
@@ -115,7 +117,7 @@ class PageProcess:
         """Start one and wait for its end."""
         with held_back():
             process = subprocess.Popen(
-                [sys.executable, "-m", "rigd.web"],
+                [sys.executable, *_PROGRAM],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=os.environ | SINGLE_THREADED,
@@ -125,15 +127,15 @@ class PageProcess:
             process.kill()
         assert process.stdin is not None
         assert process.stdout is not None
+        told = {}
         with process:
-            try:
+            with suppress(OSError, ValueError):
                 process.stdin.write(json.dumps(self._job).encode() + b"\n")
                 process.stdin.flush()
-                told = json.loads(process.stdout.readline() or b"{}")
-            except (OSError, ValueError):
-                told = {}
-            if "port" in told:
-                self._tell(told["port"])
+                for line in process.stdout:
+                    told = json.loads(line)
+                    if "port" in told:
+                        self._tell(told["port"])
             code = process.wait()
         if not self._closing.is_set():
             _log.warning("page: its process ended with code %s: %s", code, told.get("error", ""))

@@ -17,7 +17,7 @@ import time
 from collections import Counter, deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Final, cast
 
 from rigd.daemon._address import peer_of
 from rigd.daemon._log import NAME
@@ -447,8 +447,11 @@ async def _connect(link: socket.socket, client: _Client) -> None:
         client.connection_lost(None)
 
 
+_text: Final = json.JSONEncoder(allow_nan=False).encode
+
+
 def _line(document: Document) -> bytes:
-    return json.dumps(document, allow_nan=False).encode() + b"\n"
+    return _text(document).encode() + b"\n"
 
 
 def _refusal(

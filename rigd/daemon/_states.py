@@ -205,7 +205,7 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
         "angle_rad": look.angle_rad,
         "coupling_torque_nm": look.coupling_torque_nm,
         "torque_command_nm": look.torque_command_nm,
-        "signals": None if look.signals is None else _finite(asdict(look.signals)),
+        "signals": None if look.signals is None else _finite(asdict(look.signals())),
         "health": {
             "missed": look.missed,
             "late": look.late,
@@ -255,7 +255,9 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
             name: base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
             for name, values in block.signals.items()
         },
-        "gauges": {
+        "gauges": None
+        if block.gauges is None
+        else {
             name: {
                 "value": gauge.value,
                 "limit": gauge.limit,

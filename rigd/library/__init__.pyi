@@ -1,4 +1,5 @@
 from ._index import INDEX_NAME as INDEX_NAME
+from ._row import REPORT_PAGE as REPORT_PAGE
 from ._row import SessionRow as SessionRow
 from ._sessions import LibraryError as LibraryError
 from ._sessions import list_sessions as list_sessions

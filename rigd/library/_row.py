@@ -15,7 +15,7 @@ SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
 """Name of the folder of a report: of which session, and which of its reports."""
-PAGE: Final = "report.html"
+REPORT_PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
 _MOST_JSON_BYTES: Final = 8 << 20
@@ -35,7 +35,7 @@ class SessionRow:
     """
 
     id: str
-    """Name of the file without its last suffix."""
+    """Name of the file without ``.mcap`` or, as long as it has no end, ``.mcap.part``."""
     path: Path
     """The file."""
     size_bytes: int
@@ -106,15 +106,16 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
     from rigd.session import SessionError, added_metadata, read_summary
 
     size = path.stat().st_size
+    name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
     results: dict[str, Any] = {"modes": _modes(look, report)}
-    if report is not None and (report / PAGE).is_file():
-        results["report"] = report / PAGE
+    if report is not None and (report / REPORT_PAGE).is_file():
+        results["report"] = report / REPORT_PAGE
     try:
         summary = read_summary(path)
     except SessionError as error:
         path.stat()  # which may have gone
         return SessionRow(
-            path.stem, path, size, outcome="unreadable", problem=printable(str(error)), **results
+            name, path, size, outcome="unreadable", problem=printable(str(error)), **results
         )
     metadata, outcome = summary.metadata, summary.outcome or {}
     ended = _text(outcome, "outcome") or "unknown"
@@ -127,7 +128,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
     rate_hz = _number(metadata, "rate_hz") or 0.0
     added = list(added_metadata(metadata).items())[:_MOST_META]
     return SessionRow(
-        id=path.stem,
+        id=name,
         path=path,
         size_bytes=size,
         start_utc_ns=_count(metadata, "start_utc_ns"),

@@ -10,8 +10,8 @@ from rigd.errors import UserError
 from rigd.library._index import Index, Stamped
 from rigd.library._row import (
     NUMBERS,
-    PAGE,
     REPORT_FOLDER,
+    REPORT_PAGE,
     SUFFIX,
     TORN_SUFFIX,
     SessionRow,
@@ -142,7 +142,9 @@ class _Found:
         if look is not None:
             self.stamp += f" look {_stamp_of(look)}"
         if report is not None:
-            self.stamp += f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / PAGE)}"
+            self.stamp += (
+                f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / REPORT_PAGE)}"
+            )
 
 
 def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, WhatMoves, reset_drive
+from rigd.devices import DeviceError, WhatMoves
 from rigd.engine import (
     CONTROL,
     LIVE,
@@ -318,6 +318,8 @@ class Rig:
 
     def _reset_fault(self, moving: WhatMoves | None) -> None:
         try:
+            from rigd.devices import reset_drive  # loads the drivers, which no other order needs
+
             reset_drive(self._profile.rig, moving)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,8 @@ from rigd.view import Gauge, Gauges
 _FIELDS: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _MOST_TICKS: Final = 2500
 """Most ticks of a block: in base64 its signals take less than a line of the socket."""
+_GAUGES_S: Final = 0.095
+"""Least time from gauges to the next: they cost more than the signals, and are read by eyes."""
 _ABANDONED_S: Final = 1.0
 """Nobody has looked for so long: what came meanwhile is left out."""
 
@@ -32,8 +34,8 @@ class SignalBlock:
     signals: dict[str, npt.NDArray[np.float32]]
     """Angle, its reference and the coupling torque by name, (n,) each; missed ticks are NaN. No
     tick at all between records."""
-    gauges: dict[str, Gauge]
-    """Peaks over these ticks."""
+    gauges: dict[str, Gauge] | None = None
+    """Peaks over all ticks since the last gauges; None where these are recent."""
 
     @property
     def count(self) -> int:
@@ -63,12 +65,15 @@ class SignalReader:
         self._gauges = Gauges(rig.rate_hz, gauge_limits(profile), time_constant_s)
         self._seen: tuple[Ring, Observer] | None = None
         self._looked_s = 0.0
+        self._gauged_s = 0.0
+        self._ungauged: list[npt.NDArray[Any]] = []
+        """Samples of the record since the last gauges."""
         self._heated_s = time.monotonic()
         self._last: int | None = None
         """Tick of the last sample of the record."""
 
     def take(self, channels: Channels) -> list[SignalBlock]:
-        """Return what has come since the last look, at least the gauges as they are now.
+        """Return what has come since the last look; the last block has gauges where they are due.
 
         Parameters
         ----------
@@ -80,9 +85,14 @@ class SignalReader:
         if self._seen is None or self._seen[0] is not ring or now_s > self._looked_s + _ABANDONED_S:
             self._seen = ring, Observer(ring)
             self._last = None
+            self._ungauged = []
             self._gauges.forget_angle()
         self._looked_s = now_s
         blocks = list(self._blocks(self._seen[1], ring.written))
+        if now_s - self._gauged_s < _GAUGES_S:
+            return blocks
+        self._gauged_s = now_s
+        gauges = self._take_gauges()
         if not blocks:
             at_work = board[Word.PHASE] != Phase.PREPARING
             peaks = {
@@ -91,8 +101,19 @@ class SignalReader:
                 "i2t": self._cool(0.0),
             }
             nothing = dict.fromkeys(_FIELDS, np.empty(0, dtype=np.float32))
-            blocks.append(SignalBlock(0, 0, nothing, self._gauges.beside(peaks)))
+            gauges = gauges or self._gauges.beside(peaks)
+            return [SignalBlock(0, 0, nothing, gauges)]
+        blocks[-1] = replace(blocks[-1], gauges=gauges)
         return blocks
+
+    def _take_gauges(self) -> dict[str, Gauge] | None:
+        """Return the gauges of the samples since the last ones; None if there are none."""
+        if not self._ungauged:
+            return None
+        samples = np.concatenate(self._ungauged)
+        self._ungauged = []
+        self._cool(samples.size / self._rate_hz)
+        return self._gauges.take(samples)
 
     def _blocks(self, observer: Observer, end: int) -> Iterator[SignalBlock]:
         while observer.next < end:
@@ -110,17 +131,20 @@ class SignalReader:
         first, last = int(ticks[0]), int(ticks[-1])
         before, self._last = self._last, last
         if before is None or before >= first:
+            self._take_gauges()  # what was left of the record before has heated the motor
             self._gauges.forget_angle()
         # Ticks missed between two blocks belong to the second one.
         elif first - before <= _MOST_TICKS:
             first = before + 1
-        signals = {}
-        for name in _FIELDS:
-            signals[name] = np.full(last - first + 1, np.nan, dtype=np.float32)
-            signals[name][ticks - first] = samples[name]
-        self._cool(samples.size / self._rate_hz)
+        signals = {name: samples[name].astype(np.float32) for name in _FIELDS}
+        if samples.size != last - first + 1:
+            for name in _FIELDS:
+                every = np.full(last - first + 1, np.nan, dtype=np.float32)
+                every[ticks - first] = signals[name]
+                signals[name] = every
+        self._ungauged.append(samples)
         t_ns = int(samples["t_ns"][0]) - round((int(ticks[0]) - first) * self._period_ns)
-        return SignalBlock(first, t_ns, signals, self._gauges.take(samples))
+        return SignalBlock(first, t_ns, signals)
 
     def _cool(self, covered_s: float) -> float:
         """Let the motor cool for the time since the last call that samples do not cover."""

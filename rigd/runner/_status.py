@@ -3,8 +3,9 @@
 import os
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -56,8 +57,11 @@ class SignalWatch:
         self._recent: deque[npt.NDArray[Any]] = deque()
         self._peaks = np.zeros(3)
 
-    def look(self, ring: Ring) -> SignalStatus | None:
-        """Take what has come since the last look; None as long as nothing has."""
+    def look(self, ring: Ring) -> Callable[[], SignalStatus] | None:
+        """Take what has come since the last look; None as long as nothing has.
+
+        The figures are computed when they are asked for: there are more looks than questions.
+        """
         if self._seen is None or self._seen[0] is not ring:
             recent = max(0, ring.written - round(_WINDOW_S * self._rate_hz))
             self._seen = ring, Observer(ring, recent)
@@ -68,14 +72,16 @@ class SignalWatch:
                 continue  # overwritten while it was copied
             for part in np.split(samples, np.flatnonzero(samples["tick"] == 0)):
                 self._take(part)
-        return self._status() if self._recent else None
+        if not self._recent:
+            return None
+        return partial(_figures, self._rate_hz, tuple(self._recent), self._peaks)
 
     def _take(self, samples: npt.NDArray[Any]) -> None:
         if samples.size == 0:
             return
         if samples["tick"][0] == 0:  # another record
             self._recent.clear()
-            self._peaks[:] = 0.0
+            self._peaks = np.zeros(3)
         signals = (
             samples["angle_reference_rad"] - samples["angle_rad"],
             samples["coupling_torque_nm"],
@@ -87,21 +93,24 @@ class SignalWatch:
         while self._recent[0]["t_ns"][-1] < oldest_ns:
             self._recent.popleft()
 
-    def _status(self) -> SignalStatus:
-        recent = np.concatenate(self._recent)
-        last = recent[-1]
-        span = int(last["tick"]) - int(recent["tick"][0]) + 1
-        late_us = 1e-3 * np.percentile(recent["lateness_ns"], (50, 99))
-        return SignalStatus(
-            rate_hz=self._rate_hz * recent.size / span,
-            lateness_p50_us=float(late_us[0]),
-            lateness_p99_us=float(late_us[1]),
-            work_p99_us=float(1e-3 * np.percentile(recent["work_ns"], 99)),
-            tracking_error_rad=float(last["angle_reference_rad"] - last["angle_rad"]),
-            peak_tracking_error_rad=float(self._peaks[0]),
-            peak_coupling_torque_nm=float(self._peaks[1]),
-            peak_torque_command_nm=float(self._peaks[2]),
-        )
+
+def _figures(
+    rate_hz: float, parts: tuple[npt.NDArray[Any], ...], peaks: npt.NDArray[np.float64]
+) -> SignalStatus:
+    recent = np.concatenate(parts)
+    last = recent[-1]
+    span = int(last["tick"]) - int(recent["tick"][0]) + 1
+    late_us = 1e-3 * np.percentile(recent["lateness_ns"], (50, 99))
+    return SignalStatus(
+        rate_hz=rate_hz * recent.size / span,
+        lateness_p50_us=float(late_us[0]),
+        lateness_p99_us=float(late_us[1]),
+        work_p99_us=float(1e-3 * np.percentile(recent["work_ns"], 99)),
+        tracking_error_rad=float(last["angle_reference_rad"] - last["angle_rad"]),
+        peak_tracking_error_rad=float(peaks[0]),
+        peak_coupling_torque_nm=float(peaks[1]),
+        peak_torque_command_nm=float(peaks[2]),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +171,8 @@ class RigStatus:
     """Free space on the disk of the session file; None before it is known."""
     view_dropped: int
     """Samples that the live view did not get."""
-    signals: SignalStatus | None
-    """Figures of the record; None before its first sample."""
+    signals: Callable[[], SignalStatus] | None
+    """Returns the figures of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     """Processes of the rig."""
     topics: tuple[TopicStatus, ...]

@@ -13,6 +13,7 @@ only.
 import struct
 from collections.abc import Iterable
 from enum import IntFlag
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -304,10 +305,21 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     -------
     array (n,) of bool
     """
-    fixed = np.ones(wire.shape, dtype=np.bool_)
-    for number, (name, kind) in enumerate(types.items(), start=1):
-        fixed &= wire[f"tag_{name}"] == field_tag(number, kind)
+    places, tags = _tags(wire.dtype, tuple(types.items()))
+    data = np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
+    fixed: npt.NDArray[np.bool_] = (data[:, places] == tags).all(axis=1)
     return fixed
+
+
+@cache
+def _tags(
+    wire_dtype: np.dtype[np.void], types: tuple[tuple[str, str], ...]
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
+    """Return where the tag bytes of a message are, and what they are."""
+    assert wire_dtype.fields is not None
+    places = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
+    tags = [field_tag(number, kind) for number, (_, kind) in enumerate(types, start=1)]
+    return np.array(places), np.array(tags, dtype=np.uint8)
 
 
 def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:

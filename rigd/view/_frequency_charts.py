@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import Status
-from rigd.spectral import RunningEstimate, RunningResponse
+from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
 from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
 from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
@@ -38,11 +38,18 @@ class SweepResponse:
         The session.
     last_hz
         Up to where the response is wanted.
+    every
+        Estimate only every so many of `analyze`'s bins, as far as the segments allow.
     """
 
-    def __init__(self, subject: "Subject", last_hz: float) -> None:
+    def __init__(self, subject: "Subject", last_hz: float, *, every: int = 1) -> None:
         self._first, end = subject.sweep
-        self._running = RunningResponse(subject.rate_hz, end - self._first, last_hz=last_hz)
+        samples = end - self._first
+        chosen = segmentation_of(samples, subject.rate_hz)
+        chosen = replace(chosen, nfft=max(chosen.nfft // every, chosen.segment_length))
+        self._running = RunningResponse(
+            subject.rate_hz, samples, last_hz=last_hz, segmentation=chosen
+        )
         self._at_rest: list[npt.NDArray[np.float64]] = []
         self._rest_rad: float | None = None
 

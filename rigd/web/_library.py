@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from aiohttp import web
 
-from rigd.library import SessionRow, list_sessions
+from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session import LOOK_SUFFIX, last_look, read_look
 from rigd.web._access import REPORT_POLICY, Access, object_of, refused
 from rigd.web._jobs import JobError, Jobs
@@ -29,7 +29,6 @@ _FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "un
 _EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
 _REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 _SESSION_RUNS: Final = "A session runs; files are converted when it has ended."
-_PAGE: Final = "report.html"
 
 
 class Library:
@@ -170,16 +169,16 @@ class Library:
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
         path = self._session(request)
-        found = next((row for row in await self.rows() if row.id == path.stem), None)
+        found = next((row for row in await self.rows() if row.path.name == path.name), None)
         if found is None or found.report is None:
             return refused(404, "There is no report of it.")
-        return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
+        return self._page_of(found.report.parent, request.match_info.get("name", REPORT_PAGE))
 
     async def _campaign(self, request: web.Request) -> web.StreamResponse:
         folder = self._inside(request.match_info["name"])
         if not folder.name.startswith("campaign.report"):
             return refused(404, "There is no such campaign.")
-        return self._page_of(folder, request.match_info.get("file", _PAGE))
+        return self._page_of(folder, request.match_info.get("file", REPORT_PAGE))
 
     def _page_of(self, folder: Path, name: str) -> web.StreamResponse:
         """Serve one file of a report, which must be a plain one in its folder."""
@@ -208,7 +207,7 @@ class Library:
             or not all(isinstance(name, str) for name in ids)
         ):
             return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
-        paths = [str(self._path(name)) for name in dict.fromkeys(ids)]
+        paths = sorted({str(self._path(name)) for name in ids})  # as they were recorded
         folder = self._free("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
         return self._queue("campaign", arguments, "", f"/api/campaign/{folder.name}/")

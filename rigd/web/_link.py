@@ -187,10 +187,11 @@ class DaemonLink:
     async def _note_silence(self) -> None:
         """Tell of a daemon from which nothing has come for a while."""
         while True:
-            await asyncio.sleep(_LOOK_S)
-            if not self._silent and time.monotonic() - self._heard_s > _SILENT_S:
+            left_s = self._heard_s + _SILENT_S - time.monotonic()
+            if left_s <= 0.0 and not self._silent:
                 self._silent = True
                 self._on_lost(f"The daemon has said nothing for {_SILENT_S:g} s.")
+            await asyncio.sleep(max(left_s, _LOOK_S))
 
     async def _keep_asking(self, writer: asyncio.StreamWriter) -> None:
         while True:

@@ -6,7 +6,6 @@ import logging
 import os
 import re
 import sys
-import time
 from collections.abc import Awaitable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -41,12 +40,12 @@ _STOPS: Final = 4
 _LONGEST_REQUEST: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
-_GAUGES_S: Final = 0.095
 _RESPONSE_S: Final = 1.0
 _GRACE_S: Final = 0.3
 _AT_WORK: Final = ("running", "stopping")
 _LEVELS: Final = {"complete": "info", "stopped": "warning"}
 """Levels of events that tell how a session ended."""
+_FAILED: Final = "The page's server has failed; the daemon starts it again."
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
 
@@ -79,7 +78,6 @@ class PageServer:
         self._status: Document | None = None
         self._lost: Document | None = None
         self._gauges: Document | None = None
-        self._gauges_s = 0.0
         self._strips = Strips()
         self._session: str | None = None
         self._response: SessionResponse | None = None
@@ -256,14 +254,9 @@ class PageServer:
             self.pages.send(self._strips.feed(block))
             if self._response is not None:
                 self._response.feed(block)
-        now_s = time.monotonic()
-        if now_s - self._gauges_s >= _GAUGES_S:
-            self._gauges_s = now_s
-            self._gauges = {
-                "type": "gauges",
-                **event["gauges"],
-                "frequency_hz": event["frequency_hz"],
-            }
+        if event["gauges"] is not None:
+            frequency_hz = event["frequency_hz"]
+            self._gauges = {"type": "gauges", **event["gauges"], "frequency_hz": frequency_hz}
             self.pages.send(self._gauges)
 
     def _lose(self, reason: str) -> None:
@@ -335,7 +328,7 @@ def _descriptions(text: str) -> dict[str, str]:
 def run_page() -> None:
     """Serve the page until standard input ends; its first line is the job.
 
-    Standard output gets one line: the port, or why there is no page.
+    Standard output gets the port, and why the page ends by itself, a line each.
     """
     ignore()
     # A terminal that is held (Ctrl-S) would hold all pages with it, and anybody who sends nonsense
@@ -350,20 +343,26 @@ async def _run(job: Document) -> None:
     try:
         server, _, listening = await open_page(job)
     except OSError as error:
-        told = {"error": f"port {job['port']} cannot be had: {error.strerror}"}
-        print(json.dumps(told), flush=True)  # noqa: T201 - the daemon reads it
+        _say(error=f"port {job['port']} cannot be had: {error.strerror}")
         return
-    print(json.dumps({"port": port_of(listening)}), flush=True)  # noqa: T201
+    _say(port=port_of(listening))
     running = asyncio.create_task(server.run())
     gone = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
     await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
-    if running.done():
-        running.result()
-    # The daemon has ended, however: its successor may want the port.
+    failed = running.done()
+    if failed:
+        _say(error=f"unexpected error ({running.exception()!r})")
+    # The successor of this process, or of a daemon that has ended, may want the port.
     listening.close()
-    server.end("The daemon has ended; start it with rigd serve.")
+    server.end(_FAILED if failed else "The daemon has ended; start it with rigd serve.")
     await asyncio.sleep(_GRACE_S)
-    os._exit(0)  # whoever still reads would be waited for
+    # Whoever still reads would be waited for, and the thread that reads standard input.
+    os._exit(1 if failed else 0)
+
+
+def _say(**told: Any) -> None:  # noqa: ANN401 - what JSON has
+    """Tell the daemon, which reads standard output."""
+    print(json.dumps(told), flush=True)  # noqa: T201
 
 
 async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.Server]:

@@ -28,8 +28,11 @@ Real = npt.NDArray[np.float64]
 STRIP_S: Final = 0.05
 """Time that a point of a strip stands for."""
 _KEPT_S: Final = 10.0
+_EVERY: Final = 4
+"""One bin in four of the 1/160 Hz of `analyze` is shown: still two in a segment's resolution."""
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
+_NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _SAMPLE: Final = np.dtype(
     [
         ("tick", np.int64),
@@ -47,18 +50,15 @@ class Block:
 
     first_tick: int
     rate_hz: float
-    angle_rad: Real
-    reference_rad: Real
-    torque_nm: Real
+    values: Real
+    """Angle (rad), its reference (rad) and coupling torque (N·m), (3, n)."""
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "Block":
         """Take it out of the daemon's event ``signals``."""
-        angle, reference, torque = (
-            np.frombuffer(base64.b64decode(event[name]), dtype="<f4").astype(np.float64)
-            for name in ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
-        )
-        return cls(event["first_tick"], event["rate_hz"], angle, reference, torque)
+        data = b"".join(base64.b64decode(event[name]) for name in _NAMES)
+        values = np.frombuffer(data, dtype="<f4").reshape(len(_NAMES), -1).astype(np.float64)
+        return cls(event["first_tick"], event["rate_hz"], values)
 
 
 # Strips
@@ -78,7 +78,7 @@ class Strips:
     def feed(self, block: Block) -> Document | None:
         """Take a block; return the points that it completes as the page is told them."""
         ticks = max(1, round(STRIP_S * block.rate_hz))
-        values = np.stack((block.angle_rad, block.reference_rad, block.torque_nm))
+        values = block.values
         missing = block.first_tick - self._end
         if missing < 0 or missing > _KEPT_S * block.rate_hz:
             self._points.clear()
@@ -97,10 +97,8 @@ class Strips:
         bins = waiting[:, : count * ticks].reshape(3, count, ticks)
         # Without those functions' warning of points of which nothing is known.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        columns = np.round(
-            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
-        )
-        points = [tuple(_known(column)) for column in columns.T]
+        extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DIGITS)
+        points = [tuple(_known(column)) for column in extremes.T]
         first, self._next = self._next, self._next + count
         self._points.extend(points)
         return _strip(first, points)
@@ -143,30 +141,34 @@ class SessionResponse:
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ)
+        self._sweep = SweepResponse(subject, LAST_HZ, every=_EVERY)
         self._thinning: Thinning | None = None
-        self._waiting: list[npt.NDArray[Any]] = []
+        self._waiting: list[Block] = []
         self._fresh = False
         self._reached_hz = 0.0
 
     def feed(self, block: Block) -> None:
         """Take a block; what is not known of it is left out."""
-        known = np.isfinite(block.angle_rad)
-        samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
-        samples["tick"] = (block.first_tick + np.arange(known.size))[known]
-        samples["angle_rad"] = block.angle_rad[known]
-        samples["angle_reference_rad"] = block.reference_rad[known]
-        samples["coupling_torque_nm"] = block.torque_nm[known]
-        if samples.size:
-            self._waiting.append(samples)
+        self._waiting.append(block)
         if len(self._waiting) >= _FED_AT_ONCE:
             self._feed_sweep()
 
     def _feed_sweep(self) -> None:
         """Feed what waits: a call for many blocks costs no more than one for a single block."""
-        if self._waiting:
-            self._sweep.feed(np.concatenate(self._waiting))
-            self._waiting.clear()
+        if not self._waiting:
+            return
+        values = np.concatenate([block.values for block in self._waiting], axis=1)
+        ticks = np.concatenate(
+            [block.first_tick + np.arange(block.values.shape[1]) for block in self._waiting]
+        )
+        self._waiting.clear()
+        known = np.isfinite(values[0])
+        if known.any():
+            samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
+            samples["tick"] = ticks[known]
+            for name, signal in zip(_NAMES, values, strict=True):
+                samples[name] = signal[known]
+            self._sweep.feed(samples)
             self._fresh = True
 
     def document(self) -> Document | None:

@@ -35,7 +35,8 @@ def rig():
         pytest.param("recorder", signal.SIGSTOP, 0.3, {"sweep_s": 1.5}, marks=pytest.mark.slow),
         # In a session of this process it is killed in tests/live/test_live_rig.py.
         pytest.param("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.5}, marks=pytest.mark.slow),
-        ("supervisor", signal.SIGSTOP, 0.3, {}),
+        # What its silence does is in tests/engine/test_attendance.py.
+        pytest.param("supervisor", signal.SIGSTOP, 0.3, {}, marks=pytest.mark.slow),
     ],
 )
 def test_the_drive_goes_off_and_the_record_stays(rig, tmp_path, victim, how, moment_s, others):

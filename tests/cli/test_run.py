@@ -67,7 +67,11 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     ("arguments", "ticks"),
     [
         (("hold", "--duration", "1", "--rest", "0.5"), 1500),
-        (("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"), 2000),
+        pytest.param(  # runs in tests/docs/test_readme.py as well
+            ("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"),
+            2000,
+            marks=pytest.mark.slow,
+        ),
         (
             ("multisine", "--amplitude", "0.01", "--period", "1", "--duration", "2", "--start-hz",
              "1", "--stop-hz", "20", "--rest", "0.5", "--ring-down", "0.5"),
@@ -127,17 +131,16 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
 
 
 def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):
-    def series(seed, repeat):
-        options = ("--seed", seed, "--repeat", repeat, "--note", "a series", *SHORT)
+    def series():
+        options = ("--seed", "5", "--repeat", "2", "--note", "a series", *SHORT)
         sessions = json.loads(rigd("run", "chirp", "--fast", "--json", *options).stdout)["sessions"]
         return [read_session(tmp_path / session["path"]) for session in sessions]
 
-    records, again, (other,) = series(5, 2), series(5, 2), series(6, 1)
+    records, again = series(), series()
     assert [record.metadata["series"] for record in records] == ["1 of 2", "2 of 2"]
     assert {record.metadata["note"] for record in records} == {"a series"}
     assert {record.metadata["simulation_seed"] for record in records} == {"5"}
     assert not np.array_equal(records[0].samples, records[1].samples)
-    assert not np.array_equal(records[0].samples, other.samples)
     for first, second in zip(records, again, strict=True):
         assert np.array_equal(first.samples, second.samples)
 
@@ -352,13 +355,13 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
 
 def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path):
     options = ("hold", "--duration", "1", "--fast", "--json")
-    processes = [start_rigd("run", *options) for _ in range(3)]
+    processes = [start_rigd("run", *options) for _ in range(2)]
     paths = set()
     for process in processes:
         output, errors = process.communicate(timeout=300)
         assert process.returncode == 0, errors
         paths.add(json.loads(output)["sessions"][0]["path"])
-    assert len(paths) == 3
+    assert len(paths) == 2
     assert {f"sessions/{path.name}" for path in tmp_path.glob("sessions/*")} == paths
 
 

@@ -125,6 +125,27 @@ def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, ca
         assert other.told[0] != f"http://127.0.0.1:{port}/"
 
 
+FAILING = """
+import rigd.web._server as server
+
+async def run(self):
+    raise RuntimeError("such a thing")
+
+server.PageServer.run = run
+server.run_page()
+"""
+
+
+def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog):
+    monkeypatch.setattr(_page, "_MOST_STARTS", 1)
+    monkeypatch.setattr(_page, "_PROGRAM", ("-c", FAILING))
+    page = serve()
+    page._thread.join(60.0)
+    assert not page._thread.is_alive()
+    assert "ended with code 1: unexpected error (RuntimeError('such a thing'))" in caplog.text
+    assert len(page.told) == 2  # it had an address
+
+
 def test_a_file_of_a_daemon_that_is_gone_is_no_address(runtime_folder):
     folder = runtime_folder / "rigd"
     folder.mkdir()

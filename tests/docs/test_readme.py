@@ -38,7 +38,8 @@ case "${0##*/} $*" in
     "rigd run chirp --fast --output sessions "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
     "rigd run modes "*) set -- "$@" --duration 20 --ring-down 3 ;;
-    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega ;;
+    "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega --figures png ;;
+    "analyze "*) set -- "$@" --types VI --figures png ;;
 esac
 exec "FOLDER/${0##*/}" "$@"
 """

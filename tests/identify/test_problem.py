@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, Plant
+from analysis.identify._noise import Noise
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._problem import Comparison, Objective
+from analysis.identify._refit import Refit
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
@@ -25,6 +27,27 @@ def test_the_gradient_is_that_of_the_cost(objective):
     for k, step in enumerate(1e-6 * np.eye(x.size)):
         after, before = (objective.normal_equations(x + s, weight).cost for s in (step, -step))
         assert 2 * here.gradient[k] == pytest.approx((after - before) / 2e-6, rel=2e-4)
+
+
+def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective, monkeypatch):
+    comparison, unknowns = objective.comparison, objective.unknowns
+    bins = comparison.frequency_hz.size
+    noise = Noise(np.full(bins, 1e-2), np.ones(bins, dtype=bool), ())
+    evaluated = []
+    linearise = Objective._linearise
+    monkeypatch.setattr(
+        Objective, "_linearise", lambda self, x: evaluated.append(x) or linearise(self, x)
+    )
+    start = unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
+    first = Refit.descend(comparison, unknowns, start, noise, max_evaluations=1)
+    evaluated.clear()
+    on = first.further(4)
+    going_on = len(evaluated)
+    evaluated.clear()
+    anew = Refit.descend(comparison, unknowns, first.x, noise, max_evaluations=4)
+    assert (on.x == anew.x).all()
+    assert on.cost == anew.cost < first.cost
+    assert going_on == len(evaluated) - 1 == 3
 
 
 def test_neither_free_decay_nor_a_drifting_zero_counts(objective):

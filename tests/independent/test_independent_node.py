@@ -46,6 +46,8 @@ RESTRICTED = {"x60E0": (6, "ro", 50000), "x60E1": (6, "ro", 50000), "x1800_3": (
 SPARSE = ("1005", "1006", "1007", "1019", "1029", "1400:5", "60B2", "60C2", "60E0", "60E1")
 
 
+# As tests/wire/test_drives_by_eds.py has it of the simulated drive; what follows is of this one.
+@pytest.mark.slow
 def test_session_fault_reset_session(trial, eds_file):
     # The machine that runs tests has other things to do.
     verdict = trial.play("drive", eds_file(**RESTRICTED), left_on=(), ignore_timing=True)
@@ -79,8 +81,9 @@ def test_session_on_a_drive_that_lacks_objects(trial, eds_file, without, accepte
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"x6502": (7, "ro", 0x1A5)}, "6502"),
-        ({"without": ("6071",)}, "6071"),
+        # Each is refused of a drive by script as well, in tests/devices/cia402.
+        pytest.param({"x6502": (7, "ro", 0x1A5)}, "6502", marks=pytest.mark.slow),
+        pytest.param({"without": ("6071",)}, "6071", marks=pytest.mark.slow),
         ({"without": ("1016", "1400:5")}, "1016"),
     ],
 )

@@ -78,6 +78,7 @@ def test_torn_and_foreign_files_are_listed_with_their_problem(record_briefly, tm
     )  # fmt: skip
     assert "rigd recover" in rows["torn.mcap.part"].problem
     assert rows["torn.mcap.part"].recorded is None
+    assert rows["torn.mcap.part"].id == "torn"
     for name in ("text.mcap", "empty.mcap", "folder.mcap"):
         assert rows[name].outcome == "unreadable"
         assert name in rows[name].problem
@@ -87,7 +88,7 @@ def test_a_session_that_is_being_recorded_is_told_from_a_torn_one(tmp_path):
     writer = SessionWriter(tmp_path / "now.mcap")
     writer.begin(START_UTC_NS, {"rate_hz": "1000.0", "specimen": "antenna 3"}, {}, {})
     (row,) = list_sessions(tmp_path)
-    assert (row.outcome, row.specimen) == ("recording", "antenna 3")
+    assert (row.id, row.outcome, row.specimen) == ("now", "recording", "antenna 3")
     writer.close({"outcome": "complete"})
     (row,) = list_sessions(tmp_path)
     assert (row.path.name, row.outcome, row.recorded) == ("now.mcap", "complete", 0)

@@ -1,17 +1,26 @@
-"""The page's server in a thread, in front of a daemon that only notes what it is asked."""
+"""The page's server before a daemon that only notes what it is asked, and the real daemon."""
 
 import asyncio
 import contextlib
 import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
+from pathlib import Path
 
 import pytest
+from processes import eventually
 
+from rigd.daemon import page_address
 from rigd.daemon._page import _job
 from rigd.profile import load_profile
 from rigd.web import _access, _server
 
+_RIGD = Path(sys.executable).parent / "rigd"
 TOKEN = "the-right-one"
 ACTING = ("start", "tare", "zero", "reset", "check")
 STATUS = {
@@ -71,7 +80,39 @@ class FakeDaemon:
             self.say(writer, event)
 
 
-class Served:
+class Requests:
+    """Requests to a page's server, byte by byte; it has a `port`."""
+
+    patience_s = 30.0
+
+    def connect(self):
+        return socket.create_connection(("127.0.0.1", self.port), self.patience_s)
+
+    def send(self, data):
+        """Send bytes; returns what is answered, to the end of the connection or of the answer."""
+        with self.connect() as link:
+            with contextlib.suppress(ConnectionError):  # it may be closed before all is sent
+                for block in [data] if isinstance(data, bytes) else data:
+                    link.sendall(block)
+            answer = b""
+            with contextlib.suppress(ConnectionError):
+                while block := link.recv(65_536):
+                    answer += block
+            return answer
+
+    def ask(self, method, target, headers=(), body=b""):
+        """Send a request; returns its status and what comes with it."""
+        given = {"Host": f"127.0.0.1:{self.port}", "Connection": "close"} | dict(headers)
+        if body:
+            given.setdefault("Content-Length", str(len(body)))
+        lines = [f"{method} {target} HTTP/1.1"]
+        lines += [f"{name}: {value}" for name, value in given.items() if value is not None]
+        answer = self.send("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
+        head, _, rest = answer.partition(b"\r\n\r\n")
+        return (int(head.split()[1]) if head else 0), head.decode("latin-1"), rest
+
+
+class Served(Requests):
     """A page's server in its own thread, and the daemon behind it."""
 
     def __init__(self, folder, path, profile):
@@ -121,31 +162,40 @@ class Served:
         self._thread.join(30.0)
         assert not self._thread.is_alive()
 
-    def connect(self):
-        return socket.create_connection(("127.0.0.1", self.port), 30.0)
 
-    def send(self, data):
-        """Send bytes; returns what is answered, to the end of the connection or of the answer."""
-        with self.connect() as link:
-            with contextlib.suppress(ConnectionError):  # it may be closed before all is sent
-                for block in [data] if isinstance(data, bytes) else data:
-                    link.sendall(block)
-            answer = b""
-            with contextlib.suppress(ConnectionError):
-                while block := link.recv(65_536):
-                    answer += block
-            return answer
+class Rig(Requests):
+    """The real daemon of a simulated rig, with its page."""
 
-    def ask(self, method, target, headers=(), body=b""):
-        """Send a request; returns its status and what comes with it."""
-        given = {"Host": f"127.0.0.1:{self.port}", "Connection": "close"} | dict(headers)
-        if body:
-            given.setdefault("Content-Length", str(len(body)))
-        lines = [f"{method} {target} HTTP/1.1"]
-        lines += [f"{name}: {value}" for name, value in given.items() if value is not None]
-        answer = self.send("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
-        head, _, rest = answer.partition(b"\r\n\r\n")
-        return (int(head.split()[1]) if head else 0), head.decode("latin-1"), rest
+    def __init__(self, process, name, folder, address):
+        self.process, self.name, self.folder, self.address = process, name, folder, address
+        url, _, self.token = address.partition("#token=")
+        self.port = int(url.rstrip("/").rpartition(":")[2])
+
+
+@contextlib.contextmanager
+def rig_with_page(write_profile_in, folder, *options):
+    """Start a daemon with its page, on a rig of its own."""
+    name = f"page-{os.getpid()}-{time.monotonic_ns()}"
+    profile = write_profile_in(folder, "sim", {"name": f'"{name}"'}, patient=True)
+    command = [_RIGD, "serve", "--profile", profile, "--output", folder / "out", "--web", *options]
+    told = folder / "serve.txt"
+    environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
+    with told.open("w") as said:
+        process = subprocess.Popen(
+            command, stdout=said, stderr=said, start_new_session=True, env=environment
+        )
+    try:
+        address = eventually(lambda: page_address(name), within_s=60.0)
+        assert address, told.read_text()
+        yield Rig(process, name, folder / "out", address)
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.terminate()
+        try:
+            process.wait(20.0)
+        finally:
+            process.kill()
+            process.wait()
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
     script = Path(hostile.__file__)
     count = 2 * len((*hostile.LOST_ONCE, *hostile.OTHERS))  # every second one is damaged
     code = f"import sys; sys.path.insert(0, {str(script.parent)!r}); import fuzz_hostile as f; "
-    code += f"wrong = f.fuzz({count}, 3, scale=0.02); sys.exit('\\n'.join(wrong) or 0)"
+    code += f"wrong = f.fuzz({count}, 3, scale=0.01); sys.exit('\\n'.join(wrong) or 0)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=1800
     )

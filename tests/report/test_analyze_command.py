@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 
-QUICK = ("--method", "welch", "--types", "I", "--weights", "const")
+QUICK = ("--method", "welch", "--types", "I", "--weights", "const", "--figures", "png")
 
 
 def run(*arguments, cwd):
@@ -339,7 +339,7 @@ def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, an
     look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
     assert analyze_here(*look, *QUICK).returncode == 0
     (tmp_path / "out" / "notes.txt").write_text("mine")
-    quick = ("--method", "welch", "--types", "II", "--weights", "const")
+    quick = (*QUICK, "--types", "II")
     assert analyze_here(*look, *quick).returncode == 0
     for path in ("fits.json", "out/analysis.json"):
         (fit,) = json.loads((tmp_path / path).read_text())["fits"]

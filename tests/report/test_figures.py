@@ -71,7 +71,7 @@ def test_one_panel_a_type(paper_analysis):
     assert [t.split()[1] for t in titles if t.startswith("Type")] == ["I", "III", "VI"]
     assert titles[-1] == "Coherence"
     # Noise about 180° must not jump to the other edge of the panel.
-    phase_deg = np.concatenate([line.get_ydata() for line in figure.axes[1].get_lines()[:4]])
+    phase_deg = np.concatenate([dots.get_path().vertices[:, 1] for dots in figure.axes[1].patches])
     assert phase_deg.max() > 180.0
     assert phase_deg.min() > -90.0
     lines = figure.axes[0].get_lines()

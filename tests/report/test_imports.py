@@ -46,7 +46,7 @@ from analysis.cli.sessions import Outputs, session_command
 from analysis.models import WelchSettings
 from analysis.results import Routes
 from contextlib import redirect_stdout
-routes = Routes(WelchSettings(), paper=True, whole_record=True, fixed=())
+routes = Routes(WelchSettings(), paper=True, whole_record=True, fixed=(), figures=("png",))
 with redirect_stdout(sys.stderr):
     assert session_command([Path(sys.argv[1])], routes, Outputs(Path(sys.argv[2]))) == 0
 print(*sys.modules)

@@ -11,7 +11,18 @@ import pytest
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is always full")
 
-QUICK = ("--method", "welch", "--frf", "fft", "--types", "I", "--weights", "const")
+QUICK = (
+    "--method",
+    "welch",
+    "--frf",
+    "fft",
+    "--types",
+    "I",
+    "--weights",
+    "const",
+    "--figures",
+    "png",
+)
 GREEK = """
 from analysis.cli.standard_streams import standard_streams
 with standard_streams():

@@ -47,6 +47,7 @@ def channels():
 def reader(profile, clock, channels):
     reader = SignalReader(profile)
     reader.take(channels)
+    clock.now_s += 0.1
     return reader
 
 
@@ -114,7 +115,24 @@ def test_who_comes_back_after_a_while_gets_no_old_samples(reader, channels, cloc
     assert block.first_tick == 100
 
 
-def test_the_gauges_are_peaks_beside_their_limits(reader, channels, profile):
+def test_gauges_come_ten_times_a_second_and_have_the_peaks_of_all_ticks(reader, channels, clock):
+    told = []
+    for first in range(0, 200, 50):
+        put(channels, range(first, first + 50), 0.3 if first == 50 else 0.1)
+        (block,) = reader.take(channels)
+        told.append(block.gauges and block.gauges["angle"].value)
+        clock.now_s += 0.05
+    assert told == [0.1, None, 0.3, None]
+    # What is left when the record ends is told with the next ones, without ticks.
+    put(channels, [200], 0.4)
+    clock.now_s -= 0.05
+    assert [block.gauges for block in reader.take(channels)] == [None]
+    clock.now_s += 0.05
+    (block,) = reader.take(channels)
+    assert (block.count, block.gauges["angle"].value) == (0, 0.4)
+
+
+def test_the_gauges_are_peaks_beside_their_limits(reader, channels, profile, clock):
     angle = np.array([0.0, 0.0, 0.003, -0.001])
     put(channels, range(4), angle, command_nm=-0.45, wrench=(0, -11.0, 0, 0, 0, 0.1))
     (block,) = reader.take(channels)
@@ -135,26 +153,28 @@ def test_the_gauges_are_peaks_beside_their_limits(reader, channels, profile):
     assert list(gauges)[:5] == ["angle", "velocity", "tracking_error", "torque_command", "i2t"]
     # The speed goes on over the edge of a block.
     put(channels, [5], [0.001])
+    clock.now_s += 0.1
     (block,) = reader.take(channels)
     assert block.gauges["velocity"].value == pytest.approx(1.0)
 
 
-def test_a_reading_that_is_no_number_is_not_told(reader, channels):
+def test_a_reading_that_is_no_number_is_not_told(reader, channels, clock):
     put(channels, range(3), [np.nan, np.inf, np.nan])
     (block,) = reader.take(channels)
     assert block.gauges["angle"].value is None
     put(channels, range(3, 5), [0.5, np.nan])
+    clock.now_s += 0.1
     (block,) = reader.take(channels)
     assert block.gauges["angle"].value == 0.5
 
 
 def test_the_motor_is_as_warm_as_the_limit_monitor_finds_it(reader, channels, profile, clock):
     motor, torque_nm = profile.rig.motor, 0.6
-    for first in range(0, 4000, 50):
+    for first in range(0, 4050, 50):
         clock.now_s += 0.05
         put(channels, range(first, first + 50), command_nm=torque_nm)
         (block,) = reader.take(channels)
-    passed = 1.0 - np.exp(-4.0 / motor.thermal_time_constant_s)
+    passed = 1.0 - np.exp(-4.05 / motor.thermal_time_constant_s)
     expected = torque_nm * np.sqrt(passed)
     assert block.gauges["i2t"].value == pytest.approx(expected, rel=0.01)
     assert block.gauges["i2t"].limit == motor.continuous_torque_nm

@@ -227,7 +227,7 @@ def test_comes_to_true_rest_while_the_beam_rings_on():
     record = run(plant, [0.0] * 30_000)
     stopped = np.flatnonzero(record[:, 1])[-1] + 1
     assert stopped < 25_000
-    assert np.unique(record[stopped:, 0]).size == 1
+    assert np.ptp(record[stopped:, 0]) <= 1e-16  # a rounding, on some builds of numpy
     torque = record[stopped:, 2]
     assert np.max(np.abs(torque)) <= 0.03  # what the friction holds
     # On the locked shaft the beam has its clamped–free first mode, 2.56 Hz, and decays.

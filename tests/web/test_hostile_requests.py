@@ -8,8 +8,9 @@ import time
 import zlib
 
 import pytest
-from web_daemon import TOKEN
+from web_daemon import TOKEN, rig_with_page
 
+from rigd.daemon import Client, find
 from rigd.web import _access
 
 START = json.dumps({"command": "start", "excitation": "chirp"}).encode()
@@ -27,19 +28,24 @@ def without(*names):
 
 @pytest.fixture(scope="module")
 def lure(served, tmp_path_factory):
-    """Files beside the folder of the sessions, and links in it that lead to them."""
+    """A file that is not to be read, and ways to it."""
     secret = tmp_path_factory.mktemp("elsewhere") / "secret.mcap"
-    secret.write_bytes(SECRET)
-    (served.folder / "link.mcap").symlink_to(secret)
-    (served.folder / "good.mcap").write_bytes(b"no session")
-    (served.folder / "link.look.json").symlink_to(secret)
-    (served.folder / "campaign.report").symlink_to(secret.parent)
-    (served.folder / "good.report").mkdir()
-    (served.folder / "good.report" / "report.html").write_text("a report")
-    (served.folder / "good.report" / "secret.html").symlink_to(secret)
-    (served.folder.parent / "secret.mcap").write_bytes(SECRET)
-    (served.folder / ".hidden.mcap").write_bytes(SECRET)
+    bait(served.folder, secret)
     return secret
+
+
+def bait(folder, secret):
+    """Put files beside the folder of the sessions, and links into it that lead to them."""
+    secret.write_bytes(SECRET)
+    (folder / "link.mcap").symlink_to(secret)
+    (folder / "good.mcap").write_bytes(b"no session")
+    (folder / "link.look.json").symlink_to(secret)
+    (folder / "campaign.report").symlink_to(secret.parent)
+    (folder / "good.report").mkdir()
+    (folder / "good.report" / "report.html").write_text("a report")
+    (folder / "good.report" / "secret.html").symlink_to(secret)
+    (folder.parent / "secret.mcap").write_bytes(SECRET)
+    (folder / ".hidden.mcap").write_bytes(SECRET)
 
 
 @pytest.fixture(autouse=True)
@@ -307,3 +313,59 @@ def test_more_connections_than_are_served_are_turned_away(served, hurried):
     for link in links:
         assert link.recv(1) == b""  # at once, or because they say nothing
         link.close()
+
+
+@pytest.fixture
+def rig(tmp_path, tmp_path_factory, write_profile_in):
+    """The real daemon with its page, time skipped, and a file that is not to be read."""
+    with rig_with_page(write_profile_in, tmp_path, "--fast") as rig:
+        rig.folder.mkdir(exist_ok=True)
+        bait(rig.folder, tmp_path_factory.mktemp("elsewhere") / "secret.mcap")
+        yield rig
+
+
+def test_the_real_daemon_obeys_none_of_them_and_runs_a_session_afterwards(rig):
+    def meant(headers):
+        """Give headers the daemon's own token, where they have that of these tests."""
+        return {name: text and text.replace(TOKEN, rig.token) for name, text in headers.items()}
+
+    def refused(method, target, headers=(), body=b""):
+        status, _, answer = rig.ask(method, target, meant(dict(headers)), body)
+        assert 400 <= status < 500, (method, target, status)
+        assert not any(secret in answer for secret in (SECRET, b"root:", rig.token.encode()))
+
+    with Client(find(rig.name)) as client:
+
+        def status():
+            told = client.ask("status")
+            return told["state"], told["series"], told["controller"], told["last_check"]
+
+        while status()[0] != "ready":
+            time.sleep(0.02)
+        for headers in WITHOUT_RIGHT.values():
+            refused("POST", "/api/command", headers, START)
+        for command in ("tare", "zero", "reset", "check"):
+            body = json.dumps({"command": command}).encode()
+            refused("POST", "/api/command", without("Authorization"), body)
+        for body in BODIES.values():
+            refused("POST", "/api/command", RIGHT, body)
+        for target in READS:
+            refused("GET", target)
+        for ids in (["good", "../secret"], ["good", "link"], ["good", "--jobs"]):
+            refused("POST", "/api/campaign", RIGHT, json.dumps({"ids": ids}).encode())
+        rig.patience_s = 0.2  # for what waits for more that does not come
+        for data in GARBAGE.values():
+            with contextlib.suppress(TimeoutError):
+                answer = rig.send(data)
+                assert answer == b"" or answer.split()[1][:1] == b"4"
+        assert status() == ("ready", None, None, None)
+
+        rig.patience_s = 30.0
+        parameters = {"duration_s": 2.0, "rest_s": 0.1, "ring_down_s": 0.1}
+        request = {"command": "start", "excitation": "chirp", "parameters": parameters}
+        body = json.dumps(request).encode()
+        assert rig.ask("POST", "/api/command", meant(RIGHT), body)[0] == 200
+        while (series := client.ask("status")["series"])["running"]:
+            time.sleep(0.02)
+        assert [session["outcome"] for session in series["sessions"]] == ["complete"]
+    assert rig.process.poll() is None

@@ -2,69 +2,29 @@
 
 import contextlib
 import os
+import re
 import resource
 import signal
-import subprocess
-import sys
 import time
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import expect
-from processes import child_running, eventually
+from processes import child_running
+from web_daemon import rig_with_page
 
-from rigd.daemon import page_address
-
-RIGD = Path(sys.executable).parent / "rigd"
 TELL_S = 1.0
 """Within this time the page has to say what the daemon has seen."""
 END_MS = 60_000
 """For what the rig or the analysis does, on a computer that is overloaded."""
 
 
-@dataclass
-class Served:
-    """A daemon with its page."""
-
-    process: subprocess.Popen
-    address: str
-
-
-@contextlib.contextmanager
-def served(profile, name, folder, *options):
-    command = [RIGD, "serve", "--profile", profile, "--output", folder / "out", "--web", *options]
-    told = folder / "serve.txt"
-    environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
-    with told.open("w") as said:
-        process = subprocess.Popen(
-            command, stdout=said, stderr=said, start_new_session=True, env=environment
-        )
-    try:
-        address = eventually(lambda: page_address(name), within_s=60.0)
-        assert address, told.read_text()
-        yield Served(process, address)
-    finally:
-        process.send_signal(signal.SIGCONT)
-        process.terminate()
-        try:
-            process.wait(20.0)
-        finally:
-            process.kill()
-            process.wait()
-
-
 @pytest.fixture
-def serve(tmp_path, write_profile):
+def serve(tmp_path, write_profile_in):
     """Start a daemon with its page, on a rig of this test's own."""
     with contextlib.ExitStack() as ending:
-
-        def start(*options):
-            name = f"page-{os.getpid()}-{time.monotonic_ns()}"
-            profile = write_profile("sim", {"name": f'"{name}"'}, patient=True)
-            return ending.enter_context(served(profile, name, tmp_path, *options))
-
-        yield start
+        yield lambda *options: ending.enter_context(
+            rig_with_page(write_profile_in, tmp_path, *options)
+        )
 
 
 @pytest.fixture
@@ -115,8 +75,8 @@ def rows(page, count, outcome):
     says(page, "#rows tr >> nth=0", outcome)
 
 
-def test_an_operator_watches_a_session_in_real_time_and_stops_it(operate):
-    _, page = operate()
+def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(operate, open_page):
+    daemon, page = operate()
     start(page)
     says(page, "#phase", "recording")
     says(page, "#frequency", "Hz")
@@ -128,59 +88,6 @@ def test_an_operator_watches_a_session_in_real_time_and_stops_it(operate):
     says(page, "#state-reason", "was stopped")
     assert delay_s(page, "READY", "→ ready: chirp was stopped") < TELL_S
     rows(page, 1, "stopped")
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param(("--fast",), id="fast"),
-        pytest.param((), id="real-time", marks=pytest.mark.slow),
-    ],
-)
-def test_a_new_operator_runs_stops_reports_and_compares_sessions(operate, open_page, options):
-    daemon, page = operate(*options)
-    page.click("#predict")
-    says(page, "#prediction", "Predicted peaks")
-    says(page, "#prediction", "Largest allowed")
-
-    # A chirp of 10 s to its end; a longer one, stopped; and the first once more.
-    start(page)
-    rows(page, 1, "complete")
-    page.fill("#parameter-duration_s", "600")
-    start(page)
-    says(page, "#phase", "recording")
-    page.click("#stop")
-    rows(page, 2, "stopped")
-    page.fill("#parameter-duration_s", "10")
-    start(page)
-    rows(page, 3, "complete")
-
-    looks = page.locator("#event-list li", has_text="Quick look at ")
-    expect(looks).to_have_count(3, timeout=2 * END_MS)
-    row = "#rows tr[id] >> nth=0"
-    page.click(f"{row} >> button.link >> nth=0")
-    says(page, ".detail:not([hidden])", "Mean coherence")
-    if options:  # in real time, missed ticks may leave nothing to identify
-        says(page, f"{row} >> .modes", "Hz")
-        says(page, ".detail:not([hidden])", "95 % interval")
-    says(page, "#event-list", "Complete: ")
-    for number in (0, 2):
-        page.check(f"#rows tr[id] >> nth={number} >> input")
-    page.click("#overlay")
-    says(page, "#comparison-keys", "antenna 3")
-    expect(page.locator("#comparison-keys .key")).to_have_count(2)
-    page.click(f"{row} >> text=Make report")
-    report = page.locator("#sessions-result a")
-    expect(report).to_have_text("open the report", timeout=2 * END_MS)
-    address = daemon.address.split("#")[0].rstrip("/") + report.get_attribute("href")
-    assert not open_page.complaints
-    assert "antenna 3" in open_page(address).inner_text("body")
-    # A report has no origin, and so no icon of the page's.
-    open_page.complaints.clear()
-
-
-def test_what_fails_is_told_within_a_second(operate, open_page):
-    daemon, page = operate()
 
     def begin():
         start(page)
@@ -217,3 +124,71 @@ def test_what_fails_is_told_within_a_second(operate, open_page):
     assert page.evaluate("() => window.told.OFFLINE") - killed_s < TELL_S
     # The page's server ends too, and the browser tells that it finds nobody.
     open_page.complaints.clear()
+
+
+@pytest.mark.parametrize(
+    ("options", "reports"),
+    [
+        pytest.param(("--fast",), False, id="fast"),
+        # Reports and campaigns take longer than all else.
+        pytest.param(("--fast",), True, id="fast-reports", marks=pytest.mark.slow),
+        pytest.param((), True, id="real-time", marks=pytest.mark.slow),
+    ],
+)
+def test_a_new_operator_runs_stops_reports_and_compares_sessions(
+    operate, open_page, options, reports
+):
+    daemon, page = operate(*options)
+    page.click("#predict")
+    says(page, "#prediction", "Predicted peaks")
+    says(page, "#prediction", "Largest allowed")
+
+    # A chirp of 10 s to its end; a longer one, stopped; and the first once more.
+    start(page)
+    rows(page, 1, "complete")
+    page.fill("#parameter-duration_s", "600")
+    start(page)
+    says(page, "#phase", "recording")
+    page.click("#stop")
+    rows(page, 2, "stopped")
+    page.fill("#parameter-duration_s", "10")
+    start(page)
+    rows(page, 3, "complete")
+
+    looks = page.locator("#event-list li", has_text="Quick look at ")
+    expect(looks).to_have_count(3, timeout=2 * END_MS)
+    row = "#rows tr[id] >> nth=0"
+    page.click(f"{row} >> button.link >> nth=0")
+    says(page, ".detail:not([hidden])", "Mean coherence")
+    if options:  # in real time, missed ticks may leave nothing to identify
+        says(page, f"{row} >> .modes", "Hz")
+        says(page, ".detail:not([hidden])", "95 % interval")
+    says(page, "#event-list", "Complete: ")
+    for number in (0, 2):
+        page.check(f"#rows tr[id] >> nth={number} >> input")
+    page.click("#overlay")
+    says(page, "#comparison-keys", "antenna 3")
+    expect(page.locator("#comparison-keys .key")).to_have_count(2)
+    if not reports:
+        return
+    page.click(f"{row} >> text=Make report")
+    report = page.locator("#sessions-result a")
+    expect(report).to_have_text("open the report", timeout=2 * END_MS)
+    assert "antenna 3" in report_of(daemon, open_page, report)
+
+    if options:  # in real time, missed ticks may leave nothing to fit
+        page.click("#campaign")
+        expect(report).to_have_attribute("href", re.compile("campaign"), timeout=2 * END_MS)
+        told = report_of(daemon, open_page, report)
+        assert "antenna 3" in told
+        assert "2 sessions" in told
+
+
+def report_of(daemon, open_page, link):
+    """Open the report that a link of the page leads to; returns what it says."""
+    assert not open_page.complaints
+    address = daemon.address.split("#")[0].rstrip("/") + link.get_attribute("href")
+    text = open_page(address).inner_text("body")
+    # A report has no origin, and so no icon of the page's.
+    open_page.complaints.clear()
+    return text

@@ -84,6 +84,29 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert "second" in overlay["errors"][0]
 
 
+@pytest.mark.parametrize(
+    ("look", "status"),
+    [
+        (b"[" * 100_000, 404),
+        (b'{"version": 1, "response": ' * 50_000, 404),
+        (b'{"version": 1, "peak": 1e999, "response": {"magnitude": [1e999, NaN]}}', 200),
+        (b'{"version": 1, "response": [1]}', 200),
+        (b"7", 404),
+    ],
+    ids=["nested lists", "nested objects", "no numbers", "no response", "no look"],
+)
+def test_a_damaged_look_breaks_neither_list_nor_overlay(served, two, look, status):
+    (served.folder / "first.look.json").write_bytes(look)
+    assert [row["id"] for row in get(served, "/api/sessions")[2]["sessions"]] == ["second", "first"]
+    found, _, body = served.ask("GET", "/api/sessions/first/look")
+    assert found == status
+    json.loads(body, parse_constant=pytest.fail)
+    _, _, overlay = get(served, "/api/frf?ids=first")
+    assert (overlay["responses"], len(overlay["errors"])) == ([], 1)
+    finding = served.server._library.last_response("antenna", "second")
+    assert asyncio.run_coroutine_threadsafe(finding, served.loop).result(30.0) is None
+
+
 def test_another_format_is_made_and_sent(served, two):
     assert eventually(lambda: not served.server._jobs.paused)
     status, head, body = get(served, "/api/sessions/first/file.mat")

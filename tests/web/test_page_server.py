@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
+from collections import deque
 
 import aiohttp
 import numpy as np
@@ -44,11 +46,18 @@ def pages(served):
     return Pages(served)
 
 
+LINES = weakref.WeakKeyDictionary()
+"""What has come over a WebSocket and has not been looked at."""
+
+
 async def until(socket, kind, **members):
     """Wait for a message of a type; returns it with all that came before."""
     before = []
-    async for message in socket:
-        told = json.loads(message.data)
+    lines = LINES.setdefault(socket, deque())
+    while lines or (message := await socket.receive()).type is aiohttp.WSMsgType.TEXT:
+        if not lines:
+            lines.extend(message.data.split("\n"))
+        told = json.loads(lines.popleft())
         if told["type"] == kind and members.items() <= told.items():
             return told, before
         before.append(told)

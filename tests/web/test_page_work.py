@@ -60,6 +60,7 @@ def test_a_start_sends_what_the_form_says(server, page):
     page.fill("#parameter-amplitude_rad", "0,02")
     page.fill("#parameter-taper_s", "")
     page.fill("#repeat", "2")
+    page.check("#force")
     page.fill("#operator", "R. Igge")
     page.fill("#specimen", "antenna 3")
     page.fill("#metadata-rows input:nth-child(2)", "21,4")
@@ -72,7 +73,7 @@ def test_a_start_sends_what_the_form_says(server, page):
     assert server.asked == [("start", True)]
     assert server.requests == [
         {
-            "command": "start", "excitation": "chirp", "repeat": 2,
+            "command": "start", "excitation": "chirp", "repeat": 2, "force": True,
             "parameters": {
                 "amplitude_rad": 0.02, "start_hz": 0.05, "stop_hz": 50, "duration_s": 120,
                 "rest_s": 1, "ring_down_s": 15,
@@ -83,6 +84,7 @@ def test_a_start_sends_what_the_form_says(server, page):
             },
         }
     ]  # fmt: skip
+    assert not page.is_checked("#force")  # it is asked for again
 
 
 def test_each_excitation_has_its_own_parameters_with_units(page):

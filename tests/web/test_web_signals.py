@@ -17,7 +17,7 @@ def block(first, angle, reference=None, torque=None):
     angle = np.asarray(angle, dtype=float)
     reference = angle if reference is None else np.asarray(reference, dtype=float)
     torque = -angle if torque is None else np.asarray(torque, dtype=float)
-    return Block(first, RATE_HZ, angle, reference, torque)
+    return Block(first, RATE_HZ, np.stack((angle, reference, torque)))
 
 
 def test_a_block_is_what_the_event_tells():
@@ -26,8 +26,8 @@ def test_a_block_is_what_the_event_tells():
         for k, name in enumerate(("angle_rad", "angle_reference_rad", "coupling_torque_nm"))
     }
     found = Block.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
-    assert (found.first_tick, found.reference_rad[0], found.torque_nm[0]) == (7, 1.0, 2.0)
-    assert np.isnan(found.angle_rad[1])
+    assert (found.first_tick, found.values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
+    assert np.isnan(found.values[0, 1])
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 51, 400])

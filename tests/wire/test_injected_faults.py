@@ -81,10 +81,12 @@ def rows(heading):
 
 
 AGAIN = {
+    "angle lost",
     "bus cut",
     "controlword corrupted",
     "drive restarts",
     "drive's heartbeat lost",
+    "encoder jumps",
     "gauge at its end",
     "half of each wrench lost",
     "loop's frames lost",
@@ -93,6 +95,7 @@ AGAIN = {
     "sensor silent",
     "statusword corrupted",
     "stream reports an error",
+    "stream silent",
     "streaming sensor restarts",
     "torque commands lost",
     "wrench lost",

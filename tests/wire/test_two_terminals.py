@@ -55,7 +55,9 @@ def _undisturbed(session) -> np.ndarray:
     return error[: first if began_at_rest else 0]
 
 
-@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("antenna_can", marks=pytest.mark.slow), "antenna_serial"]
+)
 def test_a_chirp_through_the_wires_is_recorded_whole(
     name, quiet_profile, start_simulator, run_chirp, drive_log, tmp_path
 ):

@@ -46,11 +46,13 @@ export class Link {
     const socket = new WebSocket(`${scheme}://${location.host}/api/live`);
     this.#socket = socket;
     socket.addEventListener("message", ({ data }) => {
-      const message = JSON.parse(data);
       this.heard = performance.now();
       this.#wait = FIRST_WAIT_MS;
-      if (message.type === "stop") this.#endStops(message);
-      this.#tell(message.type, message);
+      for (const line of data.split("\n")) {
+        const message = JSON.parse(line);
+        if (message.type === "stop") this.#endStops(message);
+        this.#tell(message.type, message);
+      }
     });
     socket.addEventListener("close", () => {
       this.#endStops(null);

@@ -113,7 +113,8 @@ export class Sessions {
     return [row, detail];
   }
 
-  #files({ id, report, modes }) {
+  #files({ id, path, report }) {
+    if (path?.endsWith(".part")) return ["–"];  // without its end there is nothing to send
     const at = `/api/sessions/${encodeURIComponent(id)}`;
     const links = ["mcap", "mat", "uff"].map((ending) =>
       make("a", { href: `${at}/file.${ending}`, download: `${id}.${ending}` }, `.${ending}`));

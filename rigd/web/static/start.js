@@ -158,7 +158,8 @@ export class StartForm {
       meta[name.value.trim()] = unitOf(name.value.trim()) && Number.isFinite(number) ? number : text;
     }
     if (Object.keys(meta).length) notes.meta = meta;
-    return { excitation: byId("excitation").value, parameters, repeat, notes };
+    const force = byId("force").checked;
+    return { excitation: byId("excitation").value, parameters, repeat, notes, force };
   }
 
   async #predict() {
@@ -180,6 +181,7 @@ export class StartForm {
     byId("start-button").disabled = true;  // until the state is told again: one press, one session
     const reply = await this.#link.command("start", request);
     if (reply.ok) {
+      byId("force").checked = false;  // for one session: the next one is asked for again
       this.#prediction.show(reply.plan, null);
     } else {
       this.#enable(this.#state);
