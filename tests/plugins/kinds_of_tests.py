@@ -13,13 +13,13 @@ import pytest
 STARTS = {
     "subprocess", "fork", "Rig", "ProcessGroup", "Child", "run_in_foreground", "run_session",
     "run_alone", "process_pool", "LocalCluster", "Scene", "play", "busy", "attend",
-    "QuickLooks",
+    "QuickLooks", "PageProcess", "play_left_on",
 }  # fmt: skip
 """Names by which processes are started, or all that one does is run in the test's."""
 FITS = {
     "select", "fit_record", "fit_frf", "analyse", "analyse_session", "campaign", "CandidateSet",
     "Refit", "Comparison", "identify", "estimate_motor", "analyze_here", "judged",
-    "look_at",
+    "look_at", "fit_many",
 }  # fmt: skip
 """Names by which models are fitted."""
 

@@ -7,6 +7,8 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 
+pytestmark = pytest.mark.fit  # by the command, which plugins/kinds_of_tests does not follow
+
 
 @pytest.fixture(scope="module")
 def done(write_session, make_signals, tmp_path_factory):
