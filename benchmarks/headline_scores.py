@@ -208,7 +208,7 @@ class Scored:
     orders : dict
         By name: true value, status, interval or None.
     named : list of str
-        What was found beside the beam.
+        Other effects found.
     """
 
     cell: str

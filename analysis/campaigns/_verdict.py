@@ -34,7 +34,7 @@ _SHOWN: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
 
 @dataclass(frozen=True, slots=True)
 class CommonFinding:
-    """One thing that one or more sessions hold beside the beam.
+    """One thing besides the beam that one or more sessions show.
 
     Attributes
     ----------

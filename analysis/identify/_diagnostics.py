@@ -1,4 +1,4 @@
-"""Diagnostics of a record: what is in it beside the beam of Eq. 25, each by its name and size.
+"""Diagnostics of a record: effects other than the beam of Eq. 25, by name and size.
 
 Settings at the edge of what is searched or not as the file states them, disturbances of the torque,
 forces that are not linear, drag, a free decay at the start, and what remains unexplained.

@@ -1,4 +1,4 @@
-"""Finding: one thing found in a record beside the beam of Eq. 25."""
+"""Finding: an effect in a record other than the beam of Eq. 25."""
 
 from __future__ import annotations
 

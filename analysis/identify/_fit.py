@@ -145,7 +145,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
     x : ndarray, shape (k,)
         The minimum.
     noise : Noise
-        What was taken for noise when it was found.
+        Noise model when it was found.
     """
     unknowns, comparison = objective.unknowns, objective.comparison
     at = objective.linearise(x)

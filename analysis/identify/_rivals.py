@@ -71,7 +71,7 @@ def with_extras(field: CandidateSet) -> CandidateSet:
     freed = field.ranked((*field.candidates, *found))
     best = freed.best
     if best.extras and best.fit.cost < _QUIETER * field.best.fit.cost:
-        # Part of what was taken for noise was not.
+        # Part of the noise model was not noise.
         freed = freed.under(freed.refit(best, 1).noise_here())
     return freed.cross_checked()
 

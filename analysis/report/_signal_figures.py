@@ -196,7 +196,7 @@ _CLOSE: Final[tuple[Look, ...]] = (
     {"color": style.BLUE, "linewidth": 1.0},
     {"color": style.VERMILION, "linewidth": 0.8},
 )
-"""Measured and modelled torque and what is left, in a detail."""
+"""Measured and modelled torque and residual, in a detail."""
 
 
 def _whole(

@@ -1,6 +1,6 @@
 """Process of the operator's page: started by the daemon, started again, and never waited for.
 
-It is given a token that whoever wants to act on the page has to know. Address and token stand in a
+It is given a token that is needed to act on the page. Address and token stand in a
 file of this user's runtime folder as long as the daemon runs.
 """
 

@@ -3,7 +3,7 @@
 Nothing that a client does may cost the supervisor of a running session more than a moment: lines
 are short, taken one at a time, and at a bounded pace; what a client does not read is kept up to a
 limit, beyond which it is dropped. A connection counts as a client once it has said a whole line,
-and whoever says `stop` in it is obeyed, however many others there are.
+and a `stop` is always obeyed, with any number of clients.
 """
 
 import asyncio

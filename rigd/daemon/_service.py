@@ -567,7 +567,7 @@ class Service:
         try:
             self._publish_signals()  # the last ones come before the end is told
         except Exception:
-            _log.exception("the last signals could not be told")
+            _log.exception("the last signals could not be sent")
         series.running = False
         series.failed = bool(fault or (series.reason and not series.stop.requested))
         self._states.move(*series.state_after(fault))

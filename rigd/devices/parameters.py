@@ -185,12 +185,12 @@ class ServoDrive:
     """The drive's EDS file; its types are used, and its identity has to be the drive's. Empty:
     none."""
     set_objects: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """Objects of the maker's own to be written at the start, each ``"index:sub type value"``; see
+    """Manufacturer-specific objects written at the start, each ``"index:sub type value"``; see
     `rigd.devices.cia402`."""
     accept_without: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
     """What this drive may lack, by names of `rigd.devices.cia402.ACCEPTABLE`."""
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
-    """After how long a watchdog of the maker's own takes the torque off when SYNC and RPDO stay
+    """After how long the drive's own watchdog takes the torque off when SYNC and RPDO stay
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
     sync_gaps: bool = field(default=True, metadata=OPTIONAL)
     """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late.

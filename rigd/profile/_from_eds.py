@@ -60,7 +60,7 @@ QUESTIONS = (
 _OTHER = "The previous value was of another drive."
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
-    "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
+    "The drive's own watchdog that removes the torque if this computer stops communicating, s "
     "(0: none)",
 )
 
@@ -276,7 +276,7 @@ class Draft:
                 yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
 
     def _own_limits(self) -> str:
-        """Name objects of the maker's own that may limit the torque."""
+        """Name manufacturer-specific objects that may limit the torque."""
         found = [
             f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
             for e in self._eds.entries.values()

@@ -45,7 +45,7 @@ def address_files(pattern: str, *folders: Path) -> list[Path]:
 def announce(path: Path, address: Mapping[str, object]) -> None:
     """Write down an address for this user only, until it is withdrawn.
 
-    Whoever reads it meanwhile gets the old or the new one. The folder is made.
+    A reader meanwhile gets the old or the new one. The folder is created.
 
     Parameters
     ----------

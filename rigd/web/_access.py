@@ -74,7 +74,7 @@ class Access:
     Parameters
     ----------
     token
-        What whoever acts has to know.
+        Secret needed to act.
     """
 
     def __init__(self, token: str) -> None:

@@ -106,7 +106,7 @@ def test_a_profile_whose_eds_is_none_fails(rigd, profile_with, tmp_path, monkeyp
     (tmp_path / "x.eds").write_bytes(b"\0" * 1000)
     done = rigd("check", "--profile", profile_with('eds = "x.eds"'), "--json")
     assert done.returncode == 1
-    assert "x.eds: is no EDS file" in rows_of(done)[0]["found"]
+    assert "x.eds: is not an EDS file" in rows_of(done)[0]["found"]
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\0\1\2", b"<xml/>"])

@@ -70,9 +70,9 @@ def test_only_new_files_are_written(tmp_path):
     path = tmp_path / "a.toml"
     check_new(path)
     write_new(path, "one")
-    with pytest.raises(ProfileError, match="is there already"):
+    with pytest.raises(ProfileError, match="exists and is not overwritten"):
         write_new(path, "two")
-    with pytest.raises(ProfileError, match="is there already"):
+    with pytest.raises(ProfileError, match="exists and is not overwritten"):
         check_new(path)
     assert path.read_text() == "one"
     with pytest.raises(ProfileError, match="cannot be written"):

@@ -132,7 +132,7 @@ def test_a_name_has_to_be_fit_for_files(refuse, name):
         ),
         ('set_objects = ["3001:2 f32 2500"]', r"set_objects\[0\] .*unknown type 'f32'"),
         ('set_objects = ["3001:2 u8 256"]', r"set_objects\[0\] .*u8 does not hold \(0 to 255\)"),
-        ('set_objects = ["3001:2 u8 abc"]', r"set_objects\[0\] .*no whole number"),
+        ('set_objects = ["3001:2 u8 abc"]', r"set_objects\[0\] .*not a whole number"),
         ('set_objects = ["6072 u16 100"]', r"set_objects\[0\] .*rigd sets itself"),
         ('set_objects = ["6071 i16 100"]', r"set_objects\[0\] .*rigd sets itself"),
         ('set_objects = ["1600:1 u32 1"]', r"set_objects\[0\] .*rigd sets itself"),

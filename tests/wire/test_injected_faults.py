@@ -19,7 +19,7 @@ CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
 # another row shows as well, three have to do.
 STALE = 3
 
-FATAL, BORNE = "## Faults that end a session", "## Faults that a session bears"
+FATAL, BORNE = "## Faults that end a session", "## Faults that a session tolerates"
 MESSAGES = {
     "angle lost": r"angle.*10 ticks",
     "wrench lost": r"wrench.*10 ticks",

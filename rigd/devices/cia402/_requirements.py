@@ -57,7 +57,7 @@ def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
     heartbeat, rpdo_deadline
         Whether the drive has 1016:1, and 1400:5.
     own
-        Whether the profile states the time of one that the maker gives it.
+        Whether the profile states the time of the drive's own one.
     """
     if heartbeat:
         return Watchdog.HEARTBEAT
@@ -317,9 +317,9 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "",
-        "What the drive does when it misses this computer is then its maker's choice: read it up, "
-        "and try it at a low torque by pulling the cable. If it has a value that does, take that "
-        "for cia402.abort_option.",
+        "The drive's reaction to the loss of this computer is then manufacturer-specific: see its "
+        "manual, and test it at a low torque by pulling the cable. If it has a suitable value, "
+        "use that for cia402.abort_option.",
         accept=ABORT_OPTION,
     ),
     Requirement(
@@ -356,7 +356,7 @@ OPTIONAL: Final = (
         "Max torque",
         False,
         _R | _W,
-        "a limit of the maker's own, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
+        "a manufacturer-specific limit, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
         "limit 6080, and the cut to motor.peak_torque_nm in this program",
         "The drive then has no limit of its own for the torque that rigd could set. Set the one "
         "that its maker gives it by cia402.set_objects.",

@@ -271,7 +271,7 @@ class SdoAccess:
             )
 
     def assign(self, assignment: Assignment) -> None:
-        """Write an object of the maker's own and read it back; raises as :meth:`configure` does."""
+        """Write a manufacturer-specific object and read it back; raises as :meth:`configure`."""
         index, sub = assignment.index, assignment.sub
         variable = self._variable(index, sub)
         variable.data_type = _KINDS[assignment.kind]
@@ -350,7 +350,7 @@ def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int
         theirs = read_eds(Path(eds), node_id)
     except EdsError as error:
         raise DeviceError(
-            f"{error} Get it again from the maker, or remove cia402.eds from the profile."
+            f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
     for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
         entry, mine = theirs.get(*place), own.get_variable(*place)

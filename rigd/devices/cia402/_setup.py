@@ -61,7 +61,7 @@ class Outfit:
     lacks
         Rows of the objects that it has not, or that do not do what they are for.
     assigned
-        Objects of the maker's own that the profile has set.
+        Manufacturer-specific objects that the profile has set.
     """
 
     identity: dict[str, object]
@@ -264,7 +264,7 @@ class _SetUp:
         raise why
 
     def assign(self) -> None:
-        """Set the objects of the maker's own that the profile names."""
+        """Set the manufacturer-specific objects that the profile names."""
         for text in self._settings.set_objects:
             try:
                 self._sdo.assign(parse_assignment(text))
@@ -352,7 +352,7 @@ class _SetUp:
         if stands is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.missing()}")
         if stands in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
-            # The maker's own watchdog does what its maker says, whatever stands here.
+            # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.settle(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
         if not self.settle(row) and settings.communication_error_option:

@@ -200,7 +200,7 @@ class _Judge:
         if needed.core:
             return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
         if needed.index == objects.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
-            found = "absent; in its place: what the maker's own watchdog does"
+            found = "absent; in its place: the manufacturer's own watchdog"
             return Finding(what, found, "", Grade.STANDS_IN)
         if needed.accept:
             return self._to_accept(needed, what, "absent", "")

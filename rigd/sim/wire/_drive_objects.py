@@ -189,7 +189,7 @@ _SUPPORTED_MODES = 1 << (CYCLIC_SYNCHRONOUS_TORQUE - 1)
 _SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
 _IDENTITY = 0x1018
 _IN_SERVICE = (0x6076,)
-"""Whoever puts a drive into service tells it its motor: no file knows it."""
+"""Set when a drive is commissioned for its motor: no file contains it."""
 _NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 

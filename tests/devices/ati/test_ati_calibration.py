@@ -84,7 +84,7 @@ def test_counts_that_are_not_positive_are_refused(counts):
 def test_a_matrix_with_entries_that_are_no_numbers_is_refused(entry):
     rows = [list(row) for row in ONES]
     rows[4][1] = entry
-    with pytest.raises(ValueError, match=r"entry Ty, gauge 1 .* no number"):
+    with pytest.raises(ValueError, match=r"entry Ty, gauge 1 .* not a number"):
         calibration(matrix=tuple(map(tuple, rows)))
 
 

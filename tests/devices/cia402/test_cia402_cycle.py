@@ -351,7 +351,7 @@ def falls_silent(scripted):
         ),
         (
             told_to_disable,
-            ['for "ready to switch on"', "a corrupt frame, a second master", "the cable"],
+            ['for "ready to switch on"', "a corrupt frame, a second master", "the bus cable"],
         ),
         (switched_off_with_a_reason, ["under-voltage in the DC link", "rigd reset"]),
         (ignores_torque, ["ignores the target torque", "bit 12"]),

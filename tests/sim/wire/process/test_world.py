@@ -403,7 +403,7 @@ def test_the_bus_is_cut_by_who_holds_it(make_world):
         ("drop,from=sensor,bytes=3", "bytes is for a sensor on a serial line"),
         (
             "corrupt,from=drive,byte=8",
-            "byte=8 hits nothing; a CAN frame has at most the bytes 0 to 7",
+            "byte=8 has no effect; a CAN frame has at most the bytes 0 to 7",
         ),
     ],
 )
