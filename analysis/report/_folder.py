@@ -227,8 +227,7 @@ def _check_earlier(folder: Path) -> None:
     if not _is_free(folder) and not (folder.is_dir() and (folder / LIST).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
-            "of "
-            f"its files ({LIST}). Choose another folder with --report, or move it away."
+            f"of its files ({LIST}). Choose another folder with --report, or move it away."
         )
 
 
@@ -238,10 +237,9 @@ def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
     for name in sums:
         if os.path.lexists(folder / name) and not _is_own(folder, name, earlier):
             raise OutputExistsError(
-                f"The report {folder} is unchanged: {name} in it was modified after the analysis, "
-                "and --overwrite does not replace such files; move it away, or choose another "
-                "folder "
-                "with --report."
+                f"The report {folder} is unchanged: {name} in it was modified, or not written by "
+                "an analysis, and --overwrite does not replace such files; move it away, or choose "
+                "another folder with --report."
             )
     try:
         # Whenever this is cut short, the list holds all that is there.

@@ -97,8 +97,7 @@ def copy(
     if folder is None:
         fail(
             "There is no per-user folder, because this user has no home; set XDG_CONFIG_HOME, or "
-            "copy "
-            "into this folder by --here.",
+            "copy into this folder by --here.",
             EXIT_FAILED,
         )
     stem = new_name or profile.path.stem

@@ -110,8 +110,7 @@ def load_rig(
         if moving is not WhatMoves.SIMULATED:
             raise RefusedError(
                 f"--seed: the noise of {moving.value} of {profile.path} is not simulated here; "
-                "omit "
-                "the option."
+                "omit the option."
             )
         assert profile.rig.simulation is not None
         simulation = replace(profile.rig.simulation, seed=seed)

@@ -121,8 +121,8 @@ class SessionWriter:
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.part} exists: another session is being recorded to it or was "
-                    "interrupted. "
-                    "Choose another name or move that file away; nothing is overwritten."
+                    "interrupted. Choose another name or move that file away; nothing is "
+                    "overwritten."
                 ) from None
             self._stream = os.fdopen(descriptor, "wb")
             mark_as_written(descriptor)

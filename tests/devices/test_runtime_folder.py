@@ -50,5 +50,5 @@ def test_a_lock_follows_no_link(runtime_folder):
     assert precious.read_text() == "precious"
     held.path.unlink()
     os.mkfifo(held.path)
-    with pytest.raises(OSError, match="no plain file"):
+    with pytest.raises(OSError, match="not a plain file"):
         held.acquire("rigd run")

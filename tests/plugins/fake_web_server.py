@@ -214,7 +214,6 @@ class FakeWebServer:
         self.asked = []
         self.requests = []
         self._pages = set()
-        self._loop = asyncio.new_event_loop()
         self._listening = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -247,12 +246,10 @@ class FakeWebServer:
             await page.close()
 
     def _work(self):
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._loop.close()
+        asyncio.run(self._serve())
 
     async def _serve(self):
+        self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
         app = web.Application()
         app.router.add_get("/", self._index)

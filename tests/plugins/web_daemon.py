@@ -118,7 +118,6 @@ class Served(Requests):
     def __init__(self, folder, path, profile):
         self.folder = folder
         self.daemon = FakeDaemon()
-        self.loop = asyncio.new_event_loop()
         self._path = path
         self._job = _job(profile, folder, path) | {"token": TOKEN, "port": 0, "any_port": False}
         self._thread = threading.Thread(target=self._work)
@@ -127,10 +126,10 @@ class Served(Requests):
         assert self._ready.wait(30.0)
 
     def _work(self):
-        self.loop.run_until_complete(self._run())
-        self.loop.close()
+        asyncio.run(self._run())
 
     async def _run(self):
+        self.loop = asyncio.get_running_loop()
         self._end = asyncio.Event()
         behind = await asyncio.start_unix_server(self.daemon.serve, self._path)
         self.server, runner, listening = await _server.open_page(self._job)
@@ -148,10 +147,6 @@ class Served(Requests):
         for writer in self.daemon.watchers:
             writer.close()
         await runner.cleanup()
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
 
     def call(self, function, *arguments):
         """Have a function called in the server's thread."""

@@ -98,7 +98,7 @@ def test_a_part_that_is_complete_is_given_its_name(original, tmp_path):
     recovery = recover(path)
     assert recovery.damage is None
     assert (tmp_path / "a.mcap").read_bytes() == original.data
-    assert "complete and sound" in recovery.lines()[0]
+    assert "complete and intact" in recovery.lines()[0]
 
 
 def test_a_sound_file_needs_nothing(original, tmp_path):

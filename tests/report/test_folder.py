@@ -129,7 +129,7 @@ def test_a_file_that_is_not_as_it_was_written_stops_the_replacement(tmp_path, ch
         (out / "a").unlink()
         (out / "a").symlink_to(other) if change == "a link" else (out / "a").mkdir()
     before = contents(out)
-    with pytest.raises(OutputExistsError, match="left as it was"):
+    with pytest.raises(OutputExistsError, match="is unchanged"):
         write_report(out, a="3", b="4", c="5")
     assert contents(out) == before
     assert other.read_text() == "1"
@@ -173,7 +173,7 @@ def test_a_folder_that_is_no_report_is_not_replaced(tmp_path):
     with pytest.raises(OutputExistsError, match=f"no list of its files .{LIST}"):
         report_folders([tmp_path / "x.mcap"], out, overwrite=True)
     (tmp_path / "x.report").write_text("a file")
-    with pytest.raises(OutputExistsError, match=r"x\.report is none"):
+    with pytest.raises(OutputExistsError, match=r"x\.report is not one"):
         report_folders([tmp_path / "x.mcap"], None, overwrite=True)
 
 

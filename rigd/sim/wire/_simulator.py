@@ -77,8 +77,7 @@ def only_one(rig_name: str) -> Iterator[None]:
             who = "" if running is None else f" (process {running.pid})"
             raise DeviceError(
                 f"A simulated rig of the profile {rig_name} is already running{who}; end it first, "
-                "or "
-                "use that one."
+                "or use that one."
             ) from None
         # What a dead one left must go first: it names the sockets that are about to live again.
         forget(rig_name)
