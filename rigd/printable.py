@@ -55,7 +55,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     counts
         ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
         ``stale_wrenches``, as numbers or as texts; of the last three only what occurred is told.
-        None: it is not known, as of a file that nobody could read.
+        None: it is not known, as of a file that could not be read.
 
     Examples
     --------

@@ -139,7 +139,7 @@ class Homogeneity:
         return len(self.specimens) < _FEWEST and not self.mixed
 
     def of(self, quantity: str) -> Heterogeneity | None:
-        """Return the scatter of one quantity, None if it is not known."""
+        """Return the between-session scatter of one quantity, None if it is not known."""
         return next((each for each in self.quantities if each.quantity == quantity), None)
 
     def is_mixed(self, quantity: str) -> bool:

@@ -128,7 +128,7 @@ class PooledOrder:
     interval : tuple of float or None
         Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
     reason : str or None
-        Why the number must not be taken for a property of the specimen; None: it may.
+        Why the number is not a property of the specimen; None if it is.
     alone : mapping of str to int
         How many sessions say what by themselves.
     mixture : bool

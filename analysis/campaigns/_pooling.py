@@ -191,7 +191,7 @@ class PooledParameter:
         Probability that sessions without any such scatter differ as much as these (W. G. Cochran,
         Biometrics 10 (1954) 101-129), each parameter by itself.
     next_interval : (float, float)
-        Where the parameter of one more session would lie with 95 % (J. P. T. Higgins et al.,
+        95 % prediction interval for one more session (J. P. T. Higgins et al.,
         J. R. Stat. Soc. A 172 (2009) 137-159), whatever the noise of its own estimate.
     """
 

@@ -259,8 +259,8 @@ def dask_cluster(address: str) -> Iterator[Workers]:
     Raises
     ------
     CampaignError
-        Dask is not installed, nobody answers at the address, the cluster has no workers, or they
-        are not of these versions.
+        Dask is not installed, no scheduler answers at the address, the cluster has no workers, or
+        their versions differ.
     """
     try:
         distributed = _distributed()
@@ -299,7 +299,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """Raise an OSError if nobody listens; Dask's client would go on trying after it has failed."""
+    """Raise an OSError if no scheduler listens; Dask's client would retry even after failing."""
     name = address.rsplit("://", maxsplit=1)[-1]
     if "://" in address and not address.startswith(("tcp://", "tls://")):
         return

@@ -63,7 +63,7 @@ def write_session(
         counts["lost"] = scheduled - len(ticks)
         writer.close({name: str(count) for name, count in counts.items()})
     except BaseException:
-        # Unlike a recording, the source is still there: an incomplete copy of it helps nobody.
+        # Unlike a recording, the source is still there: an incomplete copy of it is useless.
         writer.abandon()
         writer.part.unlink(missing_ok=True)
         raise

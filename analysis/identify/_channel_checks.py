@@ -59,7 +59,7 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
 
 
 def stops(measurement: Measurement) -> Iterator[Finding]:
-    """Find a motor that stands still while it is asked to move."""
+    """Detect a motor at rest although the reference moves."""
     asked = measurement.reference_rad
     if asked is None:
         return

@@ -88,7 +88,7 @@ class DragEstimate:
     Attributes
     ----------
     value_m : float
-        C_D d at `speed_m_s`; 1.2 kg/m³ is taken for the density of the air.
+        C_D d at `speed_m_s`; the density of the air is assumed to be 1.2 kg/m³.
     std_m : float
     interval_95_m : tuple of float
         Not below 0.

@@ -64,7 +64,7 @@ class Quantity:
     interval_95 : tuple of float or None
         None as above.
     flag : str or None
-        Why it must not be taken for a property of the antenna or the rig; None: it may.
+        Why it is not a property of the antenna or the rig; None if it is.
     """
 
     value: float

@@ -63,7 +63,7 @@ _FLOOR: Final = 1e-12
 def following(
     angle_rad: NDArray[np.float64], reference_rad: NDArray[np.float64], rate_hz: float
 ) -> NDArray[np.float64]:
-    """Part of the angle that follows the reference, shape (n,).
+    """Part of the angle that is coherent with the reference, shape (n,).
 
     By the response that windowed correlations give (R. B. Blackman and J. W. Tukey, Bell System
     Technical Journal 37 (1958) 185-282): at each frequency the least squares over its neighbours.
@@ -233,7 +233,7 @@ class Comparison:
         return np.fft.irfft(every, self.samples)
 
     def followed_rad(self) -> NDArray[np.float64]:
-        """Part of the angle that follows the reference, shape (m,).
+        """Part of the angle that is coherent with the reference, shape (m,).
 
         All of it without a reference, or with one that does not explain it.
         """
@@ -377,7 +377,7 @@ class Comparison:
         return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
 
     def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Spectra of what has amplitudes that nobody knows, shape (m, K).
+        """Spectra of terms of unknown amplitude, shape (m, K).
 
         Free decays, hum, and last a zero of the torque sensor that drifts in proportion to time:
         the jump from the record's end to its beginning would leak into all bins.

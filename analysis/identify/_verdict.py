@@ -58,7 +58,7 @@ class OrderVerdict:
     interval : tuple of float or None
         Its 95 % interval, by the likelihood ratio.
     reason : str or None
-        Why the number must not be taken for a property of the beam; None: it may.
+        Why the number is not a property of the beam; None if it is.
     profile : Profile
     """
 

@@ -106,7 +106,7 @@ def _is_free(folder: Path) -> bool:
 
 
 def _free(folder: Path, taken: set[Path], *, overwrite: bool = False) -> Path:
-    """Return the folder, or the first numbered name like it that nothing has and nobody took."""
+    """Return the folder, or the first numbered name like it that is not in use."""
     number, candidate = 1, folder
     while candidate in taken or (os.path.lexists(candidate) and not overwrite):
         number += 1

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
-    """Make the vertical axis logarithmic from `low` to `high`, with as many labels as it bears."""
+    """Make the vertical axis logarithmic from `low` to `high`, with as many labels as fit."""
     axes.set_yscale("log")
     axes.set_ylim(low, high)
     if high < 5 * low:

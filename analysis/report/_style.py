@@ -97,7 +97,7 @@ _RC: Final[dict[Any, Any]] = {
 def styled() -> Iterator[None]:
     """Context in which figures are made and saved in this style."""
     with rc_context(_RC), warnings.catch_warnings():
-        # A file name may hold characters that the font lacks; a box in a title harms nobody.
+        # A file name may hold characters that the font lacks; a box in a title does no harm.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 

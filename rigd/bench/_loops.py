@@ -108,7 +108,7 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Pr
 
 
 def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Measurement:
-    """Run the loop with nobody but a reader that empties the ring every now and then.
+    """Run the loop with only a reader that empties the ring from time to time.
 
     Parameters
     ----------

@@ -345,7 +345,7 @@ HIGH_LOAD = 0.7
 
 
 def profile_rows(profile: Profile) -> Iterator[Row]:
-    """Say which profile it is, and which of its numbers nobody has verified."""
+    """Say which profile it is, and which of its numbers are unverified."""
     yield Row("profile", profile.name, str(profile.path), "", Verdict.OK)
     assumed = [key for key, source in profile.sources.items() if source == "assumed"]
     yield Row(

@@ -121,7 +121,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except OSError as error:
-        with contextlib.suppress(OSError):  # nobody may read that either
+        with contextlib.suppress(OSError):  # standard error may be closed as well
             sys.stderr.write(f"Error: {_explained(error)}\n")
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -146,5 +146,5 @@ def _explained(error: OSError) -> str:
         )
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}."
-    # Nobody reads what a command writes, or the disk behind it is full.
+    # The output of a command is not read, or the disk behind it is full.
     return f"the output cannot be written ({error.strerror})."

@@ -52,7 +52,7 @@ def peer_of(link: socket.socket) -> tuple[int, int]:
 
 
 def bind(path: Path, group: str | None) -> socket.socket:
-    """Make the socket; nobody can connect before it listens, and only its users after.
+    """Make the socket; no client can connect before it listens, and then only its users.
 
     Call it only while holding the rig: what a dead daemon left is replaced.
 

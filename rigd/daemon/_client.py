@@ -28,7 +28,7 @@ _ANSWER_PATIENCE_S = 60.0
 """Reconnecting the devices takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
-"""Time to go on trying a daemon that turns clients away, or accepts nobody."""
+"""Time for which a daemon that refuses or does not accept clients is tried again."""
 _STOP_PATIENCE_S = 10.0
 _STOP_ANSWER_S = 0.5
 _SIGNAL_AFTER_S = 0.3
@@ -103,7 +103,7 @@ class Client:
     Raises
     ------
     DaemonGoneError
-        If nobody listens there, or takes the connection in time.
+        If no process listens there, or the connection is not accepted in time.
     """
 
     def __init__(
@@ -248,7 +248,7 @@ class Client:
         )
 
     def send(self, command: str, **fields: object) -> None:
-        """Send a request whose reply nobody waits for.
+        """Send a request without waiting for its reply.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ _FLUSH_S: Final = 1.0
 
 
 class _Dropping(logging.handlers.QueueHandler):
-    """Hands records on; where nobody takes them, the oldest are kept and the rest counted."""
+    """Passes records on; if they are not read, the oldest are kept and the rest counted."""
 
     def __init__(self, waiting: "queue.Queue[logging.LogRecord]") -> None:
         super().__init__(waiting)

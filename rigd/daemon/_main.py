@@ -36,7 +36,7 @@ def run_daemon(
     page: bool = False,
     page_port: int | None = None,
 ) -> signal.Signals:
-    """Own a rig until a signal asks for the end.
+    """Run the rig daemon until a signal ends it.
 
     Parameters
     ----------

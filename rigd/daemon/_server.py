@@ -228,7 +228,7 @@ class Server:
         return True
 
     def _answer_if_stop(self, silent: "_Silent") -> None:
-        """Obey a `stop` although there is no room for whoever says it, and turn it away."""
+        """Obey a `stop` from a client for which there is no room, and turn it away."""
         line = bytes(silent.said).partition(b"\n")[0]
         with suppress(RequestError):
             request = parse_request(line)
@@ -468,7 +468,7 @@ _FULL = _line(
 
 
 def _say(link: socket.socket, line: bytes) -> None:
-    """Send a last line without waiting for anybody to read it."""
+    """Send a last line without waiting for a reader."""
     with link, suppress(OSError):
         link.send(line)
 

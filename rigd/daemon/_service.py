@@ -211,7 +211,7 @@ class Service:
             self._publish_signals()
 
     def _publish_signals(self) -> None:
-        """Publish what has come of the signals, if anybody wants them."""
+        """Publish what has come of the signals, if a client has subscribed to them."""
         if not self._signal_watchers:
             return
         series = self._series

@@ -1,8 +1,8 @@
 """Background jobs of the daemon: predictions and checks, each in its own process.
 
-They take processor time, and anybody may ask for a prediction while a session runs. In the daemon's
-own process they would hold the interpreter that supervises the session; theirs has the lowest
-priority of an ordinary program, and a part of the free memory.
+They take processor time, and any client may ask for a prediction while a session runs. In the
+daemon's own process they would block the interpreter that supervises the session; theirs has the
+lowest priority of an ordinary program, and a part of the free memory.
 """
 
 import asyncio

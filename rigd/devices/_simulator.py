@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
 
 _SOCKETS = Path("/proc/net/unix")
 _LISTENER = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
-"""Anybody may give a socket any name, with a line break in it as well."""
+"""Any user may give a socket any name, even with a line break in it."""
 _LISTENS = 0x10000
 
 

@@ -212,7 +212,7 @@ class Parent:
         return self._messages.next(timeout_s)
 
     def send(self, message: object) -> None:
-        """Send one short message; nobody may be left to hear it."""
+        """Send one short message; there may be no receiver left."""
         with contextlib.suppress(BrokenPipeError):
             os.write(sys.stdout.fileno(), encode(message))
 
@@ -290,7 +290,7 @@ class Pulse:
     """How long a process has not beaten, as seen by one that looks every so often.
 
     Only time in which the looking process itself ran is counted: a computer that stands still for a
-    second has made nobody hang.
+    second has not made a process hang.
     """
 
     _MOST_PER_LOOK_S = 0.2

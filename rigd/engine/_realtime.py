@@ -171,7 +171,7 @@ class Precedence:
 
 
 def _be_ordinary(thread: int) -> None:
-    # The mark stays: without a privilege it cannot be taken away, and it harms nobody.
+    # The mark stays: without a privilege it cannot be taken away, and it does no harm.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(thread, policy, os.sched_param(0))
 

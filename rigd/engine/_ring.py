@@ -1,7 +1,7 @@
 """Shared memory between the processes: rings of fixed-size records, and a session's reference.
 
 A ring has one producer (the control loop), one consumer that must get everything (the recorder),
-and any number of observers that may miss records but never slow anybody down (the live publisher).
+and any number of observers that may miss records but never delay the writer (the live publisher).
 
 The memory is an unlinked temporary file handed to children by file descriptor: nothing with a
 name is left behind, however a process ends.
@@ -127,7 +127,7 @@ class Ring:
         self._counters[_READ] = self._counters[_WRITTEN]
 
     def close(self) -> None:
-        """Unmap the memory; the descriptor stays open for whoever else inherited it."""
+        """Unmap the memory; the descriptor stays open for the other processes that inherited it."""
         self._counters.release()
         self.buffer.release()
         self._memory.close()

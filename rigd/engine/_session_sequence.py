@@ -212,7 +212,7 @@ class SessionSequence:
         Raises
         ------
         SessionEnd
-            If nobody says so in time: the supervisor may be there and yet do nothing.
+            If this is not reported in time: the supervisor may be there and yet do nothing.
         """
         self._board[Word.PHASE] = Phase.READY
         deadline = time.monotonic() + _GO_PATIENCE_S

@@ -70,7 +70,7 @@ class Word(IntEnum):
     STOP = 0
     GO = 1
     SUPERVISOR_BEAT = 2
-    """Heartbeats count up several times a second: a process whose beat stands still hangs."""
+    """Heartbeats count up several times a second: a process whose count does not increase hangs."""
     # Written by the control process
     PHASE = 3
     START_UTC_NS = 4
@@ -148,7 +148,7 @@ class SharedState:
         self._words[word] += 1
 
     def close(self) -> None:
-        """Unmap the memory; the descriptor stays open for whoever else inherited it."""
+        """Unmap the memory; the descriptor stays open for the other processes that inherited it."""
         with contextlib.suppress(BufferError):  # a view of a word is still held
             self._words.release()
             self._memory.close()

@@ -52,7 +52,7 @@ _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
 _SIGN_OF_LIFE_S = 1.0
 _TAKE_UP_TICKS = 2
-"""Ticks after which it is known where the motor stands, and that it does."""
+"""Ticks after which the motor's angle is known, and that it is at rest."""
 
 
 def main() -> None:
@@ -202,7 +202,7 @@ class _Attendance:
         """Observe with the torque off until there is something to do; None: nothing any more.
 
         Virtual time stands still meanwhile, but for a tick now and then where there are lines: at
-        their other end a host that is silent for long is taken for dead.
+        their other end a host that is silent for long is assumed to be dead.
         """
         seen_s = time.monotonic()
         while not self._stop.requested:
@@ -333,7 +333,7 @@ class _Attendance:
         }
 
     def _zero(self) -> dict[str, object]:
-        """Make the angle where the motor stands the rig's zero, to which its limits are relative.
+        """Make the motor's present angle the rig's zero, to which its limits are relative.
 
         Raises
         ------

@@ -130,7 +130,7 @@ def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> floa
 
 
 def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
-    """Open a text file of limited size; a pipe that nobody writes to is not waited for.
+    """Open a text file of limited size; a pipe without a writer is not waited for.
 
     Parameters
     ----------

@@ -176,7 +176,7 @@ def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
 def _merged(group: Sequence[_Entry]) -> FoundMode:
     middle_hz = median(_frequency_hz(entry) for entry in group)
     stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
-    # Fits of structures that do not suit lie far off: the median of the distances bears them.
+    # Fits of structures that do not suit lie far off: the median of the distances tolerates them.
     between_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
     return FoundMode(
         frequency_hz=middle_hz,

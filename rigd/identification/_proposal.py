@@ -19,7 +19,7 @@ ones."""
 
 
 def cautious(profile: Profile) -> Profile:
-    """Return a profile with the slowest controller that holds its beam, and bears wrong data."""
+    """Return a profile with the slowest controller that holds its beam and tolerates errors."""
     for pole_rad_s in _CAUTIOUS_POLES_RAD_S:
         if pole_rad_s < profile.control.pole_rad_s:
             slow = replace(profile, control=replace(profile.control, pole_rad_s=pole_rad_s))

@@ -23,7 +23,7 @@ from typing import Any, Final
 from rigd.live._address import LOOPBACK, LiveAddress
 
 PAGE_PORT: Final = 9090
-"""Rerun's own, as long as nobody else has it."""
+"""Rerun's own, unless another process uses it."""
 _STATE: Final = "live.json"
 """Tells the page which server there is now."""
 _FILES: Final = frozenset(
@@ -128,7 +128,7 @@ def serve_page(
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    block_on_close = False  # nobody waits for a browser
+    block_on_close = False  # does not wait for a browser
     # So that the port of a view that has just ended can be taken; not one where somebody listens.
     allow_reuse_address = True
 

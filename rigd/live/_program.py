@@ -17,7 +17,7 @@ from rigd.live._address import LOOPBACK
 from rigd.view import without_settings
 
 _NOWHERE = f"http://{LOOPBACK}:9"
-"""The discard port, on which nobody listens."""
+"""The discard port, on which no process listens."""
 _QUIET: Mapping[str, str] = {
     # How Rerun is told, for one process, to send no usage data.
     "CI": "1",
@@ -82,7 +82,7 @@ class RerunProgram:
         self._ports: dict[re.Pattern[str], int] = {}
         self._last_lines: collections.deque[str] = collections.deque(maxlen=3)
         self._without_graphics = False
-        # Read to the end: a program whose output nobody reads would block once the pipe is full.
+        # Read to the end: a program whose output is not read would block once the pipe is full.
         self._reader = threading.Thread(target=self._read_log, daemon=True)
         self._reader.start()
 

@@ -120,7 +120,7 @@ class Harvest:
 class Intake:
     """Reads the rings of one session, from its first record to its last.
 
-    What cannot be read in time is overwritten, which is counted; nobody waits.
+    What cannot be read in time is overwritten, which is counted; the writer never waits.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Server of the live view: takes what the publisher sends, and passes it on to any viewers.
 
-It is a separate process because a viewer that is slow or frozen then holds nobody up, and because
+It is a separate process because a viewer that is slow or frozen then delays nothing else, and because
 the SDK's own server listens on every interface. Viewers connect to it without any authentication,
 so it must never be reachable from another machine.
 """
@@ -148,7 +148,7 @@ class Outlet:
 
 
 def free_port(wanted: int) -> int:
-    """Return a port if nobody listens on it, or 0, which leaves the choice to the system.
+    """Return a port if no process listens on it, or 0, which leaves the choice to the system.
 
     Rerun's program is not to find out: it may take who listens there for its like.
     """

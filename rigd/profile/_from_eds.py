@@ -203,7 +203,7 @@ class Draft:
         return with_settings(self._base.text, settings)
 
     def _acceptance(self) -> Iterator[Setting]:
-        """Yield what the operator accepts; what nobody has decided on stands as a comment."""
+        """Yield what the operator accepts; what is undecided is written as a comment."""
         left = [finding.accept for finding in self.unaccepted()]
         own = self._own_limits() if TORQUE_LIMIT in (*left, *self._accepted) else ""
         hint = (

@@ -110,7 +110,7 @@ def run_in_foreground(
 
     looks = QuickLooks(told) if look else None
     try:
-        # The rig is given up last, when nobody has hold of the devices any more.
+        # The rig is given up last, when no process uses the devices any more.
         with contextlib.ExitStack() as reserved, crew:
             profile, moving = load_rig(profile_name, fast=fast, seed=seed, hardware=hardware)
             if prepare is not None:

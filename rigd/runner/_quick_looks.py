@@ -89,7 +89,7 @@ class QuickLooks:
     Parameters
     ----------
     tell
-        Called with what became of each look, by whoever calls :meth:`attend`.
+        Called with what became of each look, by the caller of :meth:`attend`.
 
     """
 

@@ -128,7 +128,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
             if uid == os.getuid():
                 whose = "in another environment"
                 remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-        shown = printable(str(path))  # whoever made it has chosen its name
+        shown = printable(str(path))  # its name was chosen by the user who made it
         raise RefusedError(
             f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
             f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "

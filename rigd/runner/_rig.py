@@ -230,7 +230,7 @@ class Rig:
         return self._order(Tare(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
-        """Make the angle where the motor stands the zero to which the limits are relative.
+        """Make the motor's present angle the zero to which the limits are relative.
 
         Returns
         -------

@@ -70,7 +70,7 @@ class SessionRig(Protocol):
 
 
 class SeriesWatcher(Protocol):
-    """Whoever is told of a series, in the order of these methods for each of its sessions."""
+    """Observer of a series; these methods are called in this order for each of its sessions."""
 
     def begins(self, number: int, path: Path) -> None:
         """Take note of the next session, from 1 on, and its file; an error ends the series."""
@@ -172,7 +172,7 @@ class Series:
         stop
             The operator's.
         watcher
-            Whoever is told.
+            Observer of the series.
         live
             Show each session in a live view.
         listens

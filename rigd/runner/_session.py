@@ -92,7 +92,7 @@ class SessionFailedError(FailureError):
                 elif self.path.exists():
                     whole = self.path  # by a recorder that was only slow
             except OSError:
-                part = part_of(self.path)  # as far as anybody knows
+                part = part_of(self.path)  # as far as is known
         return SessionResult(
             path=whole,
             outcome="fault",

@@ -20,7 +20,7 @@ _MOST_TICKS: Final = 2500
 _GAUGES_S: Final = 0.095
 """Least time from gauges to the next: they cost more than the signals, and are read by eyes."""
 _ABANDONED_S: Final = 1.0
-"""Nobody has looked for so long: what came meanwhile is left out."""
+"""Time without a reader after which the samples in between are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class SignalBlock:
 
 
 class SignalReader:
-    """Reads the samples in the ring as viewers want them; it may miss some and delays nobody.
+    """Reads the samples in the ring as viewers want them; it may miss some and delays no loop.
 
     Parameters
     ----------

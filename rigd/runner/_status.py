@@ -43,7 +43,7 @@ class SignalStatus:
 
 
 class SignalWatch:
-    """Observes the samples in the ring; it may miss some and delays nobody.
+    """Observes the samples in the ring; it may miss some and never delays the loop.
 
     Parameters
     ----------

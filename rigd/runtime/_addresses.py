@@ -70,7 +70,7 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
 def read_address(path: Path) -> dict[str, Any]:
     """Return what was announced; empty if nothing was, or something else lies there."""
     try:
-        # Anything may lie there, even what blocks whoever opens it.
+        # Anything may lie there, even what blocks the process that opens it.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         with os.fdopen(descriptor, "rb") as file:
             found = json.loads(file.read(_MOST_BYTES))
@@ -80,7 +80,7 @@ def read_address(path: Path) -> dict[str, Any]:
 
 
 def answers(path: str | Path) -> bool:
-    """Whether somebody listens on a Unix socket: on what a dead process left nobody does."""
+    """Whether a process listens on a Unix socket; on that of a dead process none does."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(_PROBE_S)
         try:

@@ -48,7 +48,7 @@ class HeldFile:
         holder
             What others are told of who has it.
         alone
-            Whether nobody else may have it meanwhile.
+            Whether the lock is exclusive.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class HeldFile:
             self._fd = None
 
     def _open(self) -> int:
-        """Open it for reading and writing, whoever made it."""
+        """Open it for reading and writing, whichever user made it."""
         with suppress(FileExistsError):
             fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
             os.fchmod(fd, 0o666)  # whatever the umask: the next holder may be another user
@@ -99,7 +99,7 @@ def _lock(fd: int, *, alone: bool) -> None:
 def _others(fd: int, said: str) -> str:
     """Name who holds the file by the kernel's table, if that is not who the file says it is.
 
-    Anybody may write into the file, and hold it.
+    Any user may write to the file, and hold the lock.
     """
     inode = str(os.fstat(fd).st_ino)
     try:

@@ -72,7 +72,7 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
 def signal_when_orphaned(number: int) -> None:
     """Have the system send this process a signal when the one that started it ends.
 
-    A process that is suspended gets it too; nobody would wake it otherwise.
+    A process that is suspended gets it too, because nothing else would wake it.
     """
     with contextlib.suppress(AttributeError):  # Linux has it, others do without
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)

@@ -1,4 +1,4 @@
-"""Decoder of messages: samples, controls and timings as arrays, whoever wrote them.
+"""Decoder of messages: samples, controls and timings as arrays, from any writer.
 
 Messages of the fixed layout (`rigd.session._format`) are taken as they are. Any other protobuf
 library may put the fields in another order, leave out zeros, number or type them differently: the

@@ -1,6 +1,6 @@
 """Quick looks: the files that the analyzer writes beside session files, and how they are read.
 
-docs/quick_look.md describes them. Anybody may have put such a file there: what is read of it is
+docs/quick_look.md describes them. Any user may have put such a file there: what is read of it is
 checked here, once for the live view, the page, the library and the analyzer.
 """
 

@@ -522,7 +522,7 @@ def rename_new(source: Path, target: Path) -> None:
         if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
             raise
         # A file system without hard links (FAT, some network shares): reserve the name, which
-        # fails if anybody has it, and replace the empty file that then is our own.
+        # fails if the name is taken, and replace the empty file that then is our own.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         source.replace(target)
     else:

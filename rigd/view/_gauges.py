@@ -54,7 +54,7 @@ class Gauge:
 class Gauges:
     """Peaks of the samples, block by block, beside their limits.
 
-    The rms torque (i²t) counts from the first sample on: the motor is taken for cold before.
+    The rms torque (i²t) counts from the first sample on: the motor is assumed to be cold before.
 
     Parameters
     ----------

@@ -229,7 +229,7 @@ class Connections:
             if each.transport is not None and not each.transport.is_closing()
         ]
         too_many = max(0, len(open_now) - _MOST_CONNECTIONS + 1)
-        # Whoever comes last may want to stop the rig.
+        # The last client may want to stop the rig.
         for transport in [each[1] for each in open_now if each[0] not in self._pages][:too_many]:
             transport.abort()
         protocol = self.serving()

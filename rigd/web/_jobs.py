@@ -58,7 +58,7 @@ class Job:
     state: str = "waiting"
     error: str = ""
     dropped: bool = False
-    """A session has begun, and nobody waits for it any more."""
+    """A session has begun; its result is no longer waited for."""
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
     def document(self) -> Document:

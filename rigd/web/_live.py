@@ -1,4 +1,4 @@
-"""Messages to the pages that are open: each has a queue, and nobody waits for a slow one."""
+"""Messages to the pages that are open: each has a queue, so a slow one delays no other."""
 
 import asyncio
 import json

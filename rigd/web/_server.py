@@ -356,7 +356,7 @@ async def _run(job: Document) -> None:
     listening.close()
     server.end(_FAILED if failed else "The daemon has ended; start it with rigd serve.")
     await asyncio.sleep(_GRACE_S)
-    # Whoever still reads would be waited for, and the thread that reads standard input.
+    # An ordinary exit would wait for clients that still read, and for the thread that reads stdin.
     os._exit(1 if failed else 0)
 
 

@@ -27,7 +27,7 @@ _READ_SIZE = 65_536
 
 
 class SerialLine:
-    """An open port: 8 data bits, even parity, one stop bit; nobody else may open it meanwhile.
+    """An open port: 8 data bits, even parity, one stop bit; no other process may open it meanwhile.
 
     Parameters
     ----------

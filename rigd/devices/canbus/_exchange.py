@@ -57,7 +57,7 @@ class ReplyPairing:
     owed : int
         Replies that have not come yet, to the last request or to earlier ones.
     lost : int
-        Replies that were taken for lost.
+        Replies that were assumed to be lost.
     unproven : int
         Lost replies that may also be late by whole periods for good.
     """
@@ -157,7 +157,7 @@ _PASSIVE = 0x30
 _NO_ACKNOWLEDGE = 0x20
 
 _FAILURES_SKIPPED = 10
-"""Failures to receive that one drain bears in `regardless`: an adapter may have several queued."""
+"""Failures to receive that one drain in `regardless` tolerates: an adapter may queue several."""
 _FAILURES_WAITED = 100
 """Failures of reading after which one wait gives up."""
 _FAILURE_PAUSE_S = 0.001
@@ -227,7 +227,7 @@ class CanExchange:
         """Within this block receiving raises nothing, whatever bus and adapter have reported.
 
         It is for switching a drive off. An error-passive controller goes on sending, and a frame
-        that nobody acknowledged is sent again; what the drive then answers has to be taken, and
+        that was not acknowledged is sent again; what the drive then answers has to be taken, and
         SYNC sent, for the torque of an RPDO acts at the next one. `send` raises as ever, for the
         frame that the bus does not take.
         """
@@ -398,7 +398,7 @@ class CanLink:
         return self._exchange
 
     def open(self) -> CanExchange:
-        """Open the bus if nobody has yet.
+        """Open the bus if it is not open yet.
 
         Raises
         ------

@@ -239,7 +239,7 @@ class Cia402Drive:
         if not self._same_tick:
             self._settle_previous(node)
         if self._keeps_deadline and not self._enabled:
-            # The drive times the RPDOs from the first on, also while nobody commands a torque.
+            # The drive times the RPDOs from the first on, also while no torque is commanded.
             node.exchange.send(self._idle)
         node.send_sync_or_pause()
         self._awaiting = True

@@ -109,7 +109,7 @@ class SdoAccess:
     Parameters
     ----------
     port
-        Open port; nobody else receives from it meanwhile.
+        Open port; no other code receives from it meanwhile.
     node_id
         Node number of the drive.
     name
@@ -182,7 +182,7 @@ class SdoAccess:
         return _take_types(self._node.object_dictionary, path, self._node_id)
 
     def tell_pre_operational(self) -> None:
-        """Tell the drive to leave operational, which it may ignore; nobody waits for it.
+        """Tell the drive to leave operational, which it may ignore, without waiting for it.
 
         Raises
         ------

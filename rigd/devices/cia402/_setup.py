@@ -95,7 +95,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     Parameters
     ----------
     port
-        Open port; nobody else receives from it meanwhile.
+        Open port; no other code receives from it meanwhile.
     rig
         Parameters with a section ``cia402``.
     name

@@ -46,7 +46,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     Parameters
     ----------
     port
-        Open port; nobody else receives from it meanwhile.
+        Open port; no other code receives from it meanwhile.
     rig
         Parameters with a section ``cia402``.
     name
@@ -69,7 +69,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
         _see_off(sdo, name)
         sdo.to_pre_operational()
         with suppress(SdoRefusal):
-            # Nobody sends a heartbeat now, whose absence would be the next fault.
+            # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
         fault = _reset(sdo, name, patience_s) if _in_fault(sdo) else None

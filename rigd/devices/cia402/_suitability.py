@@ -218,7 +218,7 @@ class _Judge:
             sentence = f"{what}: {found}.{stand_in}"
             return Finding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
         sentence = _sentence(needed.missing()) + stand_in
-        # Without a profile nobody has had the chance to accept it.
+        # Without a profile there was no chance to accept it.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
         return Finding(what, found, wanted, grade, sentence, needed.accept)
 

@@ -87,7 +87,7 @@ class WallClock:
 class LockStep:
     """One period per SYNC; simulated time waits for the next one.
 
-    It does not wait forever: five seconds after the last SYNC, and at once where nobody is left
+    It does not wait forever: five seconds after the last SYNC, and at once where no client is left
     who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
     the first SYNC it goes on too.
 
@@ -122,7 +122,7 @@ class LockStep:
         return passed
 
     def left_alone(self, now_ns: int) -> None:
-        """End the waiting: nobody is connected any more."""
+        """End the waiting: no client is connected any more."""
         self._stands_until_ns = min(self._stands_until_ns, now_ns)
 
 
@@ -372,7 +372,7 @@ class BusSimulation:
             self._pass_period()
         self._owed = periods > 0
         self._lines["host"].send(_SYNC, data, origin)
-        self.step()  # if nobody heard it, the rig moves all the same
+        self.step()  # the rig moves even if it was not received
         if periods:
             self._let_nodes_act()
 

@@ -134,7 +134,7 @@ class VirtualBus:
                 self._send(client, frame)
 
     def close(self) -> None:
-        """Close every connection; nobody can connect any more."""
+        """Close every connection; no client can connect any more."""
         if self._listener.fileno() >= 0:
             del self._handlers[self._listener.fileno()]
             self._listener.close()
@@ -364,7 +364,7 @@ _LINE_BYTES = 4096
 class PtyLine:
     """The sensor's end of a serial line.
 
-    While nobody has the other end open, what is sent is lost, as on a real line. A terminal with
+    While the other end is not open, what is sent is lost, as on a real line. A terminal with
     a closed end is always "readable", so it is looked at from time to time instead.
 
     Parameters

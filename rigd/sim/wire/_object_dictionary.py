@@ -87,7 +87,7 @@ class Entry:
     ----------
     kind
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
-        bytes: a text, or a value that nobody here computes with.
+        bytes: a text, or a value that is not used in computations here.
     value
         Value at power-on.
     access
@@ -546,7 +546,7 @@ def _described(entry: EdsEntry) -> Description:
         size = _TIMES.get(entry.data_type) or (entry.bits or 0) // 8
         return Description("s", access, "", text=_bytes(entry, size), fixed=size > 0)
     boolean = entry.data_type == _BOOLEAN
-    # A boolean takes one bit in a PDO, which nobody needs here.
+    # A boolean takes one bit in a PDO, which is not needed here.
     mappable = entry.mappable and not boolean
     directions = _PDO_DIRECTIONS.get(entry.access, "rt") if mappable else ""
     low, high = entry.low, 1 if boolean else entry.high

@@ -512,7 +512,7 @@ class _Process:
             self._bus.open()
         elif self._line is not None:
             self._line.open()
-            # The line may be another one now: whoever comes has to find it.
+            # The line may be another one now: the next process has to find it.
             self._address = replace(self._address, serial_port=self._port)
             announce(self._rig.name, self._address)
 

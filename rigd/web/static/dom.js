@@ -6,7 +6,7 @@ export const byId = (id) => document.getElementById(id);
  * Make an element.
  * @param {string} tag
  * @param {object} properties - of the element; `class` and `data-…`/`aria-…` as attributes
- * @param {...(Node|string|number|null)} children - texts stay texts, whoever wrote them
+ * @param {...(Node|string|number|null)} children - texts are inserted as text, never as HTML
  */
 export function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
