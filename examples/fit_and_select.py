@@ -9,7 +9,7 @@ from analysis import fit, load, select
 
 
 def main(path: str) -> None:
-    """Print the fits of two structures, then what the record says whichever is the true one."""
+    """Print the fits of two structures, then the results of the structure selection."""
     record = load(path)
     for found in fit(record, ["III", "VI"]).fits:
         print(f"type {found.structure.name}, cost {found.cost:.1f}")

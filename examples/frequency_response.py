@@ -2,9 +2,9 @@
 
 Usage: python frequency_response.py SESSION.mcap
 
-Welch's estimate has the paper's settings, made for sweeps of two minutes: on a short one the end of
-the band is leakage, so peaks are looked for up to 40 Hz. The empirical transfer function estimate
-of the whole record is smeared by no window: compare the heights.
+Welch's estimate has the paper's settings, which suit sweeps of two minutes. In a short sweep,
+leakage dominates the end of the band, so peaks are searched for up to 40 Hz. The empirical transfer
+function estimate of the whole record has no window that would broaden peaks: compare the heights.
 """
 
 import sys
@@ -20,7 +20,7 @@ ETFE = WelchSettings(estimator="fft")
 
 
 def main(path: str) -> None:
-    """Print the peaks of two estimates beside the undamped frequencies of the stated beam."""
+    """Print the peaks of two estimates and the undamped frequencies of the stated beam."""
     record = load(path)
     expected_hz = undamped_frequencies_rad_s(record.beam, 2) / (2 * np.pi)
     print("undamped:", *(f"{each:.2f} Hz" for each in expected_hz))

@@ -1,9 +1,9 @@
-"""A custom drive and sensor, behind the devices' contract: a rigid hub with friction.
+"""A custom drive and sensor that implement the device interface: a rigid hub with friction.
 
 Usage: python own_device.py
 
-What each method has to do stands in `rigd.devices.contracts`; how a profile comes to name a device,
-in CONTRIBUTING.md.
+`rigd.devices.contracts` describes each method; CONTRIBUTING.md describes how to add a device that a
+profile can name.
 """
 
 import math
@@ -23,7 +23,7 @@ class RigidHub:
     off_doubt = ""
 
     def connect(self) -> None:
-        pass  # there is no line
+        pass  # there is no connection
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
         self.torque_nm, self.enabled = 0.0, True
@@ -62,7 +62,7 @@ class RigidHub:
 
 
 def open_rigid_hub() -> Devices:
-    """Make drive and sensor, as an entry of the registry of devices does."""
+    """Make drive and sensor, as an entry of the device registry does."""
     hub = RigidHub()
     return Devices(drive=hub, sensor=hub, simulated=True)
 

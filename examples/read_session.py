@@ -1,4 +1,4 @@
-"""Read a session file: what it states, its samples as a numpy array, its segments and its log.
+"""Read a session file: metadata, samples as a numpy array, segments and log.
 
 Usage: python read_session.py SESSION.mcap
 """
@@ -11,7 +11,7 @@ from rigd.session import Status, read_session
 
 
 def main(path: str) -> None:
-    """Print what there is to know of a session before it is analysed."""
+    """Print the contents of a session file."""
     session = read_session(path)
     rate_hz = session.number("rate_hz")
     print(f"{session.metadata['specimen']}: {session.metadata['excitation']} at {rate_hz:g} Hz")

@@ -1,6 +1,6 @@
 """Server of the live view: takes what the publisher sends, and passes it on to any viewers.
 
-It is a separate process because a viewer that is slow or frozen then delays nothing else, and because
+It is a separate process because a slow or frozen viewer then delays nothing else, and because
 the SDK's own server listens on every interface. Viewers connect to it without any authentication,
 so it must never be reachable from another machine.
 """
@@ -85,7 +85,7 @@ class Outlet:
         self.address = None
         age_s = time.monotonic() - self._started_s
         if age_s > _START_S:
-            program.kill()  # it took who listens on its port for its like, and serves nobody
+            program.kill()  # it mistook a listener on its port for its like, and serves no one
         if age_s > _PAUSE_S and not program.running:
             self._replace()
         return False

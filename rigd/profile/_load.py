@@ -1,7 +1,7 @@
 """A rig's profile: one TOML file, read and validated into frozen dataclasses.
 
 Every number stands as ``{ value = 2.0e-3, source = "assumed" }``, with its unit in the key, so
-that nobody takes an assumed number for a measured one. Ranges are declared where the number is
+that an assumed number is not mistaken for a measured one. Ranges are declared where the number is
 used (``annotated_types`` on the dataclasses) and enforced here. All problems of a file are
 reported at once.
 """
