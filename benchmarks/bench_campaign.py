@@ -70,7 +70,7 @@ def cpu_s() -> float:
 
 
 def welch_only(paths: list[Path]) -> int:
-    """Fit by the paper's route alone, on two workers, these started included."""
+    """Fit by the Welch method alone, on two workers, these started included."""
     task = SessionTask(WelchSettings(), (), (), BAND_HZ)
     with process_pool(JOBS) as pool:
         results = pool.run(analyse_session, [(path, task) for path in paths])

@@ -41,7 +41,7 @@ PAPER_TABLE3 = Path(__file__).parents[1] / "analysis" / "report" / "data" / "pap
 
 @dataclass(frozen=True, slots=True)
 class PaperRoute:
-    """Fits of a campaign by the paper's route, by type and weighting."""
+    """Fits of a campaign by the Welch method, by type and weighting."""
 
     parameters: dict[tuple[str, str], dict[str, NDArray[np.float64]]]
 
