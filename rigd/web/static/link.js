@@ -49,9 +49,13 @@ export class Link {
       this.heard = performance.now();
       this.#wait = FIRST_WAIT_MS;
       for (const line of data.split("\n")) {
-        const message = JSON.parse(line);
-        if (message.type === "stop") this.#endStops(message);
-        this.#tell(message.type, message);
+        try {
+          const message = JSON.parse(line);
+          if (message.type === "stop") this.#endStops(message);
+          this.#tell(message.type, message);
+        } catch (error) {
+          reportError(error);  // the other messages are shown all the same
+        }
       }
     });
     socket.addEventListener("close", () => {
