@@ -637,8 +637,8 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         if not complete:
             verdict.complaints.append(f"the session did not go on: {verdict.outcome}")
         lost = not passing and case.stopped_s is None and case.timed and not case.anywhere
-        if lost and "started again" not in verdict.said:
-            verdict.complaints.append("the publisher was not started again")
+        if lost and "It is restarted" not in verdict.said:
+            verdict.complaints.append("the publisher was not restarted")
     elif case.killed and case.victim in ("supervisor", "all"):
         # Unless it had ended before.
         expected = {1} if case.daemon else {-signal.SIGKILL, *({0} if complete else ())}
