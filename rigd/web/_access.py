@@ -25,6 +25,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 LIVE: Final = "/api/live"
 """Address of what happens; there is a limit to the pages that are open there."""
+ICON: Final = "/favicon.ico"
+"""Picture that any page may have."""
 _OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost"})
 _OWN_HEADER: Final = "X-Rigd"
 _FREE_COMMANDS: Final = frozenset({"stop", "predict"})
@@ -171,7 +173,9 @@ def _refusal(request: web.Request) -> web.Response | None:
     origin = request.headers.get("Origin")
     if origin is not None and origin != f"http://{host}":
         return refused(403, "Requests from other pages are refused.")
-    if request.headers.get("Sec-Fetch-Site", "same-origin") not in ("same-origin", "none"):
+    # A report is in a sandbox, which makes it a page of another origin; its browser wants an icon.
+    site = request.headers.get("Sec-Fetch-Site", "same-origin")
+    if site not in ("same-origin", "none") and request.path != ICON:
         return refused(403, "Requests from other pages are refused.")
     if request.method not in ("GET", "HEAD", "POST"):
         return refused(405, "Only GET, HEAD and POST are answered.")

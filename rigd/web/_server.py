@@ -24,7 +24,7 @@ from rigd.runner import QuickLook, result_line
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject
-from rigd.web._access import LIVE, Access, Connections, object_of, refused
+from rigd.web._access import ICON, LIVE, Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
@@ -95,7 +95,7 @@ class PageServer:
             [
                 web.get("/", self._static),
                 web.get("/static/{name}", self._static),
-                web.get("/favicon.ico", self._static),
+                web.get(ICON, self._static),
                 web.get(LIVE, self._live),
                 web.post("/api/command", self._command),
                 *self._library.routes(),
@@ -123,9 +123,8 @@ class PageServer:
         path = Path(str(files("rigd.web") / "static" / name))
         if not _STATIC_NAME.fullmatch(name) or not path.is_file():
             return refused(404, "There is no such file.")
-        # A browser asks for it from a report, too, whose sandbox makes it a page of another origin.
         shared = {"Cross-Origin-Resource-Policy": "cross-origin"}
-        return web.FileResponse(path, headers=shared if request.path == "/favicon.ico" else None)
+        return web.FileResponse(path, headers=shared if request.path == ICON else None)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         """Serve a page that is open."""

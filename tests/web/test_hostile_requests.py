@@ -97,6 +97,16 @@ def test_without_the_right_nothing_is_started(served, headers):
     assert TOKEN.encode() not in body
 
 
+@pytest.mark.parametrize("path", ["/", "/static/main.js", "/api/sessions", "/favicon.ico"])
+def test_another_site_gets_the_icon_alone(served, path):
+    """Which a report asks for: its sandbox makes it a page of another origin."""
+    for site in ("cross-site", "same-site"):
+        status, head, _ = served.ask("GET", path, {"Sec-Fetch-Site": site}, b"")
+        assert status == (200 if path == "/favicon.ico" else 403)
+        shared = "cross-origin-resource-policy: cross-origin" in head.lower()
+        assert shared is (path == "/favicon.ico")
+
+
 @pytest.mark.parametrize("command", ["tare", "zero", "reset", "check"])
 def test_without_a_token_nothing_else_acts(served, command):
     body = json.dumps({"command": command}).encode()
