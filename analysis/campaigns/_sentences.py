@@ -159,7 +159,7 @@ def _slight(found: Homogeneity) -> str:
     if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
         return ""
     return (
-        f" Frequencies scatter by less than {100 * _SLIGHT:g} %, as those of one beam may when its "
+        f" Frequencies vary by less than {100 * _SLIGHT:g} %, as those of one beam may when its "
         "temperature or clamp changes."
     )
 
@@ -171,7 +171,7 @@ def _scatter(each: Heterogeneity) -> str:
     size = _told([each.between_std], each)
     share = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
     return (
-        f"{label(each.quantity)[0]} scatters between sessions by {each.own_stds:.3g} of its own "
+        f"{label(each.quantity)[0]} varies between sessions by {each.own_stds:.3g} of its own "
         f"standard deviations ({share}Cochran's Q = {each.cochran_q:.3g} where "
         f"{each.degrees_of_freedom} is expected, I² {equals}{percents})"
     )
@@ -327,7 +327,7 @@ def order(found: PooledOrder) -> str:
     low, high = found.interval
     is_ = (
         f"The order {name} of the {of} is {found.value:.4f} "
-        f"(95 %: {low:.4f} to {high:.4f}, scatter between sessions included)"
+        f"(95 %: {low:.4f} to {high:.4f}, between-session variance included)"
     )
     if found.reason is not None:
         would = is_.replace(" is ", " would be ", 1)

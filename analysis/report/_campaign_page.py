@@ -97,8 +97,8 @@ def _how(campaign: CampaignResult, made_at: datetime) -> list[Facts]:
                 ("band", f"{first_hz:g} to {last_hz:g} Hz"),
                 (
                     "pooled",
-                    "random effects: sessions with their own covariances, and a scatter of each "
-                    "parameter between them (DerSimonian and Laird); Student's t",
+                    "random effects: sessions with their own covariances, and a between-session "
+                    "variance of each parameter (DerSimonian and Laird); Student's t",
                 ),
                 (
                     "structure",

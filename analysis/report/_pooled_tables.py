@@ -68,8 +68,8 @@ def structures_table(campaign: CampaignResult) -> Table:
         ),
         tuple(map(row, campaign.structures)),
         (
-            "Damping and stiffness corrections have one value for all sessions, with a scatter "
-            "between sessions where they differ; settings of the rig have one per session.",
+            "Damping and stiffness corrections have one value for all sessions, with a "
+            "between-session variance where they differ; settings of the rig have one per session.",
             *(() if all(each.pooled for each in campaign.structures) else (NOT_POOLED,)),
         ),
         selected=0 if campaign.pooled else None,

@@ -138,7 +138,7 @@ class SessionSequence:
         if abs(self._start_angle_rad) > limit_rad:
             raise SessionEnd(
                 "fault",
-                f"The motor stands at {self._start_angle_rad:.4g} rad, outside "
+                f"The motor is at {self._start_angle_rad:.4g} rad, outside "
                 f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
             )
         self._rest_spread_nm = rest.torque_spread_nm
@@ -172,7 +172,7 @@ class SessionSequence:
                 raise SessionEnd(
                     "fault",
                     f"{moving} It did not come to rest within session.rest_timeout_s = "
-                    f"{settings.rest_timeout_s:g} s; wait until it stands still and start again.",
+                    f"{settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
                 )
             if self._board[Word.PHASE] != Phase.WAITING:
                 self._board[Word.PHASE] = Phase.WAITING

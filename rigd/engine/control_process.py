@@ -346,7 +346,7 @@ class _Attendance:
             raise SessionEnd(
                 "fault",
                 f"The motor moves by {rest.speed_rad_s:.2g} rad/s, more than "
-                f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it stands still.",
+                f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it is at rest.",
             )
         moved_rad = self._cycle.angle_rad
         self._zero_rad += moved_rad

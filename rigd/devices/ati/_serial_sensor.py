@@ -231,10 +231,10 @@ class AtiSerialSensor:
             return ""
         late_ms = 1e3 * missing / self._settings.stream_hz
         return (
-            f"{self._name}: {missing} records did not come, or all come later by {late_ms:.2g} ms "
-            "since, and nothing on the line tells which: the wrench may be older than the file "
-            "states. Check cable and adapter; reconnecting (rigd reset, or another rigd run) "
-            "ends it."
+            f"{self._name}: {missing} records did not arrive, or all have been delayed by "
+            f"{late_ms:.2g} ms since; the line does not show which: the wrench may be older than "
+            "the file states. Check cable and adapter; reconnecting (rigd reset, or another rigd "
+            "run) ends it."
         )
 
     def measure(self, duration_s: float) -> dict[str, float]:

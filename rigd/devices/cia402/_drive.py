@@ -315,8 +315,8 @@ class Cia402Drive:
         unproven = pairing.unproven
         how = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
         doubt = (
-            f"{self._name}: {unproven} of its TPDOs did not come, or all come later by as many "
-            f"periods since, which cannot be told {how}: angles may be older than the file states."
+            f"{self._name}: {unproven} of its TPDOs did not arrive, or all have been delayed by as "
+            f"many periods since, which is unknown {how}: angles may be older than the file states."
             if unproven
             else ""
         )

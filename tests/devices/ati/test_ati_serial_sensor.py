@@ -257,7 +257,7 @@ def test_records_that_are_late_are_not_taken_for_those_of_the_tick(follow):
 def test_records_that_stay_late_cannot_be_told_from_lost_ones_and_that_is_said(follow):
     shown = follow([7, 0, 0, 0, 7, 7, 7, 7])
     assert shown[1:6] == ["stale"] * 5
-    assert "21 records did not come, or all come later by 3 ms since" in follow.doubt
+    assert "21 records did not arrive, or all have been delayed by 3 ms since" in follow.doubt
 
 
 def test_what_was_lost_with_a_torn_record_is_no_doubt(follow):

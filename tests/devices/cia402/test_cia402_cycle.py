@@ -216,7 +216,7 @@ def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
     scripted.drop = 1
     ticks(6)
     assert not drive.angle_stale
-    assert "1 of its TPDOs did not come, or all come later" in drive.health().doubt
+    assert "1 of its TPDOs did not arrive, or all have been delayed" in drive.health().doubt
 
 
 def test_a_reply_that_comes_between_the_ticks_does_not_count(make_drive, rig, scripted):
