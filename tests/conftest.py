@@ -25,7 +25,7 @@ from rigd.runtime import use_one_thread
 
 pytest_plugins = [
     "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "rewritten_once",
-    "shipped_profile", "standstill", "synthetic_sessions", "web_daemon",
+    "shared_memory_closed", "shipped_profile", "standstill", "synthetic_sessions", "web_daemon",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
