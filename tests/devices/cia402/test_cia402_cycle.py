@@ -184,7 +184,7 @@ def test_without_gaps_no_sync_is_ever_left_out(make_drive, rig, settings, script
     # Three periods with one reply each, and what is missing is taken for lost.
     assert stale == [True, True, True, True, False, False]
     assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one per tick
-    assert "cannot be told while cia402.sync_gaps = false" in drive.health().doubt
+    assert "unknown while cia402.sync_gaps = false" in drive.health().doubt
 
 
 def test_without_gaps_a_late_reply_is_still_not_the_next_ticks(make_drive, rig, settings, scripted):
