@@ -253,12 +253,12 @@ class _Shown:
 
     def _take_look(self) -> None:
         """Add the text of the quick look to the events, once there is one."""
-        if self._look is None:
+        if self._look is None or not self._look.exists():
             return
-        look = read_look(self._look)
+        # Once: it takes its name when it is whole, and garbage stays garbage.
+        look, self._look = read_look(self._look), None
         if look is None:
             return
-        self._look = None
         picture, t_ns = self.intake.picture, self.intake.t_ns
         self.backlog.owe(picture.events([Note(t_ns, "info", line) for line in look["text"]]))
 
