@@ -179,7 +179,7 @@ class Client:
         DaemonGoneError
             If there is none.
         """
-        return self._ask(command, fields, lambda: False)
+        return self.ask_unless(lambda: False, command, **fields)
 
     def ask_unless(self, stopped: Callable[[], bool], command: str, **fields: object) -> Document:
         """Ask as :meth:`ask` does, and cancel the request once a stop is wanted.
@@ -205,11 +205,6 @@ class Client:
         DaemonGoneError
             If there is none.
         """
-        return self._ask(command, fields, stopped)
-
-    def _ask(
-        self, command: str, fields: dict[str, object], stopped: Callable[[], bool]
-    ) -> Document:
         deadline_s = time.monotonic() + min(_CROWD_PATIENCE_S, self._answer_s)
         while True:
             try:
