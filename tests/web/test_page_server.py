@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 import json
 import socket
 import subprocess
@@ -304,19 +305,30 @@ def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
     assert pages.run(scenario) == 503
 
 
+@contextlib.asynccontextmanager
+async def page_at(served, session):
+    """Open a page; gives its socket, and the connection by which the server follows the daemon."""
+    async with session.ws_connect("/api/live") as socket:
+        await until(socket, "nominal")
+        (following,) = served.daemon.connected
+        yield socket, following
+
+
+def ends(served, series):
+    served.call(served.daemon.publish, {"event": "series", "series": series})
+
+
 @pytest.mark.usefixtures("asked_before")
 def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
     held = []
 
     async def scenario(session):
-        async with session.ws_connect("/api/live") as socket:
-            await until(socket, "nominal")
-            (following,) = served.daemon.connected
+        async with page_at(served, session) as (socket, following):
             served.daemon.replies["start"] = {"series": 1}
             await command(session, command="start", excitation="chirp")
             await command(session, command="reset")
             held.append(served.daemon.connected - {following})
-            served.call(served.daemon.publish, {"event": "series", "series": 1})
+            ends(served, 1)
             await until(socket, "series")
             while served.daemon.connected != {following}:
                 await asyncio.sleep(0.01)
@@ -328,18 +340,12 @@ def test_a_started_session_keeps_control_until_its_series_ends(served, pages):
     assert eventually(lambda: served.daemon.connected == {following})
 
 
-def ends(served, series):
-    served.call(served.daemon.publish, {"event": "series", "series": series})
-
-
 @pytest.mark.usefixtures("asked_before")
 def test_a_request_is_sent_once_although_a_series_ends_meanwhile(served, pages, delayed):
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with session.ws_connect("/api/live") as socket:
-            await until(socket, "nominal")
-            (following,) = served.daemon.connected
+        async with page_at(served, session) as (socket, following):
             await command(session, command="start", excitation="chirp")
             served.daemon.replies["start"] = {"series": 2}
             go_on = delayed("start")
@@ -366,9 +372,7 @@ def test_a_request_whose_reply_is_lost_is_not_sent_again(served, pages, delayed)
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with session.ws_connect("/api/live") as socket:
-            await until(socket, "nominal")
-            (following,) = served.daemon.connected
+        async with page_at(served, session) as (_, following):
             await command(session, command="start", excitation="chirp")
             delayed("zero")
             zeroing = asyncio.create_task(command(session, command="zero"))
@@ -388,9 +392,7 @@ def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served,
     served.daemon.replies["start"] = {"series": 1}
 
     async def scenario(session):
-        async with session.ws_connect("/api/live") as socket:
-            await until(socket, "nominal")
-            (following,) = served.daemon.connected
+        async with page_at(served, session) as (socket, following):
             go_on = delayed("start")
             starting = asyncio.create_task(command(session, command="start", excitation="chirp"))
             await seen(served.daemon, "start")
