@@ -3,7 +3,8 @@
 Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
 modes and their poles (`modes`, `poles`), a state-space realisation that runs in real time
 (`realise`, `couple`), the deflection and the tip's motion (`DeflectionFilter`, `tip_motion`), a
-beam with a tip mass (`LoadedBeam`) and the air's drag (`DragGrid`). It knows of no rig and no file.
+force at a point of the beam (`PointForceGrid`), a beam with a tip mass (`LoadedBeam`) and the air's
+drag (`DragGrid`). It knows of no rig and no file.
 """
 
 import lazy_loader as lazy

@@ -1,0 +1,318 @@
+"""Beam that is turned at its root and pushed at a point: what a touch does to it.
+
+The displacement ``y(x)`` from the line of angle zero obeys, in the Laplace domain::
+
+    P y + Q y'''' = F delta(x - x_c),     y(0) = 0,  y'(0) = theta,  y''(L) = y'''(L) = 0
+
+with ``P = rho s² + c_v s^lambda`` and ``Q = EI (1 + zeta s^alpha)``. The motor holds the root by
+the torque ``-Q y''(0)`` and the base shear ``Q y'''(0)``, both as it exerts them on the beam.
+
+As for Eq. 25, one form would cancel at low and overflow at high frequency, and there are two, which
+meet at ``|q| = 40`` for ``q = -L⁴ P / Q``:
+
+* below, power series: with ``K_n(x) = sum_k (-P/Q)^k x^(4k+n) / (4k+n)!`` the solution is
+  ``theta K_1(x) + M K_2(x) + V K_3(x)``, plus ``F/Q K_3(x - x_c)`` beyond the force; the two
+  conditions at the tip give M and V;
+* beyond, exponentials that never grow, ``exp(-b x)``, ``exp(-b (L - x))``, ``exp(-c x)`` and
+  ``exp(-c (L - x))`` with ``b = (-P/Q)^(1/4)`` and ``c = ±j b``, and for the force the response of
+  the beam without ends, ``A exp(-b r) + B exp(-c r)`` at the distance r. The four conditions make a
+  system whose inverse does not depend on x_c.
+
+References
+----------
+K. F. Graff, Wave Motion in Elastic Solids (1975), chapter 3.
+"""
+
+from dataclasses import dataclass
+from math import factorial, inf
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigd.beam._model import Beam, Damping
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_SERIES_LIMIT = 40.0
+_TERMS = 9
+"""Terms of the series: the first that is left out is below 40^9 / 36! = 7e-28."""
+
+
+class PointForceGrid:
+    """Response to an angle of the root and to a force, on one grid of s.
+
+    Parameters
+    ----------
+    s
+        Laplace variable in rad/s, any shape; 0 gives the static response.
+    beam, damping
+        Parameters of the exact model.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping, PointForceGrid
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> response = PointForceGrid([0.0], beam, Damping())
+    >>> print(response.per_force(0.6, 0.6).real, round(0.6**3 / (3 * 0.0903), 6))  # m/N
+    [0.79734219] 0.797342
+    """
+
+    __slots__ = ("_b4", "_high", "_length_m", "_low", "_q_stiffness", "_shape", "_waves")
+
+    def __init__(self, s: ArrayLike, beam: Beam, damping: Damping) -> None:
+        points = np.asarray(s, dtype=np.complex128)
+        self._shape = points.shape
+        points = points.ravel()
+        inertial = beam.density_over_stiffness * points * points
+        internal = 1 + damping.zeta * points**damping.alpha
+        self._length_m = beam.length_m
+        self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal
+        self._b4: Complex = -(inertial + damping.gamma * points**damping.lambda_) / internal
+        low = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
+        self._low, self._high = np.flatnonzero(low), np.flatnonzero(~low)
+        self._waves = _Waves(self._b4[self._high], beam.length_m)
+
+    def per_angle(self, x_m: ArrayLike, order: int = 0) -> Complex:
+        """Displacement along the beam per angle of the root, or a derivative of it.
+
+        Parameters
+        ----------
+        x_m
+            Distance from the motor's axis, any shape.
+        order
+            Order of the derivative with respect to x, 0 to 3.
+
+        Returns
+        -------
+        complex ndarray, shape of s, then of `x_m`
+            In m^(1 - order)/rad.
+        """
+        x = np.asarray(x_m, dtype=np.float64)
+        out = np.empty((self._b4.size, x.size), dtype=np.complex128)
+        b4 = self._b4[self._low, None]
+        moment, shear = self._root_curves(b4, b4 * self._k(3), b4 * self._k(2))
+        out[self._low] = (
+            _series(b4, x.ravel(), 1, order)
+            + moment * _series(b4, x.ravel(), 2, order)
+            + shear * _series(b4, x.ravel(), 3, order)
+        )
+        out[self._high] = self._waves.turned(x.ravel(), order)
+        return out.reshape(*self._shape, *x.shape)
+
+    def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
+        """Displacement along the beam per force on it, the root held, or a derivative of it.
+
+        Parameters
+        ----------
+        x_m, force_at_m
+            Where it is told and where the force acts, as distances from the motor's axis; both are
+            broadcast against each other.
+        order
+            Order of the derivative with respect to `x_m`, 0 to 3; the third jumps at the force, and
+            is given on the root's side there.
+
+        Returns
+        -------
+        complex ndarray, shape of s, then of the distances
+            In m^(1 - order)/N.
+        """
+        x, at = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64))
+        shape = x.shape
+        x, at = x.ravel(), at.ravel()
+        out = np.empty((self._b4.size, x.size), dtype=np.complex128)
+        b4, stiffness = self._b4[self._low, None], self._q_stiffness[self._low, None]
+        beyond = self._length_m - at
+        moment, shear = self._root_curves(b4, _series(b4, beyond, 1), _series(b4, beyond, 0))
+        after = np.where(x > at, _series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
+        out[self._low] = (
+            moment * _series(b4, x, 2, order) + shear * _series(b4, x, 3, order) + after
+        ) / stiffness
+        out[self._high] = self._waves.pushed(x, at, order) / self._q_stiffness[self._high, None]
+        return out.reshape(*self._shape, *shape)
+
+    def torque_per_angle(self) -> Complex:
+        """Return the motor's torque on the beam per angle in N·m/rad, of the shape of s: Eq. 25."""
+        return -self._stiffness() * self.per_angle(0.0, 2)
+
+    def shear_per_angle(self) -> Complex:
+        """Return the base shear per angle in N/rad, of the shape of s."""
+        return self._stiffness() * self.per_angle(0.0, 3)
+
+    def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
+        """Return the motor's torque per force on the beam in m, shape of s, then of `force_at_m`.
+
+        Parameters
+        ----------
+        force_at_m
+            Where it acts.
+        """
+        at = np.asarray(force_at_m, dtype=np.float64)
+        return -self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
+
+    def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
+        """Return the base shear per force on the beam, shape of s, then of `force_at_m`.
+
+        Parameters
+        ----------
+        force_at_m
+            Where it acts.
+        """
+        at = np.asarray(force_at_m, dtype=np.float64)
+        return self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
+
+    def force_per_angle(self, obstacle_at_m: ArrayLike, stiffness_n_per_m: float = inf) -> Complex:
+        """Force of an obstacle that the beam stays in touch with, per angle.
+
+        Parameters
+        ----------
+        obstacle_at_m
+            Where it is.
+        stiffness_n_per_m
+            Its own stiffness; infinite if it does not yield at all.
+
+        Returns
+        -------
+        complex ndarray, shape of s, then of `obstacle_at_m`
+            In N/rad; by it the response to the angle becomes ``per_angle + force · per_force``.
+        """
+        at = np.asarray(obstacle_at_m, dtype=np.float64)
+        yielding = self.per_force(at, at) + 1 / stiffness_n_per_m
+        force: Complex = -self.per_angle(at) / yielding
+        return force
+
+    def _stiffness(self, axes: int = 0) -> Complex:
+        return self._q_stiffness.reshape(*self._shape, *(1,) * axes)
+
+    def _k(self, n: int) -> Complex:
+        """``K_n`` at the tip at the low points, shape (low, 1)."""
+        return _series(self._b4[self._low, None], np.array([self._length_m]), n)
+
+    def _root_curves(
+        self, b4: Complex, tip_moment: Complex, tip_shear: Complex
+    ) -> tuple[Complex, Complex]:
+        """y''(0) and y'''(0) that cancel second and third derivatives of the rest at the tip."""
+        k0, k1, k3 = self._k(0), self._k(1), self._k(3)
+        determinant = k0 * k0 - b4 * k1 * k3
+        moment: Complex = (k1 * tip_shear - k0 * tip_moment) / determinant
+        shear: Complex = (b4 * k3 * tip_moment - k0 * tip_shear) / determinant
+        return moment, shear
+
+
+def _series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
+    """``K_n`` or a derivative of it at the points x (m,) for b4 (s, 1); shape (s, m)."""
+    n -= order
+    if n < 0:
+        return b4 * _series(b4, x, n + 4)
+    argument = b4 * x**4
+    total = np.full_like(argument, 1 / factorial(4 * (_TERMS - 1) + n))
+    for k in range(_TERMS - 2, -1, -1):
+        total *= argument
+        total += 1 / factorial(4 * k + n)
+    return total * x**n
+
+
+@dataclass(init=False, slots=True)
+class _Waves:
+    """Solution by exponentials that never grow, at the points where |q| is large."""
+
+    _b: Complex  # (s, 1)
+    _kappa: Complex  # (s, 1): c / b, which is j or -j
+    _length_m: float
+    _inverse: Complex  # (s, 4, 4)
+
+    def __init__(self, b4: Complex, length_m: float) -> None:
+        root = b4**0.25
+        self._length_m = length_m
+        self._b = root[:, None]
+        self._kappa = np.where(root.imag > 0, -1j, 1j)[:, None]  # so that Re c >= 0
+        decay = np.exp(-root * length_m)
+        turn = np.exp(-root * self._kappa[:, 0] * length_m)
+        one, kappa = np.ones_like(root), self._kappa[:, 0]
+        # y(0), y'(0)/b, y''(L)/b², y'''(L)/b³ of the four functions: c² = -b².
+        rows = [
+            [one, decay, one, turn],
+            [-one, decay, -kappa, kappa * turn],
+            [decay, one, -turn, -one],
+            [-decay, one, kappa * turn, -kappa],
+        ]
+        self._inverse = np.linalg.inv(np.moveaxis(np.array(rows), -1, 0)).astype(np.complex128)
+
+    def turned(self, x: Real, order: int) -> Complex:
+        """Per angle at x (m,), shape (s, m)."""
+        return self._combined(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
+
+    def pushed(self, x: Real, at: Real, order: int) -> Complex:
+        """Per force over Q at x (m,) for forces at `at` (m,), shape (s, m)."""
+        b, c, kappa = self._b, self._kappa * self._b, self._kappa
+        near = -1 / (4 * b**3)  # A, of the decaying wave
+        far = -near / kappa  # B, of the other
+        to_root = near * np.exp(-b * at), far * np.exp(-c * at)
+        to_tip = (
+            near * np.exp(-b * (self._length_m - at)),
+            far * np.exp(-c * (self._length_m - at)),
+        )
+        at_ends = np.stack(
+            [
+                to_root[0] + to_root[1],
+                to_root[0] + kappa * to_root[1],
+                to_tip[0] - to_tip[1],
+                -to_tip[0] + kappa * to_tip[1],
+            ],
+            axis=1,
+        )
+        distance = np.abs(x - at)
+        side = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
+        direct = (side * b) ** order * near * np.exp(-b * distance) + (
+            side * c
+        ) ** order * far * np.exp(-c * distance)
+        coefficients = -self._inverse @ at_ends
+        return direct + self._combined(coefficients, x, order)
+
+    def _combined(self, coefficients: Complex, x: Real, order: int) -> Complex:
+        """Combine the four functions by coefficients (s, 4, m or 1)."""
+        b, c = self._b, self._kappa * self._b
+        from_tip = self._length_m - x
+        functions = (
+            (-b) ** order * np.exp(-b * x),
+            b**order * np.exp(-b * from_tip),
+            (-c) ** order * np.exp(-c * x),
+            c**order * np.exp(-c * from_tip),
+        )
+        total: Complex = sum(
+            (coefficients[:, i] * function for i, function in enumerate(functions)),
+            start=np.zeros((b.shape[0], x.size), dtype=np.complex128),
+        )
+        return total
+
+
+def pressing_force_n(
+    beam: Beam, obstacle_at_m: float, angle_rad: float, stiffness_n_per_m: float = inf
+) -> float:
+    """Force that a beam at rest exerts on an obstacle.
+
+    Parameters
+    ----------
+    beam
+    obstacle_at_m
+        Distance of the obstacle from the motor's axis.
+    angle_rad
+        By how much the motor has turned beyond the angle at which the straight beam touches.
+    stiffness_n_per_m
+        Stiffness of the obstacle; infinite if it does not yield at all.
+
+    Returns
+    -------
+    float
+        In N; not negative. An obstacle at rest does not pull.
+
+    Examples
+    --------
+    >>> from rigd.beam import Beam, pressing_force_n
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> print(f"{pressing_force_n(beam, 0.5, angle_rad=0.1):.4f} N")
+    0.1084 N
+    """
+    compliance_m_per_n = obstacle_at_m**3 / (3 * beam.bending_stiffness_n_m2)
+    return max(0.0, obstacle_at_m * angle_rad / (compliance_m_per_n + 1 / stiffness_n_per_m))
