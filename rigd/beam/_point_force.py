@@ -99,7 +99,7 @@ class PointForceGrid:
             + shear * _series(b4, x.ravel(), 3, order)
         )
         out[self._high] = self._waves.turned(x.ravel(), order)
-        return out.reshape(*self._shape, *x.shape)
+        return out.reshape((*self._shape, *x.shape))
 
     def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
         """Displacement along the beam per force on it, the root held, or a derivative of it.
@@ -130,7 +130,7 @@ class PointForceGrid:
             moment * _series(b4, x, 2, order) + shear * _series(b4, x, 3, order) + after
         ) / stiffness
         out[self._high] = self._waves.pushed(x, at, order) / self._q_stiffness[self._high, None]
-        return out.reshape(*self._shape, *shape)
+        return out.reshape((*self._shape, *shape))
 
     def torque_per_angle(self) -> Complex:
         """Return the motor's torque on the beam per angle in N·m/rad, of the shape of s: Eq. 25."""
@@ -183,7 +183,7 @@ class PointForceGrid:
         return force
 
     def _stiffness(self, axes: int = 0) -> Complex:
-        return self._q_stiffness.reshape(*self._shape, *(1,) * axes)
+        return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
     def _k(self, n: int) -> Complex:
         """``K_n`` at the tip at the low points, shape (low, 1)."""

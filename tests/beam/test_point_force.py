@@ -121,3 +121,9 @@ def test_shapes():
     assert grid.per_angle(PLACES_M).shape == (2, 3, 4)
     assert grid.per_force(0.2, 0.5).shape == (2, 3)
     assert grid.force_per_angle(PLACES_M).shape == (2, 3, 4)
+
+
+def test_one_point():
+    grid = PointForceGrid(5j, BEAM, FRACTIONAL)
+    assert grid.torque_per_angle() == pytest.approx(transfer(5j, BEAM, FRACTIONAL))
+    assert grid.per_force(0.2, 0.5).shape == ()

@@ -1,0 +1,387 @@
+"""Innovations: what the sensor shows of a beam that is touched, tick by tick.
+
+The exact model of the free beam tells from the angle what torque and base shear there should be.
+What is measured beyond that is noise, the ringing of the beam from before, the model's own error,
+or a touch. Ringing and error come slowly and at the beam's own frequencies: an observer follows
+them (a stationary Kalman filter of the first modes and of the zeros of both channels). What it
+cannot foresee from one tick to the next are the innovations, white noise unless something else
+begins.
+
+Filter and observer are linear, so that a tick is the product of one matrix with one vector:
+[state, angle, torque, shear] → [next state, whitened innovations, whitened prediction].
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import (
+    Beam,
+    Damping,
+    PointForceGrid,
+    clamped_free_eigenvalues,
+    poles_for_eigenvalues,
+)
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_MOST_MODES = 40
+_FASTEST = 0.42
+"""Fastest mode that the filter follows, as a share of the rate; the taps stand for the others."""
+_LEAST_SHARE = 0.5
+"""Imaginary part of a pole over its size: below, the ladder stands for it."""
+_LADDER = 10
+"""Real poles for the branch cut of the fractional orders."""
+_SLOWEST_RAD_S = 0.03
+_TAPS = 4
+_FIT_FROM_HZ, _FIT_TO = 0.02, 0.45
+_WEIGHTED_FROM_HZ, _KNEE_HZ = 0.3, 50.0
+"""Band in which the relative error counts fully. No motor moves much above, where a close fit
+would only make more of the encoder's steps."""
+_OBSERVED_MODES = 4
+_OBSERVER_RAD_S = 15.0
+"""How fast the observer takes up ringing that it did not foresee: slow against a touch (10 ms),
+fast against the drift in phase of a model whose frequencies are 1 % wrong."""
+_ZERO_RAD_S = 0.5
+"""The same of the zero of a channel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeBeam:
+    """Discrete model of the free beam with its observer, for one rate and sensor.
+
+    Examples
+    --------
+    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.touch import Noise, free_beam
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> model = free_beam(beam, Damping(zeta=7e-5), 1000.0, Noise(torque_nm=5e-3, shear_n=0.02))
+    >>> model.states, model.matrix.shape
+    (39, (43, 42))
+    """
+
+    matrix: Real
+    """(n + 4, n + 3) as above; without shear its row and column are zero."""
+    gain: Real
+    """(n, 2): what each whitened innovation has added to the next state."""
+    whitening: Real
+    """(2, 2): from innovations to whitened ones."""
+    states: int
+    """n."""
+    channels: int
+    """1: torque alone; 2: torque and base shear."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of one sample of each channel."""
+
+    torque_nm: float
+    """Standard deviation of the coupling torque."""
+    shear_n: float | None
+    """Standard deviation of the base shear; None: it is not measured."""
+    angle_rad: float = 0.0
+    """Standard deviation of the angle; a resolution of 7e-5 rad makes 2e-5 rad."""
+
+
+def free_beam(
+    beam: Beam,
+    damping: Damping,
+    rate_hz: float,
+    noise: Noise,
+    *,
+    tool_inertia_kg_m2: float = 0.0,
+    torque_after_angle_s: float = 0.0,
+) -> FreeBeam:
+    """Design filter and observer.
+
+    Parameters
+    ----------
+    beam, damping
+        Parameters of the exact model.
+    rate_hz
+        Ticks a second.
+    noise
+        Noise of the channels.
+    tool_inertia_kg_m2
+        Inertia between sensor and beam.
+    torque_after_angle_s
+        By how much older the wrench of a tick is than its angle.
+
+    Returns
+    -------
+    FreeBeam
+    """
+    filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s)
+    both = noise.shear_n is not None
+    observer = _observer(beam, damping, rate_hz, noise, filter_.noise_gain)
+    f, o = filter_.a.shape[0], observer.a.shape[0]
+    n = f + o
+    matrix = np.zeros((n + 4, n + 3))
+    matrix[:f, :f], matrix[:f, n] = filter_.a, filter_.b
+    prediction = np.zeros((2, n + 3))
+    prediction[:, :f], prediction[:, n] = filter_.c, filter_.d
+    innovation = -prediction
+    innovation[:, f:n] -= observer.c
+    innovation[0, n + 1] = innovation[1, n + 2] = 1.0
+    matrix[f:n, f:n] = observer.a
+    matrix[f:n] += observer.gain @ innovation
+    matrix[n : n + 2] = observer.whitening @ innovation
+    matrix[n + 2 :] = observer.whitening @ prediction
+    gain = np.zeros((n, 2))
+    channels = 2 if both else 1
+    gain[f:, :channels] = observer.gain[:, :channels] @ np.linalg.inv(
+        observer.whitening[:channels, :channels]
+    )
+    return FreeBeam(matrix, gain, observer.whitening, n, channels)
+
+
+class InnovationFilter:
+    """Runs a `FreeBeam`; starts at rest at the first angle.
+
+    Parameters
+    ----------
+    model
+        From `free_beam`.
+
+    Attributes
+    ----------
+    whitened
+        Innovations of torque and shear, in their standard deviations and uncorrelated.
+    predicted
+        Torque and shear that the angle alone explains, in the same unit.
+    """
+
+    __slots__ = (
+        "_angle_before_rad",
+        "_angle_rad",
+        "_dot",
+        "_gain",
+        "_n",
+        "_rest_rad",
+        "_vectors",
+        "predicted",
+        "whitened",
+    )
+
+    def __init__(self, model: FreeBeam) -> None:
+        n = self._n = model.states
+        self._gain = model.gain
+        self._dot = np.asfortranarray(model.matrix).dot
+        # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
+        self._vectors = tuple(np.zeros((2, n + 4)))
+        self._rest_rad: float | None = None
+        self._angle_rad = self._angle_before_rad = 0.0
+        self.whitened = (0.0, 0.0)
+        self.predicted = (0.0, 0.0)
+
+    def step(
+        self,
+        angle_rad: float,
+        torque_nm: float,
+        shear_n: float,
+        *,
+        missed: int = 0,
+        angle_stale: bool = False,
+        wrench_stale: bool = False,
+    ) -> None:
+        """Take the readings of a tick.
+
+        Parameters
+        ----------
+        angle_rad, torque_nm, shear_n
+            Readings; the shear is without effect where the model has none.
+        missed
+            Ticks that were missed before this one: their angle is interpolated.
+        angle_stale
+            The angle is an old one: it is extrapolated, and says nothing new.
+        wrench_stale
+            Torque and shear are old: they are passed over.
+        """
+        if self._rest_rad is None:
+            self._rest_rad = angle_rad
+        turned_rad = angle_rad - self._rest_rad
+        if angle_stale:
+            turned_rad = 2.0 * self._angle_rad - self._angle_before_rad
+        if missed:
+            start_rad = self._angle_rad
+            for tick in range(1, missed + 1):
+                share = tick / (missed + 1)
+                self._pass(start_rad + share * (turned_rad - start_rad), torque_nm, shear_n)
+        if wrench_stale:
+            self._pass(turned_rad, torque_nm, shear_n)
+        else:
+            self._run(turned_rad, torque_nm, shear_n)
+
+    def _run(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
+        n = self._n
+        input_, output = self._vectors
+        input_[n] = turned_rad
+        input_[n + 1] = torque_nm
+        input_[n + 2] = shear_n
+        self._dot(input_[: n + 3], output)
+        self._vectors = output, input_
+        torque, shear, predicted_torque, predicted_shear = output[n:].tolist()
+        self.whitened = torque, shear
+        self.predicted = predicted_torque, predicted_shear
+        self._angle_before_rad, self._angle_rad = self._angle_rad, turned_rad
+
+    def _pass(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
+        """Go on without a wrench: take back what an old one has done to the state."""
+        self._run(turned_rad, torque_nm, shear_n)
+        self._vectors[0][: self._n] -= self._gain @ np.array(self.whitened)
+        self.whitened = 0.0, 0.0
+
+
+# Filter of the angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Filter:
+    """``x' = a x + b θ``, ``[torque, shear] = c x + d θ``."""
+
+    a: Real
+    b: Real
+    c: Real
+    d: Real
+    noise_gain: Real
+    """(2,): rms of each channel for white noise of 1 rad in the angle."""
+
+
+def _fit(
+    beam: Beam, damping: Damping, rate_hz: float, tool_inertia_kg_m2: float, later_s: float
+) -> _Filter:
+    """Fit discrete poles, where the exact ones are, and some taps to the exact response."""
+    pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
+    upper = pairs[_ringing(pairs[:, 0], rate_hz), 0]
+    turning: Complex = np.exp(upper / rate_hz)
+    decaying: Real = np.exp(-np.geomspace(_SLOWEST_RAD_S, rate_hz, _LADDER) / rate_hz)
+
+    half_width_hz = np.maximum(-upper.real, 1e-3 * upper.imag) / (2 * pi)
+    near_hz = upper.imag[:, None] / (2 * pi) + half_width_hz[:, None] * np.linspace(-3, 3, 11)
+    band_hz = np.geomspace(_FIT_FROM_HZ, _FIT_TO * rate_hz, 400)
+    frequency_hz = np.concatenate([band_hz, near_hz.ravel()])
+    frequency_hz = frequency_hz[(frequency_hz > 0) & (frequency_hz < _FIT_TO * rate_hz)]
+    s = 2j * pi * frequency_hz
+    exact = PointForceGrid(s, beam, damping)
+    response = np.array([exact.torque_per_angle(), exact.shear_per_angle()])
+    response[0] += tool_inertia_kg_m2 * s**2
+    response *= np.exp(-later_s * s)
+
+    weight = np.minimum(1.0, (_KNEE_HZ / frequency_hz) ** 3)
+    weight *= np.minimum(1.0, frequency_hz / _WEIGHTED_FROM_HZ)
+    columns = _columns(s / rate_hz, turning, decaying)
+    at_rest = _columns(np.zeros(1, dtype=complex), turning, decaying).real
+    coefficients = np.empty((2, columns.shape[1]))
+    for row, target in zip(coefficients, response, strict=True):
+        scale = weight / np.abs(target)
+        weighted = columns * scale[:, None]
+        # An angle at rest has to give no torque at all, not one that is small beside the others'.
+        matrix = np.concatenate([weighted.real, weighted.imag, 1e4 * at_rest])
+        aim = np.concatenate([(target * scale).real, (target * scale).imag, [0.0]])
+        size = np.linalg.norm(matrix, axis=0)
+        row[:] = np.linalg.lstsq(matrix / size, aim, rcond=1e-12)[0] / size
+
+    everywhere = _columns(1j * np.linspace(0, pi, 4001), turning, decaying) @ coefficients.T
+    noise_gain = np.sqrt(np.mean(np.abs(everywhere) ** 2, axis=0))
+    return _state_space(turning, decaying, coefficients, noise_gain)
+
+
+def _ringing(upper: Complex, rate_hz: float) -> NDArray[np.bool_]:
+    """Tell which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
+    ringing: NDArray[np.bool_] = upper.imag > _LEAST_SHARE * np.abs(upper)
+    return ringing & (upper.imag < 2 * pi * _FASTEST * rate_hz)
+
+
+def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
+    """Responses whose combination is fitted: real and imaginary part of each pole, and taps."""
+    delay = np.exp(-s_ticks)[:, None]
+    up, down = 1 / (1 - turning * delay), 1 / (1 - turning.conj() * delay)
+    cut = 1 / (1 - decaying * delay)
+    return np.concatenate([up + down, 1j * (up - down), cut, delay ** np.arange(_TAPS)], axis=1)
+
+
+def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gain: Real) -> _Filter:
+    """State space of the fit; the states are those before the angle of the tick is taken in."""
+    m, k = turning.size, decaying.size
+    n = 2 * m + k + _TAPS - 1
+    a, b = np.zeros((n, n)), np.zeros(n)
+    even = np.arange(0, 2 * m, 2)
+    a[even, even] = a[even + 1, even + 1] = turning.real
+    a[even, even + 1], a[even + 1, even] = -turning.imag, turning.imag
+    b[even], b[even + 1] = turning.real, turning.imag
+    rest = np.arange(2 * m, 2 * m + k)
+    a[rest, rest] = b[rest] = decaying
+    taps = np.arange(2 * m + k, n)
+    b[taps[0]] = 1.0
+    a[taps[1:], taps[:-1]] = 1.0
+    # A state holds the sum up to the tick before, moved on by one tick: with θ it is up to date.
+    c = np.zeros((2, n))
+    c[:, even] = 2 * coefficients[:, :m]
+    c[:, even + 1] = -2 * coefficients[:, m : 2 * m]
+    c[:, rest] = coefficients[:, 2 * m : 2 * m + k]
+    c[:, taps] = coefficients[:, -_TAPS + 1 :]
+    d = (
+        2 * coefficients[:, :m].sum(axis=1)
+        + coefficients[:, 2 * m : 2 * m + k].sum(axis=1)
+        + coefficients[:, -_TAPS]
+    )
+    return _Filter(a, b, c, d, noise_gain)
+
+
+# Observer of what the angle does not explain
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observer:
+    """``x' = a x + gain e``, ``e = y - c x``, and the whitening of e."""
+
+    a: Real
+    c: Real
+    gain: Real
+    whitening: Real
+
+
+def _observer(
+    beam: Beam, damping: Damping, rate_hz: float, noise: Noise, noise_gain: Real
+) -> _Observer:
+    """Stationary Kalman filter of ringing modes and drifting zeros."""
+    from scipy.linalg import solve_discrete_are
+
+    z = clamped_free_eigenvalues(_OBSERVED_MODES)
+    upper = poles_for_eigenvalues(z, beam, damping)[:, 0]
+    ringing = _ringing(upper, rate_hz)
+    turning, wave_number = np.exp(upper[ringing] / rate_hz), z[ringing] / beam.length_m
+    both = noise.shear_n is not None
+    channels = 2 if both else 1
+    m = turning.size
+    n = 2 * m + channels
+    a, c = np.zeros((n, n)), np.zeros((2, n))
+    even = np.arange(0, 2 * m, 2)
+    a[even, even] = a[even + 1, even + 1] = turning.real
+    a[even, even + 1], a[even + 1, even] = -turning.imag, turning.imag
+    zeros = np.arange(2 * m, n)
+    a[zeros, zeros] = 1.0
+    # At the root of a mode of wave number k the third derivative is sigma k times the second.
+    sigma = (np.cosh(z) + np.cos(z)) / (np.sinh(z) + np.sin(z))
+    c[0, even] = 1.0
+    c[np.arange(channels), zeros] = 1.0
+    sizes = np.array([noise.torque_nm, noise.shear_n or 0.0])
+    variance = sizes**2 + (noise_gain * noise.angle_rad) ** 2
+    q = np.zeros(n)
+    # A random walk of this size makes the observer as fast as it is to be.
+    q[even] = q[even + 1] = variance[0] * (_OBSERVER_RAD_S / rate_hz) ** 2
+    q[zeros] = variance[:channels] * (_ZERO_RAD_S / rate_hz) ** 2
+    if both:
+        c[1, even] = sigma[ringing] * wave_number
+    used = c[:channels]
+    r = np.diag(variance[:channels])
+    covariance = solve_discrete_are(a.T, used.T, np.diag(q), r)
+    innovation = used @ covariance @ used.T + r
+    gain, whitening = np.zeros((n, 2)), np.zeros((2, 2))
+    gain[:, :channels] = a @ np.linalg.solve(innovation, used @ covariance).T
+    whitening[:channels, :channels] = np.linalg.inv(np.linalg.cholesky(innovation))
+    return _Observer(a, c, gain, whitening)

@@ -1,0 +1,177 @@
+"""Innovations of the free beam, and the test for a touch, on records of the exact model."""
+
+from dataclasses import replace
+from math import exp, pi
+
+import numpy as np
+import pytest
+
+from rigd.beam import Beam, Damping, PointForceGrid, transfer
+from rigd.touch import DetectorSettings, InnovationFilter, Noise, TouchDetector, free_beam
+from rigd.touch._innovations import _fit
+
+BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+DAMPING = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
+RATE_HZ = 1000.0
+REST = 1000
+NOISE = Noise(torque_nm=5e-3, shear_n=0.02, angle_rad=7e-5 / 12**0.5)
+SHIFT_PER_S = 1.5
+"""Of the line along which the transform is taken back: what it wraps round has died away by
+exp(-16 · 1.5), or could not be told from noise."""
+
+
+def respond(transfers, inputs, ticks):
+    """Sum of responses to sampled inputs (n,), by the Laplace transform along a shifted line."""
+    n = 16 * 1024
+    damped = np.exp(-SHIFT_PER_S * np.arange(n) / RATE_HZ)
+    s = SHIFT_PER_S + 2j * pi * np.fft.rfftfreq(n, 1 / RATE_HZ)
+    total = np.zeros(s.size, dtype=complex)
+    for response, signal in zip(transfers(s), inputs, strict=True):
+        padded = np.zeros(n)
+        padded[: signal.size] = signal
+        total += response * np.fft.rfft(padded * damped)
+    return (np.fft.irfft(total, n) / damped)[:ticks]
+
+
+def slewed(speed_rad_s, ticks=3000):
+    """Angle that starts after the rest within 0.1 s, smoothly."""
+    u = np.clip(np.arange(ticks) / 100 - REST / 100, 0, 1)
+    return np.cumsum(speed_rad_s * u**3 * (10 - 15 * u + 6 * u**2)) / RATE_HZ
+
+
+def record(angle_rad, beam=BEAM, *, force_n=None, at_m=0.6, seed=0, noise=NOISE):
+    """Quantised angle, and torque and shear with noise."""
+    ticks = angle_rad.size
+    force = np.zeros(ticks) if force_n is None else force_n
+
+    def torque(s):
+        grid = PointForceGrid(s, beam, DAMPING)
+        return grid.torque_per_angle(), grid.torque_per_force(at_m)
+
+    def shear(s):
+        grid = PointForceGrid(s, beam, DAMPING)
+        return grid.shear_per_angle(), grid.shear_per_force(at_m)
+
+    random = np.random.default_rng(seed).standard_normal((2, ticks))
+    # Beyond what the angle's end can reach: the transform would otherwise see it fall to zero.
+    held = np.concatenate([angle_rad, np.full(4096, angle_rad[-1])])
+    inputs = (held, force)
+    return (
+        np.round(angle_rad / 7e-5) * 7e-5,
+        respond(torque, inputs, ticks) + noise.torque_nm * random[0],
+        respond(shear, inputs, ticks) + noise.shear_n * random[1],
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    return free_beam(BEAM, DAMPING, RATE_HZ, NOISE)
+
+
+def innovations(model, readings):
+    filter_ = InnovationFilter(model)
+    told = []
+    for angle, torque, shear in np.column_stack(readings).tolist():
+        filter_.step(angle, torque, shear)
+        told.append(filter_.whitened)
+    return np.array(told)
+
+
+def detection(model, readings, **settings):
+    detector = TouchDetector(model, RATE_HZ, DetectorSettings(**settings))
+    for tick, (angle, torque, shear) in enumerate(np.column_stack(readings).tolist()):
+        if tick == REST:
+            detector.arm()
+        if detector.step(angle, torque, shear):
+            return tick, detector
+    return None, detector
+
+
+def test_the_filter_follows_the_exact_response():
+    fitted = _fit(BEAM, DAMPING, RATE_HZ, 1e-5, 4e-4)
+    for frequency_hz in (0.5, 2.0, 8.0, 30.0, 50.0):
+        s = 2j * pi * frequency_hz
+        z = np.exp(s / RATE_HZ)
+        told = fitted.c @ np.linalg.solve(z * np.eye(len(fitted.b)) - fitted.a, fitted.b) + fitted.d
+        exact = (transfer(s, BEAM, DAMPING) + 1e-5 * s**2) * np.exp(-4e-4 * s)
+        shear = PointForceGrid(s, BEAM, DAMPING).shear_per_angle() * np.exp(-4e-4 * s)
+        assert told == pytest.approx(np.array([exact, shear]), rel=3e-3)
+
+
+@pytest.mark.parametrize("speed_rad_s", [0.3, 2.0])
+def test_innovations_of_a_free_beam_are_white(model, speed_rad_s):
+    white = innovations(model, record(slewed(speed_rad_s)))
+    assert np.cov(white.T) == pytest.approx(np.eye(2), abs=0.12)
+    for channel in white.T:
+        assert abs(np.corrcoef(channel[1:], channel[:-1])[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize("wrong", [0.99, 1.01])
+@pytest.mark.parametrize("key", ["bending_stiffness_n_m2", "density_kg_per_m"])
+def test_a_model_that_is_one_per_cent_wrong_makes_no_touch(model, key, wrong):
+    beam = replace(BEAM, **{key: wrong * getattr(BEAM, key)})
+    tick, _ = detection(model, record(slewed(2.0), beam))
+    assert tick is None
+
+
+@pytest.mark.parametrize("at_m", [0.05, 0.3, 0.6, 0.95])
+def test_a_touch_is_detected_within_ten_milliseconds(model, at_m):
+    begin = 2000
+    # A force of one newton that rises within 2 ms, against the motion.
+    force = -np.clip((np.arange(3000) - begin) / 2, 0, 1)
+    tick, detector = detection(model, record(slewed(1.0), force_n=force, at_m=at_m))
+    assert begin < tick <= begin + 10
+    assert detector.level > 1
+
+
+def test_torque_alone_detects_as_well():
+    model = free_beam(BEAM, DAMPING, RATE_HZ, replace(NOISE, shear_n=None))
+    assert model.channels == 1
+    force = -np.clip((np.arange(3000) - 2000) / 2, 0, 1)
+    angle, torque, _ = record(slewed(1.0), force_n=force)
+    tick, _ = detection(model, (angle, torque, np.zeros(3000)))
+    assert 2000 < tick <= 2015
+    assert detection(model, (*record(slewed(1.0))[:2], np.zeros(3000)))[0] is None
+
+
+def test_the_threshold_rises_with_the_noise_at_rest(model):
+    noise = Noise(2 * NOISE.torque_nm, 2 * NOISE.shear_n)
+    tick, detector = detection(model, record(slewed(1.0), noise=noise))
+    assert tick is None
+    assert detector.excess == pytest.approx(4.0, rel=0.15)
+
+
+def test_rate_of_false_alarms():
+    # White noise straight into the test: the stated rate counts each window by itself.
+    per_hour = 3e4
+    settings = DetectorSettings(false_alarms_per_hour=per_hour, model_tolerance=0.0)
+    assert exp(-settings.threshold(RATE_HZ) / 2) == pytest.approx(per_hour / (4 * 3600 * RATE_HZ))
+    random = np.random.default_rng(1).standard_normal((200_000, 2))
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(random, axis=0)])
+    alarms = np.zeros(200_001, dtype=bool)
+    for window in (1, 2, 4, 8):
+        square = ((sums[window:] - sums[:-window]) ** 2).sum(axis=1) / window
+        alarms[window:] |= square > settings.threshold(RATE_HZ)
+    expected = per_hour * 200_000 / RATE_HZ / 3600
+    assert 0.5 * expected < alarms.sum() < 1.2 * expected
+
+
+def test_missed_ticks_and_old_readings_are_passed_over(model):
+    readings = np.column_stack(record(slewed(1.0)))
+    detector = TouchDetector(model, RATE_HZ, DetectorSettings())
+    missed = 0
+    before = readings[0]
+    for tick, now in enumerate(readings):
+        if tick == REST:
+            detector.arm()
+        if 1500 <= tick < 1530 or tick in (1700, 1800):
+            missed += 1
+            continue
+        stale_wrench, stale_angle = tick % 97 == 0, tick % 89 == 0
+        angle = before[0] if stale_angle else now[0]
+        torque, shear = before[1:] if stale_wrench else now[1:]
+        touched = detector.step(
+            angle, torque, shear, missed=missed, angle_stale=stale_angle, wrench_stale=stale_wrench
+        )
+        assert not touched
+        missed, before = 0, now
