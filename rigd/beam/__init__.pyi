@@ -1,6 +1,9 @@
 from ._air_drag import AIR_DENSITY_KG_PER_M3 as AIR_DENSITY_KG_PER_M3
 from ._air_drag import DragGrid as DragGrid
 from ._deflection import DeflectionFilter as DeflectionFilter
+from ._force_realisation import ForceRealisation as ForceRealisation
+from ._force_realisation import check_order as check_order
+from ._force_realisation import realise_force as realise_force
 from ._model import PARAMETERS as PARAMETERS
 from ._model import Beam as Beam
 from ._model import Damping as Damping
@@ -9,6 +12,7 @@ from ._model import transfer as transfer
 from ._model import transfer_and_gradient as transfer_and_gradient
 from ._modes import Mode as Mode
 from ._modes import clamped_free_eigenvalues as clamped_free_eigenvalues
+from ._modes import mode_mean as mode_mean
 from ._modes import mode_shape as mode_shape
 from ._modes import modes as modes
 from ._modes import participation as participation
@@ -20,10 +24,12 @@ from ._point_force import pressing_force_n as pressing_force_n
 from ._realisation import CoupledModel as CoupledModel
 from ._realisation import Realisation as Realisation
 from ._realisation import RealisationError as RealisationError
+from ._realisation import StateOutput as StateOutput
 from ._realisation import couple as couple
 from ._realisation import held_inputs as held_inputs
 from ._realisation import propagator as propagator
 from ._realisation import realise as realise
+from ._realisation import state_output as state_output
 from ._realisation import with_filter as with_filter
 from ._tip import SMALL_SLOPE_RAD as SMALL_SLOPE_RAD
 from ._tip import TipMotion as TipMotion

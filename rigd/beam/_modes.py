@@ -124,6 +124,28 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
     return shape
 
 
+def mode_mean(n: int) -> Real:
+    """Mean of each of the first `n` mode shapes over the beam, shape (n,).
+
+    Parameters
+    ----------
+    n
+        Number of modes, from the first on.
+
+    Examples
+    --------
+    >>> from rigd.beam import mode_mean
+    >>> print(mode_mean(3).round(4))
+    [ 0.783  -0.4339  0.2544]
+    """
+    z = clamped_free_eigenvalues(n)
+    decay = np.exp(-z)
+    sum_ = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
+    sigma = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
+    mean: Real = 2 * (-1.0) ** np.arange(n) * sigma / z
+    return mean
+
+
 def participation(beam: Beam, n: int) -> Real:
     """First `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
 

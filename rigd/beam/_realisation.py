@@ -16,7 +16,8 @@ and still not be passive, and then motor and beam together are unstable.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +44,7 @@ _FIT_BAND_HZ = (0.02, 500.0)
 _TAIL_HZ = (1e-4, 1080.0)
 _TAIL_WEIGHT = 1e-3
 _CLOSEST = 3e-7
+_MAX_OUTPUT_ERROR = 3e-3
 _RCOND = 1e-10
 """Cuts off the combinations of columns that would buy the last digit in the band with huge residues
 that cancel there and nowhere else."""
@@ -91,6 +93,80 @@ class Realisation:
         )
         g: Complex = columns @ np.concatenate([self.c, direct])
         return g.reshape(points.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateOutput:
+    """Another response to the root's angle, told by the states of a realisation.
+
+    It is ``c x + D θ'' + V θ' + K θ``, as the torque of a `Realisation`.
+    """
+
+    c: Real
+    """(n,), in the response's unit."""
+    per_acceleration: float
+    """D."""
+    per_velocity: float
+    """V."""
+    per_angle: float
+    """K."""
+
+
+def state_output(
+    realisation: Realisation,
+    response: Callable[[NDArray[np.complex128]], Complex],
+    *,
+    inertial: bool,
+    small: float = 0.0,
+) -> StateOutput:
+    """Tell a response of the beam, such as its base shear, by the states of its realisation.
+
+    Parameters
+    ----------
+    realisation
+        The beam's.
+    response
+        Response to the angle of the root, from s (rad/s) to an array of its shape. Its poles have
+        to be those of the torque.
+    inertial
+        Whether it may have a part that follows the angular acceleration at once (D).
+    small
+        Size of the response below which its error counts as a share of this size.
+
+    Raises
+    ------
+    RealisationError
+        If the relative error exceeds 0.3 % (rms) between 0.02 and 500 Hz.
+    """
+    poles = realisation.poles_rad_s
+    omega, weight = _fit_grid(poles[poles.imag > 0])
+    apart = _apart(omega, poles, np.zeros(0, dtype=np.complex128))
+    s = (1j * omega[apart]).astype(np.complex128)
+    weight = weight[apart]
+    exact = response(s)
+    columns = basis(s, poles)
+    used = np.arange(columns.shape[1])
+    if not inertial:
+        used = np.delete(used, -3)
+    size = np.abs(exact) + small
+    matrix = columns[:, used] * (weight / size)[:, None]
+    rows = np.concatenate([matrix.real, matrix.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    weighted = exact * weight / size
+    target = np.concatenate([weighted.real, weighted.imag])
+    coefficients = np.zeros(columns.shape[1])
+    coefficients[used] = np.linalg.lstsq(rows / scale, target, rcond=_RCOND)[0] / scale
+    # The mean and not the largest, for a response has zeros of its own.
+    in_band = weight == 1
+    left = ((columns @ coefficients - exact) / size)[in_band]
+    error = float(np.sqrt(np.mean(np.abs(left) ** 2)))
+    if not error <= _MAX_OUTPUT_ERROR:
+        raise RealisationError(
+            f"A response of the beam is realised with a relative error of {error:.1e} (rms); "
+            f"{_MAX_OUTPUT_ERROR:.1e} is accepted."
+        )
+    inertia, viscosity, stiffness = coefficients[-3:].tolist()
+    return StateOutput(coefficients[:-3], inertia, viscosity, stiffness)
 
 
 def basis(s: Complex, poles: Complex) -> Complex:
@@ -348,12 +424,18 @@ class CoupledModel:
     """Share of τ that passes the sensor at once."""
     sensed_torque: Real | None = None
     """(n,) row: what the sensor's filter lets through, in N·m; None: it has none."""
+    shear: Real = field(default_factory=lambda: np.zeros(0))
+    """(n,) row: force of the motor on the beam, in N; τ adds `shear_per_torque`."""
+    shear_per_torque: float = 0.0
+    """In 1/m."""
+    sensed_shear: Real | None = None
+    """(n,) row: what the sensor's filter lets through of it, in N; None: it has none."""
 
 
 def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledModel:
-    """Let the sensor's torque through a low-pass filter, of order 1 or 2 (Butterworth).
+    """Let the sensor's torque and shear through low-pass filters, of order 1 or 2 (Butterworth).
 
-    The filter's states come last.
+    The filters' states come last.
 
     Parameters
     ----------
@@ -365,17 +447,24 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
         1, or 2 (Butterworth).
     """
     n, omega = model.b.size, 2 * math.pi * corner_hz
-    a = np.zeros((n + order, n + order))
-    b = np.zeros(n + order)
+    more = 2 * order
+    a = np.zeros((n + more, n + more))
+    b = np.zeros(n + more)
     a[:n, :n], b[:n] = model.a, model.b
-    # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-    a[-1, :n] = omega * model.sensor_torque
-    b[-1] = omega * model.sensor_torque_per_torque
-    a[-1, n] = -omega
-    if order == 2:
-        a[n, n + 1] = omega
-        a[n + 1, n + 1] = -math.sqrt(2) * omega
-    none = np.zeros(order)
+    filtered = (
+        (n, model.sensor_torque, model.sensor_torque_per_torque),
+        (n + order, model.shear, model.shear_per_torque),
+    )
+    for first, row, per_torque in filtered:
+        last = first + order - 1
+        # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
+        a[last, :n] = omega * row
+        b[last] = omega * per_torque
+        a[last, first] = -omega
+        if order == 2:
+            a[first, last] = omega
+            a[last, last] = -math.sqrt(2) * omega
+    none = np.zeros(more)
     return replace(
         model,
         a=a,
@@ -385,7 +474,9 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
         acceleration=np.append(model.acceleration, none),
         beam_torque=np.append(model.beam_torque, none),
         sensor_torque=np.append(model.sensor_torque, none),
-        sensed_torque=np.eye(1, n + order, n)[0],
+        sensed_torque=np.eye(1, n + more, n)[0],
+        shear=np.append(model.shear, none),
+        sensed_shear=np.eye(1, n + more, n + order)[0],
     )
 
 
@@ -395,6 +486,7 @@ def couple(
     motor_inertia_kg_m2: float,
     viscous_nm_s_per_rad: float = 0.0,
     tool_inertia_kg_m2: float = 0.0,
+    shear: StateOutput | None = None,
 ) -> CoupledModel:
     """Attach the beam, with the tool inertia in front of it, to a motor.
 
@@ -408,6 +500,8 @@ def couple(
         Viscous friction at the output shaft.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
+    shear
+        Base shear of the beam; None leaves it out.
     """
     beam_states = 0 if realisation is None else realisation.b.size
     n = 2 + beam_states
@@ -431,6 +525,11 @@ def couple(
         a[2:] += np.outer(realisation.b, acceleration)
         b[2:] = realisation.b / total_inertia
     sensed_inertia = direct_inertia + tool_inertia_kg_m2
+    shear_row, shear_per_acceleration = np.zeros(n), 0.0
+    if shear is not None:
+        shear_per_acceleration = shear.per_acceleration
+        shear_row = np.concatenate([[shear.per_angle, shear.per_velocity], shear.c])
+        shear_row += shear_per_acceleration * acceleration
     return CoupledModel(
         a=a,
         b=b,
@@ -442,6 +541,8 @@ def couple(
         beam_torque_per_torque=direct_inertia / total_inertia,
         sensor_torque=rigid_torque + sensed_inertia * acceleration,
         sensor_torque_per_torque=sensed_inertia / total_inertia,
+        shear=shear_row,
+        shear_per_torque=shear_per_acceleration / total_inertia,
     )
 
 

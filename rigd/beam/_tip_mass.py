@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import poles_for_eigenvalues
+from rigd.beam._point_force import PointForceGrid
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -113,6 +114,19 @@ class LoadedBeam:
         """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
         response = self.at(s).response
         return response / (1 + self.root_compliance_rad_per_nm * response)
+
+    def shear(self, s: Complex) -> Complex:
+        """Force of the motor on the beam per motor angle in N/rad, of the shape of `s`."""
+        grid = PointForceGrid(s, self.beam, self.damping)
+        shear = grid.shear_per_angle()
+        if self.tip_mass_kg:
+            # The tip is pushed by what accelerates the mass.
+            tip, load = self.beam.length_m, self.tip_mass_kg * s * s
+            push = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
+            shear = shear + grid.shear_per_force(tip) * push
+        if self.root_compliance_rad_per_nm:
+            shear = shear / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+        return shear
 
     def at(self, s: Complex) -> LoadedResponse:
         """Give what the clamp, were it rigid, would have to exert, with its derivatives."""

@@ -1,0 +1,127 @@
+"""Realisation of a force on the beam, and outputs told by the states of a realisation."""
+
+from math import pi
+
+import numpy as np
+import pytest
+
+from rigd.beam import (
+    Beam,
+    Damping,
+    PointForceGrid,
+    RealisationError,
+    mode_mean,
+    mode_shape,
+    realise,
+    realise_force,
+    state_output,
+)
+from rigd.beam._realisation import basis
+
+BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+DAMPINGS = {
+    "undamped": Damping(),
+    "integer": Damping(1.07e-3, 1.0, 0.02, 1.0),
+    "paper": Damping(7.1e-5, 0.996, 0.055, 0.594),
+    "half": Damping(1e-3, 0.5, 0.1, 0.3),
+    "above one": Damping(7.1e-5, 1.3, 0.055, 0.594),
+}
+MOST = (1e-3, 1e-3, 1e-3, 0.01, 0.03)
+TOLD_M = np.array([0.1, 0.5, 0.97])
+
+
+def response(realised, s):
+    """Outputs per force, shape (s, outputs)."""
+    poles, vectors = np.linalg.eig(realised.a)
+    driven = np.linalg.solve(vectors, realised.b.astype(complex))
+    return (driven / (s[:, None] - poles)) @ (realised.rows @ vectors).T + realised.direct
+
+
+@pytest.mark.parametrize("highest_rad_s", [1e4, 1e5])
+@pytest.mark.parametrize("at_m", [0.1, 0.62, 0.97])
+@pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
+def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
+    s = 1j * np.geomspace(0.1, 0.5 * highest_rad_s, 700)
+    grid = PointForceGrid(s, BEAM, damping)
+    exact = np.column_stack(
+        [
+            grid.per_force(TOLD_M, np.full(3, at_m)),
+            grid.torque_per_force(at_m),
+            grid.shear_per_force(at_m),
+        ]
+    )
+    realised = response(realise_force(BEAM, damping, at_m, TOLD_M, highest_rad_s), s)
+    # Displacement of a beam without ends: the size at a place where it happens to stand still.
+    stiffness = 0.090275 * (1 + damping.zeta * s**damping.alpha)
+    load = 4.7e-3 * s**2 + 0.090275 * damping.gamma * s**damping.lambda_
+    unbounded = np.sqrt(1 / 8) / np.abs(load**0.75 * stiffness**0.25)
+    size = np.abs(exact) + np.column_stack(
+        [unbounded] * 3 + [np.full(700, 0.01), np.full(700, 0.05)]
+    )
+    error = (np.abs(realised - exact) / size).max(axis=0)
+    assert (error < MOST).all(), error
+
+
+def test_a_force_at_rest_bends_the_beam_as_the_books_say():
+    at_m = 0.7
+    realised = realise_force(BEAM, DAMPINGS["paper"], at_m, TOLD_M, 1e4)
+    static = realised.direct - realised.rows @ np.linalg.solve(realised.a, realised.b)
+    ei = BEAM.bending_stiffness_n_m2
+    short, long = np.minimum(TOLD_M, at_m), np.maximum(TOLD_M, at_m)
+    assert static[:3] == pytest.approx(short**2 * (3 * long - short) / (6 * ei), rel=2e-3)
+    assert static[3:] == pytest.approx([-at_m, -1.0], rel=2e-3)
+
+
+def test_an_order_that_is_too_high_is_refused_where_it_damps():
+    with pytest.raises(RealisationError, match=r"order above 1\.5"):
+        realise_force(BEAM, Damping(1e-4, 1.6), 0.3, np.array([0.3]), 1e4)
+    realise_force(BEAM, Damping(1e-4, 1.0, 0.0, 1.6), 0.3, np.array([0.3]), 1e4)
+
+
+@pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
+@pytest.mark.parametrize("x_m", [0.1, 0.7])
+def test_displacement_told_by_the_states(damping, x_m):
+    realisation = realise(BEAM, damping)
+    told = state_output(
+        realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(x_m), inertial=False
+    )
+    assert told.per_acceleration == 0
+    assert errors(realisation, told, damping, lambda grid: grid.per_angle(x_m)) < 2e-3
+
+
+@pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
+def test_shear_told_by_the_states(damping):
+    realisation = realise(BEAM, damping)
+    told = state_output(
+        realisation, lambda s: PointForceGrid(s, BEAM, damping).shear_per_angle(), inertial=True
+    )
+    assert errors(realisation, told, damping, lambda grid: grid.shear_per_angle()) < 2e-3
+
+
+def errors(realisation, told, damping, response_of):
+    s = 2j * pi * np.geomspace(0.05, 400, 2000)
+    exact = response_of(PointForceGrid(s, BEAM, damping))
+    direct = (told.per_acceleration, told.per_velocity, told.per_angle)
+    realised = basis(s, realisation.poles_rad_s) @ np.concatenate([told.c, direct])
+    return (np.abs(realised - exact) / np.abs(exact)).max()
+
+
+@pytest.mark.parametrize("at_m", [0.2, 0.62, 0.97])
+def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
+    damping = DAMPINGS["paper"]
+    s = 2j * pi * np.geomspace(0.05, 300, 1000)
+    realisation = realise(BEAM, damping)
+    told = state_output(
+        realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(at_m), inertial=False
+    )
+    displacement = basis(s, realisation.poles_rad_s) @ np.append(
+        told.c, [0.0, told.per_velocity, told.per_angle]
+    )
+    torque = response(realise_force(BEAM, damping, at_m, np.array([at_m]), 1e4), s)[:, -2]
+    assert (np.abs(torque + displacement) / (np.abs(displacement) + 0.01 * at_m)).max() < 2e-3
+
+
+def test_mean_of_the_mode_shapes():
+    x = np.linspace(0, 1, 20001)
+    means = [np.trapezoid(mode_shape(number, x), x) for number in range(1, 9)]
+    assert mode_mean(8) == pytest.approx(means, abs=1e-6)
