@@ -2,6 +2,15 @@ from ._eds import Eds as Eds
 from ._eds import EdsEntry as EdsEntry
 from ._eds import EdsError as EdsError
 from ._eds import read_eds as read_eds
+from ._obstacles import NOT_BESIDE_OBSTACLES as NOT_BESIDE_OBSTACLES
+from ._obstacles import Encounter as Encounter
+from ._obstacles import Knock as Knock
+from ._obstacles import Obstacle as Obstacle
+from ._obstacles import ObstacleError as ObstacleError
+from ._obstacles import check_obstacles as check_obstacles
+from ._obstacles import describe_obstacle as describe_obstacle
+from ._obstacles import parse_obstacle as parse_obstacle
+from ._obstacles import with_obstacles as with_obstacles
 from ._registry import UnknownDeviceError as UnknownDeviceError
 from ._registry import WhatMoves as WhatMoves
 from ._registry import check_selection as check_selection

@@ -67,6 +67,11 @@ class WrenchSensor:
     Its delay is not part of `delay_s`."""
     filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
     """Order of that filter: 1, or 2 (Butterworth)."""
+    shear_projection: tuple[float, float, float, float, float, float] = field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), metadata=OPTIONAL
+    )
+    """Base shear, the force of the motor on the beam towards a positive angle = shear_projection ·
+    wrench; all zero: not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +109,11 @@ class Simulation:
     older all the time, and it cannot grow younger than it is."""
     air_drag_m: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Drag coefficient times diameter of the beam, C_D d, in air of 1.2 kg/m³; 0: no drag."""
+    crosstalk_percent: Annotated[float, Ge(0), Le(20)] = field(default=0.0, metadata=OPTIONAL)
+    """Error of the sensor's calibration: the largest share of its range that an axis shows of the
+    full range of another."""
+    obstacles: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    """What the beam meets, each as `rigd.devices.parse_obstacle` reads it."""
 
 
 @dataclass(frozen=True, slots=True)

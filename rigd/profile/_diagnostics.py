@@ -14,7 +14,13 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
-from rigd.devices import AtiSerial
+from rigd.devices import (
+    NOT_BESIDE_OBSTACLES,
+    AtiSerial,
+    ObstacleError,
+    check_obstacles,
+    parse_obstacle,
+)
 from rigd.devices.ati import RECORD_BITS
 from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
@@ -26,6 +32,7 @@ _UNITS_OF_SIX = {
     "sensor.resolution": "N, N, N, N·m, N·m, N·m",
     "sensor.range": "N, N, N, N·m, N·m, N·m",
     "sensor.projection": "m, m, m, 1, 1, 1",
+    "sensor.shear_projection": "1, 1, 1, 1/m, 1/m, 1/m",
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
 
@@ -41,6 +48,7 @@ _FIRST_MODE_HZ = 0.1, 100.0
 _PER_MILLE_LIMIT = 32.767
 """Largest torque over rated torque that fits the 16 bits of object 6071."""
 _ROUNDING = 1e-9
+_PARALLEL = 1e-6
 
 
 def no_source(key: str, source: object) -> str:
@@ -100,6 +108,8 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     yield from first_mode(values)
     if not any(values["sensor.projection"]):
         yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
+    yield from _shear(values)
+    yield from _obstacles(values)
     for name in values["metadata.required"]:
         try:
             if name not in NOTES:
@@ -147,6 +157,34 @@ def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
                 f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
                 "one of them out, or make it 0."
             )
+
+
+def _shear(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with the axis of the base shear."""
+    torque, shear = values["sensor.projection"], values["sensor.shear_projection"]
+    across = sum(a * b for a, b in zip(torque, shear, strict=True)) ** 2
+    lengths = sum(a * a for a in torque) * sum(b * b for b in shear)
+    if lengths > 0 and across > (1 - _PARALLEL) * lengths:
+        yield (
+            f"sensor.shear_projection = {_show(shear)} is a multiple of sensor.projection: shear "
+            "and torque could not be told apart; give the row that makes the force across the beam "
+            "of the wrench."
+        )
+
+
+def _obstacles(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with the obstacles of a simulated rig."""
+    beam = Beam(
+        values["beam.length_m"],
+        values["beam.density_kg_per_m"],
+        values["beam.bending_stiffness_n_m2"],
+    )
+    given = {name: values.get(f"simulation.{name}") for name in NOT_BESIDE_OBSTACLES}
+    for text in values.get("simulation.obstacles") or ():
+        try:
+            check_obstacles([parse_obstacle(text)], beam, given)
+        except ObstacleError as error:
+            yield f"simulation.obstacles: {error}"
 
 
 def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:

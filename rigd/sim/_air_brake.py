@@ -19,6 +19,7 @@ from rigd.beam import (
     DragGrid,
     Realisation,
     clamped_free_eigenvalues,
+    mode_mean,
 )
 
 Real = NDArray[np.float64]
@@ -48,6 +49,7 @@ class AirBrake:
     """
 
     __slots__ = (
+        "_force_m",
         "_forces",
         "_grid",
         "_magnitude",
@@ -55,6 +57,7 @@ class AirBrake:
         "_newest",
         "_per_square",
         "_poles",
+        "_shear_of_mode",
         "_torque_of_mode",
         "_weights",
         "speed",
@@ -76,6 +79,9 @@ class AirBrake:
         leverage_m2 = beam.length_m * grid.leverage_m
         self._torque_of_mode = _rows(leverage_m2 * load / slope).sum(axis=0)
         self._moment_m2 = leverage_m2 @ grid.to_modes - grid.to_moment
+        mean_m = beam.length_m * mode_mean(modes)
+        self._shear_of_mode = _rows(mean_m * load / slope).sum(axis=0)
+        self._force_m = mean_m @ grid.to_modes - grid.weight_m
 
         states = 2 + realisation.b.size
         self.speed: Real = np.zeros((_POINTS, states + 2 * modes))
@@ -127,23 +133,27 @@ class AirBrake:
             acceleration=row(model.acceleration, model.acceleration_per_torque),
             beam_torque=row(model.beam_torque, model.beam_torque_per_torque, 1.0),
             sensor_torque=row(model.sensor_torque, model.sensor_torque_per_torque, 1.0),
+            shear=np.append(
+                model.shear,
+                self._shear_of_mode - model.shear_per_torque * self._torque_of_mode,
+            ),
         )
         return extended, of_force
 
-    def feel(self, speed_m_s: Real) -> float:
+    def feel(self, speed_m_s: Real) -> tuple[float, float]:
         """Take the speeds at an instant, shape (points,).
 
         Returns
         -------
-        float
-            Torque in N·m that the force adds at once to what the beam takes, its modes held still.
+        torque_nm, shear_n : float
+            What the force adds at once to what the beam takes, its modes held still.
         """
         self._newest = (self._newest + 1) % 3
         force = self._forces[self._newest]
         np.absolute(speed_m_s, self._magnitude)
         np.multiply(self._magnitude, speed_m_s, force)
         force *= self._per_square
-        return float(self._moment_m2.dot(force))
+        return float(self._moment_m2.dot(force)), float(self._force_m.dot(force))
 
     def hold(self, out: Real) -> None:
         """Write the force per metre to be held over the coming period, shape (points,), N/m."""

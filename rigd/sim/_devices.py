@@ -4,19 +4,26 @@ The drive's latch, which comes first in a tick, moves the rig on to it; periods 
 missed pass with the last torque held, as they do on a real rig.
 """
 
+import os
+import pickle
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from operator import mul
+from typing import IO
 
 import numpy as np
 
+from rigd.beam import check_order
+from rigd.devices import Encounter, ObstacleError, describe_obstacle, with_obstacles
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
 
 _NAME = "Simulated drive"
+_MOST_MET = 4
 _NOISE_BLOCK = 128
 """Readings drawn at a time, 50 µs of work in one tick; thousands would take a whole period."""
 
@@ -64,18 +71,106 @@ class SimulatedRig:
             rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, rest_s)))
         rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
         assert rig.simulation is not None
+        self._parameters = rig
+        self._met: list[Encounter] = []
+        self._ended: list[Encounter] = []
+        self._preparing: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, weights)
         self._resolution_rad = rig.encoder.resolution_rad
 
     def advance(self, n_periods: int) -> None:
         """Move on by whole periods, the torque held."""
+        if self._preparing is not None:
+            self._look()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
             return
         for _ in range(n_periods * self.records_per_period):
             self.plant.advance(1)
             self.sensor.sample()
+
+    def check(self, encounter: Encounter) -> None:
+        """Refuse what the beam cannot meet beside what it meets already.
+
+        Raises
+        ------
+        ObstacleError, RealisationError
+            Saying why.
+        """
+        with_obstacles(self._parameters, [describe_obstacle(encounter)])
+        check_order(self._parameters.damping)
+        if len(self._met) == _MOST_MET:
+            raise ObstacleError(
+                f"{_MOST_MET} obstacles and knocks were added while the simulated rig ran, and one "
+                "more would take too long a tick; start it again."
+            )
+
+    def meet(self, encounter: Encounter, *, wait: bool) -> None:
+        """Put an obstacle or a knock in the beam's way.
+
+        Parameters
+        ----------
+        encounter
+            Its times count from the first enabling of the drive.
+        wait
+            Let it take effect before the next period, for which the caller waits a tenth of a
+            second. Otherwise another process makes ready for it, and the rig goes on meanwhile.
+        """
+        self._met.append(encounter)
+        if wait:
+            self._take_over(self._prepared()[1])
+        elif self._preparing is None:
+            self._prepare()
+
+    def end(self, encounter: Encounter) -> None:
+        """Take an obstacle away that `meet` put there."""
+        self._ended.append(encounter)
+        self.plant.end_obstacle(encounter)
+
+    def _prepared(self) -> tuple[int, SimulatedPlant]:
+        """Make a plant that meets all that was added so far, and their number."""
+        texts = [describe_obstacle(encounter) for encounter in self._met]
+        return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
+
+    def _prepare(self) -> None:
+        """Make it in a process of its own: a thread would hold the interpreter's lock."""
+        import tempfile  # late: no session needs it
+
+        file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
+        process = os.fork()
+        if process == 0:
+            failed = True
+            with suppress(BaseException):
+                with suppress(OSError):  # it has time
+                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+                pickle.dump(self._prepared(), file, protocol=5)
+                file.flush()
+                failed = False
+            os._exit(failed)
+        self._preparing = process, file
+
+    def _look(self) -> None:
+        """Take over what was prepared, once it is; what came meanwhile is prepared next."""
+        assert self._preparing is not None
+        process, file = self._preparing
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if not ended:
+            return
+        self._preparing = None
+        with file:
+            if status != 0:
+                raise DeviceError("The simulated rig could not make ready for an obstacle.")
+            file.seek(0)
+            count, plant = pickle.load(file)
+        self._take_over(plant)
+        if count < len(self._met):
+            self._prepare()
+
+    def _take_over(self, plant: SimulatedPlant) -> None:
+        self.plant.meet(plant)
+        for encounter in self._ended:
+            self.plant.end_obstacle(encounter)
 
     def read_angle(self) -> float:
         """Return the angle in whole encoder steps, in rad."""
@@ -150,8 +245,9 @@ class SimulatedDrive:
 class SimulatedSensor:
     """Six-axis sensor with white noise, offset, limited resolution and range.
 
-    The coupling torque appears as the smallest wrench whose projection it is. Where the readings
-    are streamed, what is read is the last of them through the decimating filter.
+    Coupling torque and base shear appear as the smallest wrench whose projections they are, with
+    the crosstalk of the simulation. Where the readings are streamed, what is read is the last of
+    them through the decimating filter.
 
     Parameters
     ----------
@@ -174,14 +270,13 @@ class SimulatedSensor:
         self.records: deque[Wrench] = deque(maxlen=len(weights))
         self._sensor = sensor
         self._simulation = simulation
-        projection = np.array(sensor.projection)
-        per_torque = (projection / (projection @ projection)).tolist()
-        # Axes that the coupling torque does not reach show noise only, which is drawn, limited
-        # and quantised by the block; the others are finished tick by tick.
+        per_torque, per_shear = _wrenches(sensor, simulation.crosstalk_percent)
+        # Axes that neither torque nor shear reaches show noise only, which is drawn, limited and
+        # quantised by the block; the others are finished tick by tick.
         self._active = [
-            (axis, per_torque[axis], sensor.range[axis], sensor.resolution[axis])
+            (axis, per_torque[axis], per_shear[axis], sensor.range[axis], sensor.resolution[axis])
             for axis in range(6)
-            if per_torque[axis] != 0.0
+            if per_torque[axis] != 0.0 or per_shear[axis] != 0.0
         ]
         self._rows = chain.from_iterable(self._noise())
         self._saturated = False  # since the last that was read
@@ -230,9 +325,10 @@ class SimulatedSensor:
         """Return a reading of this instant."""
         row = next(self._rows)
         torque_nm = self._plant.sensed_torque_nm
+        shear_n = self._plant.sensed_shear_n
         saturated = False
-        for axis, per_torque, limit, step in self._active:
-            value = row[axis] + per_torque * torque_nm
+        for axis, per_torque, per_shear, limit, step in self._active:
+            value = row[axis] + per_torque * torque_nm + per_shear * shear_n
             if not -limit < value < limit:
                 value = limit if value > 0 else -limit
                 saturated = True
@@ -259,3 +355,29 @@ class SimulatedSensor:
             block[:, passive] = np.clip(block[:, passive], -limit[passive], limit[passive])
             block[:, quantised] = np.round(block[:, quantised] / step[quantised]) * step[quantised]
             yield block.tolist()
+
+
+_CROSSTALK = (
+    (0.0, -0.62, 0.31, 0.85, -0.44, 0.57),
+    (0.73, 0.0, -0.52, -0.28, 0.91, -0.66),
+    (-0.48, 0.39, 0.0, 0.64, -0.83, 1.0),
+    (0.27, 0.94, -0.71, 0.0, 0.36, -0.59),
+    (-0.88, -0.33, 0.46, 0.54, 0.0, 0.79),
+    (0.41, -0.97, 0.68, -0.75, 0.29, 0.0),
+)
+"""Share of its range that each axis (row) shows of the full range of another, over the largest."""
+
+
+def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[float], list[float]]:
+    """Wrenches of a coupling torque of 1 N·m without shear, and of a base shear of 1 N alone."""
+    projections = np.array([sensor.projection, sensor.shear_projection])
+    known = projections.any(axis=1)
+    wrenches = np.zeros((6, 2))
+    rows = projections[known]
+    wrenches[:, known] = rows.T @ np.linalg.inv(rows @ rows.T)
+    if crosstalk_percent:
+        full = np.array(sensor.range)
+        shares = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
+        wrenches += shares * full[:, None] / full @ wrenches
+    per_torque, per_shear = wrenches.T.tolist()
+    return per_torque, per_shear

@@ -6,29 +6,43 @@ here quantises or adds noise: that is what the simulated devices do with the val
 """
 
 from collections import deque
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
     CoupledModel,
+    LoadedBeam,
     Realisation,
     couple,
     held_inputs,
     propagator,
     realise,
+    state_output,
     with_filter,
 )
+from rigd.devices import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
+from rigd.sim._obstacle import Contact, March
 
 Real = NDArray[np.float64]
 
-_OUTPUTS = 6
+_OUTPUTS = 8
 """Rows of a step beyond the state: angle, velocity, sensor torque, the same if the shaft did not
-accelerate, sensed angle, sensed torque."""
+accelerate, base shear, sensed angle, sensed torque, sensed shear."""
 
 _SAME_INSTANT_PERIODS = 1e-9
+
+_OF_OBSTACLES = (
+    "_contact", "_free", "_free_march", "_friction_effects", "_locked", "_locked_march", "_states",
+)  # fmt: skip
+"""Parts of a plant that depend on what its beam meets."""
+
+_FRICTION_SWEEPS = 4
+_SAME_FRICTION = 1e-3
+"""Change of the Coulomb friction, as a share of the whole, that an obstacle is not told of."""
 
 _STENCIL = 4
 """Readings through which the value between two of them is taken."""
@@ -54,9 +68,12 @@ class SimulatedPlant:
         It jumps with the motor's torque. At a jump the mean of both sides is given, which is where
         a band-limited signal passes, if the torque after it is known by now (an actuation delay of
         at least one period); else the value just before it.
-    sensed_angle_rad, sensed_torque_nm : float
-        The same angle and torque `encoder.delay_s` and `sensor.delay_s` ago: what the devices have
-        to show at this tick.
+    base_shear_n : float
+        Force of the motor on the beam at this instant, positive towards a positive angle. At a jump
+        of the torque it is as the torque is.
+    sensed_angle_rad, sensed_torque_nm, sensed_shear_n : float
+        The same angle, torque and shear `encoder.delay_s` and `sensor.delay_s` ago: what the
+        devices have to show at this tick.
     enabled : bool
         Whether the drive is on.
 
@@ -64,6 +81,8 @@ class SimulatedPlant:
     ------
     RealisationError
         If the beam's damping cannot be realised.
+    ObstacleError
+        If an obstacle is not written as it should be, or lies beyond the beam's tip.
 
     Notes
     -----
@@ -74,21 +93,31 @@ class SimulatedPlant:
 
     __slots__ = (
         "_air",
+        "_contact",
         "_coulomb_nm",
         "_direct_nm",
         "_direct_share",
+        "_direct_shear_n",
+        "_direct_shear_share",
         "_free",
+        "_free_march",
         "_friction_effects",
         "_friction_nm",
         "_friction_speed",
         "_holding_beam_nm",
         "_jump_gain",
         "_locked",
+        "_locked_march",
         "_peak_nm",
+        "_period_s",
+        "_periods",
         "_sensed_angles",
         "_sensed_jump_gain",
+        "_sensed_shear_jump_gain",
+        "_sensed_shears",
         "_sensed_torques",
         "_share_before_switch",
+        "_shear_jump_gain",
         "_states",
         "_stuck",
         "_torque_instant_share",
@@ -96,9 +125,11 @@ class SimulatedPlant:
         "_torques",
         "_vectors",
         "angle_rad",
+        "base_shear_n",
         "coupling_torque_nm",
         "enabled",
         "sensed_angle_rad",
+        "sensed_shear_n",
         "sensed_torque_nm",
         "velocity_rad_s",
     )
@@ -117,15 +148,24 @@ class SimulatedPlant:
             tip_mass_kg=simulation.tip_mass_kg,
             root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
         )
-        tool_inertia = parameters.sensor.tool_inertia_kg_m2
-        free = couple(
+        loaded = LoadedBeam(
+            parameters.beam,
+            parameters.damping,
+            simulation.tip_mass_kg,
+            simulation.clamp_compliance_rad_per_nm,
+        )
+        attach = partial(
+            couple,
             beam,
+            tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
+            shear=state_output(beam, loaded.shear, inertial=True),
+        )
+        free = attach(
             motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
             viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
-            tool_inertia_kg_m2=tool_inertia,
         )
         # No torque turns an infinite inertia: the beam on a locked shaft.
-        locked = couple(beam, motor_inertia_kg_m2=np.inf, tool_inertia_kg_m2=tool_inertia)
+        locked = attach(motor_inertia_kg_m2=np.inf)
         filtered = simulation.torque_filter_hz > 0
         if filtered:
             free, locked = (
@@ -135,6 +175,9 @@ class SimulatedPlant:
         self._air = _air(parameters, beam)
         if self._air is not None:
             (free, on_free), (locked, on_locked) = map(self._air.attached, (free, locked))
+        self._contact = _contact(parameters, beam, period)
+        if self._contact is not None:
+            (free, on_free), (locked, on_locked) = map(self._contact.attached, (free, locked))
         n = free.b.size
         step = _step(free, locked.sensor_torque, period, *instants)
         locked_step = _step(locked, locked.sensor_torque, period, *instants)
@@ -156,19 +199,28 @@ class SimulatedPlant:
                 for parts in ((step, held), (locked_step, locked_held))
             )
             self._friction_speed = self._air.speed @ friction[:n]
-            self._direct_nm = 0.0
+            self._direct_nm = self._direct_shear_n = 0.0
             self._direct_share = 1 - free.sensor_torque_per_torque
+            self._direct_shear_share = -free.shear_per_torque
             self._torque_instant_share = 1 - torque_age / period
+        if self._contact is not None:
+            points = len(self._contact.place)
+            self._free_march, self._locked_march = (
+                self._contact.march(
+                    model, of_force, locked.sensor_torque, *instants, friction=friction[:n]
+                )
+                for model, of_force in ((free, on_free), (locked, on_locked))
+            )
+            step, locked_step = (
+                np.vstack([whole, self._contact.place @ whole[:n]]) for whole in (step, locked_step)
+            )
         self._free = np.asfortranarray(step).dot
         self._locked = np.asfortranarray(locked_step).dot
 
         # Two vectors, in turn the input [state, torque before and after the switch, friction, force
-        # of the air] and the output [state, outputs, speeds in the air] of a step; each with the
-        # views a step needs.
-        here, there = np.zeros((2, n + _OUTPUTS + points))
-        self._vectors = tuple(
-            (vector, vector[: n + 3 + points], vector[n : n + _OUTPUTS]) for vector in (here, there)
-        )
+        # of the air] and the output [state, outputs, speeds in the air or displacements at the
+        # obstacles] of a step; each with the views a step needs.
+        self._vectors = _vectors(n, points, felt=points if self._air is not None else 0)
         self._states = n
 
         self._coulomb_nm = parameters.motor.coulomb_nm
@@ -179,33 +231,77 @@ class SimulatedPlant:
         self._share_before_switch = switch / period
         next_is_known = switch == 0 and periods > 0
         self._jump_gain = 0.5 * free.sensor_torque_per_torque if next_is_known else 0.0
-        self._sensed_jump_gain = self._jump_gain if torque_age == 0 and not filtered else 0.0
+        self._shear_jump_gain = 0.5 * free.shear_per_torque if next_is_known else 0.0
+        seen = torque_age == 0 and not filtered
+        self._sensed_jump_gain = self._jump_gain if seen else 0.0
+        self._sensed_shear_jump_gain = self._shear_jump_gain if seen else 0.0
 
         self._torque_nm = 0.0
         self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
         self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
         difference = simulation.clock_rate_difference
-        self._sensed_torques: deque[float] | OtherClock = (
+        self._sensed_torques, self._sensed_shears = (
             OtherClock(torque_periods, -difference)
             if difference
             else deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
+            for _ in range(2)
         )
+        self._period_s = period
+        self._periods = -1  # since the drive was first enabled; -1 before
         self.enabled = False
         self.angle_rad = 0.0
         self.velocity_rad_s = 0.0
         self.coupling_torque_nm = 0.0
+        self.base_shear_n = 0.0
         self.sensed_angle_rad = 0.0
         self.sensed_torque_nm = 0.0
+        self.sensed_shear_n = 0.0
 
     def enable(self) -> None:
         """Switch the drive on; its torque is zero until the next command takes effect."""
         self.enabled = True
+        self._periods = max(self._periods, 0)
 
     def disable(self) -> None:
         """Switch the drive off: no torque from this instant, commands on their way included."""
         self.enabled = False
         self._torque_nm = 0.0
         self._torques.extend([0.0] * len(self._torques))
+
+    @property
+    def contact_forces_n(self) -> Real:
+        """Force on the beam over each substep of the last period, shape (substeps, obstacles).
+
+        Positive towards a positive angle. Without obstacles there is none, and no substep.
+        """
+        return np.zeros((0, 0)) if self._contact is None else self._contact.forces_n
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the drive was first enabled, from which obstacles count; 0 before."""
+        return max(self._periods, 0) * self._period_s
+
+    def meet(self, prepared: "SimulatedPlant") -> None:
+        """Meet the obstacles of another plant from here on, in the state of this one.
+
+        Parameters
+        ----------
+        prepared
+            A plant of the same rig, at rest. It takes a tenth of a second to make, which is why it
+            is made before. Its obstacles are those of this one and more.
+        """
+        contact = prepared._contact
+        assert contact is not None
+        state = contact.take_over(self._vectors[0][0][: self._states], self._contact)
+        for name in _OF_OBSTACLES:
+            setattr(self, name, getattr(prepared, name))
+        self._vectors = _vectors(state.size, len(contact.bodies), felt=0)
+        self._vectors[0][0][: state.size] = state
+
+    def end_obstacle(self, obstacle: Encounter) -> None:
+        """Take an obstacle away, if there is such a one."""
+        if self._contact is not None:
+            self._contact.end(obstacle, self.elapsed_s)
 
     def command(self, torque_nm: float) -> None:
         """Torque to exert from this tick on, after the actuation delay; limited to the peak.
@@ -239,17 +335,28 @@ class SimulatedPlant:
             load = share * before + (1 - share) * after - self._holding_beam_nm
             if self._stuck and abs(load) <= self._coulomb_nm:
                 self._locked(input_, output)
-                angle, _, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                if self._contact is not None:
+                    self._touch(self._locked_march, input_, output, turns=False)
+                angle, _, torque, holding, shear, sensed_angle, sensed_torque, sensed_shear = (
+                    results.tolist()
+                )
                 self._friction_nm = velocity = 0.0
                 free = False
             else:
                 free = True
                 self._free(input_, output)
-                angle, velocity, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                if self._contact is not None:
+                    self._touch(self._free_march, input_, output, turns=True)
+                (
+                    angle, velocity, torque, holding, shear,
+                    sensed_angle, sensed_torque, sensed_shear,
+                ) = results.tolist()  # fmt: skip
                 if self._jump_gain:
                     jump = torques[2] - after
                     torque += self._jump_gain * jump
+                    shear += self._shear_jump_gain * jump
                     sensed_torque += self._sensed_jump_gain * jump
+                    sensed_shear += self._sensed_shear_jump_gain * jump
                 if self._coulomb_nm:
                     effects = self._friction_effects
                     friction = -velocity / effects[1]
@@ -263,35 +370,86 @@ class SimulatedPlant:
                     angle += effects[0] * friction
                     torque += effects[2] * friction
                     holding += effects[3] * friction
-                    sensed_angle += effects[4] * friction
-                    sensed_torque += effects[5] * friction
+                    shear += effects[4] * friction
+                    sensed_angle += effects[5] * friction
+                    sensed_torque += effects[6] * friction
+                    sensed_shear += effects[7] * friction
             if self._air is not None:
-                torque, holding, sensed_torque = self._braked(
-                    output, free, torque, holding, sensed_torque
+                torque, holding, shear, sensed_torque, sensed_shear = self._braked(
+                    output, free, torque, holding, shear, sensed_torque, sensed_shear
                 )
+            if self._periods >= 0:
+                self._periods += 1
             self._holding_beam_nm = holding
             self._sensed_angles.append(sensed_angle)
             self._sensed_torques.append(sensed_torque)
+            self._sensed_shears.append(sensed_shear)
         if n_periods > 0:
             self.angle_rad = angle
             self.velocity_rad_s = velocity
             self.coupling_torque_nm = torque
+            self.base_shear_n = shear
             self.sensed_angle_rad = self._sensed_angles[0]
             self.sensed_torque_nm = self._sensed_torques[0]
+            self.sensed_shear_n = self._sensed_shears[0]
+
+    def _touch(self, march: March, input_: Real, output: Real, *, turns: bool) -> None:
+        """Add what the obstacles do to a step that was made without them.
+
+        Friction acts on the touch and the touch on friction: they are found in turn, from the
+        friction of the period before.
+        """
+        contact = self._contact
+        assert contact is not None
+        n = self._states
+        time_s = self.elapsed_s
+        if contact.nothing(output[n + _OUTPUTS :], time_s):
+            return
+        free_m = march.free(input_).reshape(contact.substeps, -1)
+        friction = self._friction_nm if turns else 0.0
+        for _ in range(_FRICTION_SWEEPS):
+            rubbed_m = free_m + friction * march.friction
+            forces = contact.forces(march, rubbed_m, time_s)
+            effect = march.effect(forces.ravel())
+            if not turns or not self._coulomb_nm:
+                break
+            velocity = output.item(march.velocity_row) + effect.item(march.velocity_row)
+            wanted = -velocity / self._friction_effects[1]
+            wanted = min(max(wanted, -self._coulomb_nm), self._coulomb_nm)
+            if abs(wanted - friction) < _SAME_FRICTION * self._coulomb_nm:
+                break
+            friction = wanted
+        contact.take(march, forces, rubbed_m)
+        output[: effect.size] += effect
 
     def _braked(
-        self, output: Real, free: bool, torque: float, holding: float, sensed_torque: float
-    ) -> tuple[float, float, float]:
-        """Add what the force of the air does at once to the torques at the end of a step."""
+        self,
+        output: Real,
+        free: bool,
+        torque: float,
+        holding: float,
+        shear: float,
+        sensed_torque: float,
+        sensed_shear: float,
+    ) -> tuple[float, float, float, float, float]:
+        """Add what the force of the air does at once to the outputs at the end of a step."""
         assert self._air is not None
         speed_m_s = output[self._states + _OUTPUTS :]
         if free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
-        before_nm = self._direct_nm
-        self._direct_nm = now_nm = self._air.feel(speed_m_s)
-        share = self._direct_share if free else 1.0
-        then_nm = before_nm + self._torque_instant_share * (now_nm - before_nm)
-        return torque + share * now_nm, holding + now_nm, sensed_torque + share * then_nm
+        before_nm, before_n = self._direct_nm, self._direct_shear_n
+        now_nm, now_n = self._air.feel(speed_m_s)
+        share, shear_share = (self._direct_share, self._direct_shear_share) if free else (1.0, 0.0)
+        now_n += shear_share * now_nm
+        self._direct_nm, self._direct_shear_n = now_nm, now_n
+        at = self._torque_instant_share
+        return (
+            torque + share * now_nm,
+            holding + now_nm,
+            shear + now_n,
+            sensed_torque + share * (before_nm + at * (now_nm - before_nm)),
+            sensed_shear + before_n + at * (now_n - before_n),
+        )
 
 
 def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
@@ -299,6 +457,24 @@ def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
     if simulation is None or not simulation.air_drag_m:
         return None
     return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
+
+
+def _contact(parameters: RigParameters, beam: Realisation, period_s: float) -> Contact | None:
+    simulation = parameters.simulation
+    if simulation is None or not simulation.obstacles:
+        return None
+    bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
+    beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    check_obstacles(bodies, parameters.beam, beside)
+    return Contact(parameters.beam, parameters.damping, beam, bodies, period_s)
+
+
+def _vectors(states: int, points: int, *, felt: int) -> tuple[tuple[Real, Real, Real], ...]:
+    """Two vectors of a step, with views of input and outputs; the input has `felt` points."""
+    return tuple(
+        (vector, vector[: states + 3 + felt], vector[states : states + _OUTPUTS])
+        for vector in np.zeros((2, states + _OUTPUTS + points))
+    )
 
 
 def _split(delay_s: float, period_s: float) -> tuple[int, float]:
@@ -333,32 +509,44 @@ def _step(
 
     Returns
     -------
-    (n + 6, n + 2)
+    (n + 8, n + 2)
     """
 
+    @cache
     def state_at(instant_s: float) -> Real:
         phi, whole = propagator(model, instant_s)
         after = propagator(model, max(instant_s - switch_s, 0.0))[1]
         return np.column_stack([phi, whole - after, after])
 
     def torque_at(instant_s: float) -> Real:
-        row = model.sensor_torque @ state_at(instant_s)
+        return at_once(model.sensor_torque, model.sensor_torque_per_torque, instant_s)
+
+    def shear_at(instant_s: float) -> Real:
+        return at_once(model.shear, model.shear_per_torque, instant_s)
+
+    def at_once(of_state: Real, per_torque: float, instant_s: float) -> Real:
+        """Row of what follows the torque at once."""
+        row: Real = of_state @ state_at(instant_s)
         apart_s = instant_s - switch_s
         if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
             share_after = 0.5
         else:
             share_after = 1.0 if apart_s > 0 else 0.0
-        row[-2:] += model.sensor_torque_per_torque * np.array([1 - share_after, share_after])
+        row[-2:] += per_torque * np.array([1 - share_after, share_after])
         return row
 
     end = state_at(period_s)
     return np.vstack(
         [
             *_told(model, end, torque_at(period_s), holding_torque),
+            shear_at(period_s),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
             if model.sensed_torque is None
             else model.sensed_torque @ state_at(torque_instant_s),
+            shear_at(torque_instant_s)
+            if model.sensed_shear is None
+            else model.sensed_shear @ state_at(torque_instant_s),
         ]
     )
 
@@ -389,7 +577,7 @@ def _held(
 
     Returns
     -------
-    (n + 6, points)
+    (n + 8, points)
     """
 
     def state_at(instant_s: float) -> Real:
@@ -399,8 +587,10 @@ def _held(
     return np.vstack(
         [
             *_told(model, end, model.sensor_torque @ end, holding_torque),
+            model.shear @ end,
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),
+            model.shear @ state_at(torque_instant_s),
         ]
     )
 

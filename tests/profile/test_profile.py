@@ -345,6 +345,35 @@ def test_a_projection_of_nothing_is_refused(refuse):
     assert line.startswith("sensor.projection is all zero")
 
 
+def test_a_shear_that_is_the_torque_is_refused(refuse):
+    [line] = refuse(("[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0, 0.0, 2.0]"))
+    assert line.startswith("sensor.shear_projection = [0, 0, 0, 0, 0, 2] is a multiple of")
+
+
+def test_the_base_shear_may_be_left_out(sim_toml):
+    lines = [line for line in sim_toml.splitlines() if not line.startswith("shear_projection")]
+    profile = profile_of("\n".join(lines), Path("a.toml"))
+    assert profile.rig.sensor.shear_projection == (0.0,) * 6
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "said"),
+    [
+        ("x=0.5", "simulation.obstacles: Obstacle 'x=0.5': 'angle' is missing"),
+        ("x=1.5,angle=1", "simulation.obstacles: Obstacle 'x=1.5,angle=1': x=1.5 m lies beyond"),
+    ],
+)
+def test_obstacles_are_looked_at(refuse, sim_toml, obstacle, said):
+    [line] = refuse((sim_toml, f'{sim_toml}\nobstacles = ["{obstacle}"]\n'))
+    assert line.startswith(said)
+
+
+def test_an_obstacle_beside_what_is_not_simulated_with_it_is_refused(refuse, sim_toml):
+    more = 'obstacles = ["x=0.5,angle=1"]\ntip_mass_kg = { value = 1e-3, source = "assumed" }\n'
+    [line] = refuse((sim_toml, f"{sim_toml}\n{more}"))
+    assert line.startswith("simulation.obstacles: simulation.tip_mass_kg and an obstacle")
+
+
 def test_all_problems_are_reported_at_once(refuse):
     lines = refuse(
         (INERTIA, INERTIA.replace("2.0e-3", "nan")),

@@ -8,7 +8,7 @@ import pytest
 from analysis.identify import Measurement, Plant
 from analysis.identify._drag_torque import DragLaw, DragResponse
 from analysis.identify._problem import Comparison
-from rigd.beam import Damping
+from rigd.beam import Damping, PointForceGrid
 from rigd.profile import load_profile
 from rigd.sim._plant import SimulatedPlant
 
@@ -97,3 +97,33 @@ def test_without_drag_there_is_none():
     assert np.abs(still - braked).max() > 0.01
     left, _ = unexplained(rig(0.0, damping), 0.0)
     assert left < 1e-3
+
+
+def test_the_air_s_torque_and_shear_are_those_of_its_force():
+    parameters = rig(DRAG_M, Damping(7.1e-5, 0.996, 0.055, 0.594))
+    plant = SimulatedPlant(parameters)
+    plant.enable()
+    grid = plant._air._grid
+    ticks = 6000
+    told, forces = np.empty((ticks, 3)), np.empty((ticks, grid.x_m.size))
+    for tick in range(ticks):
+        told[tick] = plant.angle_rad, plant.coupling_torque_nm, plant.base_shear_n
+        forces[tick] = plant._air._forces[plant._air._newest] * grid.weight_m
+        plant.command(0.15 * np.sin(2 * np.pi * 1.7e-3 * tick) - 0.1 * plant.velocity_rad_s)
+        plant.advance()
+    padded = 1 << 15
+    decay = np.exp(-8 * np.arange(ticks) / ticks)
+    s = 8 * RATE_HZ / ticks + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
+    exact = PointForceGrid(s, parameters.beam, parameters.damping)
+    angle, *_ = np.fft.rfft(told.T * decay, padded)
+    pushed = np.fft.rfft(forces.T * decay, padded).T
+    for column, per_angle, per_force in (
+        (1, exact.torque_per_angle(), exact.torque_per_force(grid.x_m)),
+        (2, exact.shear_per_angle(), exact.shear_per_force(grid.x_m)),
+    ):
+        drag = np.fft.irfft((per_force * pushed).sum(axis=1), padded)[:ticks] / decay
+        whole = np.fft.irfft(per_angle * angle, padded)[:ticks] / decay + drag
+        kept = slice(0, ticks // 2)
+        scale = np.std(told[kept, column])
+        assert np.std(drag[kept]) > 0.1 * scale
+        assert np.std((told[:, column] - whole)[kept]) < 0.01 * scale

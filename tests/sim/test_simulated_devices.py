@@ -65,20 +65,63 @@ def test_a_sensor_at_the_end_of_its_range_says_so(rig):
     assert (np.abs(wrenches[saturated, 5]) > 0.0498).all()
 
 
-def test_the_projection_of_the_wrench_is_the_coupling_torque(rig):
-    # A sensor turned by 180° about x, and off the axis: its fy has a lever arm of 3 cm.
-    quiet = replace(
+@pytest.fixture
+def quiet(rig):
+    """A rig whose sensor shows what there is, to every digit."""
+    return replace(
         rig,
         sensor=replace(rig.sensor, resolution=(0.0,) * 6),
         simulation=replace(
             rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0, offset=(0.0,) * 6
         ),
     )
-    turned = replace(quiet, sensor=replace(quiet.sensor, projection=(0, 0.03, 0, 0, 0, -1.0)))
+
+
+def test_the_projections_of_the_wrench_are_coupling_torque_and_base_shear(quiet):
+    # A sensor turned by 180° about x, and off the axis: its fy has a lever arm of 3 cm.
+    turned = replace(
+        quiet,
+        sensor=replace(
+            quiet.sensor,
+            projection=(0, 0.03, 0, 0, 0, -1.0),
+            shear_projection=(0, -1.0, 0, 0, 0, 0),
+        ),
+    )
     _, straight, _ = watch(quiet, 800, wiggle)
     _, wrenches, _ = watch(turned, 800, wiggle)
     assert np.abs(straight[:, 5]).max() > 0.01
+    assert np.abs(straight[:, 1]).max() > 0.02
+    assert not straight[:, [0, 2, 3, 4]].any()
     assert wrenches @ np.array(turned.sensor.projection) == pytest.approx(straight[:, 5])
+    assert wrenches @ np.array(turned.sensor.shear_projection) == pytest.approx(straight[:, 1])
+
+
+def test_without_a_place_for_it_there_is_no_shear(quiet):
+    told = replace(
+        quiet,
+        sensor=replace(
+            quiet.sensor, projection=(0, 0.03, 0, 0, 0, -1.0), shear_projection=(0.0,) * 6
+        ),
+    )
+    _, straight, _ = watch(quiet, 400, wiggle)
+    _, wrenches, _ = watch(told, 400, wiggle)
+    # The smallest wrench of which the projection makes the torque.
+    assert wrenches @ np.array(told.sensor.projection) == pytest.approx(straight[:, 5])
+    assert wrenches[:, 1] == pytest.approx(-0.03 * wrenches[:, 5])
+
+
+def test_crosstalk_is_a_share_of_each_range_and_always_the_same(quiet):
+    crossed = replace(quiet, simulation=replace(quiet.simulation, crosstalk_percent=2.0))
+    _, straight, _ = watch(quiet, 400, wiggle)
+    _, wrenches, _ = watch(crossed, 400, wiggle)
+    full = np.array(quiet.sensor.range)
+    shown = np.linalg.lstsq(straight[:, [1, 5]] / full[[1, 5]], wrenches / full)[0]
+    own, other = shown[[0, 1], [1, 5]], np.delete(shown, [1, 5], axis=1)
+    assert own == pytest.approx([1.0, 1.0])
+    assert 0.01 < np.abs(other).max() <= 0.02 + 1e-9
+    assert (np.abs(other) > 1e-3).all()
+    _, again, _ = watch(replace(crossed, sensor=replace(crossed.sensor)), 400, wiggle)
+    assert np.array_equal(again, wrenches)
 
 
 def test_a_declared_delay_is_the_age_of_the_reading(rig):

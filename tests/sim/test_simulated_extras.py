@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.beam import LoadedBeam
+from rigd.beam import LoadedBeam, PointForceGrid
 from rigd.profile import load_profile
 from rigd.sim._plant import OtherClock, SimulatedPlant
 
@@ -20,15 +20,15 @@ def rig():
 
 
 def driven(rig, **more):
-    """Sensed angle and torque while the motor's torque sweeps to 30 Hz."""
+    """Sensed angle, torque and shear while the motor's torque sweeps to 30 Hz."""
     t = np.arange(TICKS) / RATE_HZ
     sweep = np.sin(2 * np.pi * (0.5 * t + 29.5 * t**2 / (2 * t[-1])))
     torques = (0.2 * np.hanning(TICKS) * sweep).tolist()
     plant = SimulatedPlant(replace(rig, simulation=replace(rig.simulation, **more)))
     plant.enable()
-    found = np.empty((2, TICKS))
+    found = np.empty((3, TICKS))
     for tick, torque in enumerate(torques):
-        found[:, tick] = plant.sensed_angle_rad, plant.sensed_torque_nm
+        found[:, tick] = plant.sensed_angle_rad, plant.sensed_torque_nm, plant.sensed_shear_n
         plant.command(torque)
         plant.advance()
     return found
@@ -50,8 +50,8 @@ def low_pass(s, hertz, order):
     ],
     ids=lambda more: " ".join(more) or "nothing",
 )
-def test_the_torque_is_that_of_the_exact_response(rig, more):
-    angle, torque = driven(rig, **more)
+def test_torque_and_shear_are_those_of_the_exact_response(rig, more):
+    angle, torque, shear = driven(rig, **more)
     decay = np.exp(-5.0 * np.arange(TICKS) / TICKS)
     s = 5.0 * RATE_HZ / TICKS + 2j * np.pi * np.fft.rfftfreq(4 * TICKS, 1 / RATE_HZ)
     beam = LoadedBeam(
@@ -60,18 +60,38 @@ def test_the_torque_is_that_of_the_exact_response(rig, more):
         more.get("tip_mass_kg", 0.0),
         more.get("clamp_compliance_rad_per_nm", 0.0),
     )
-    response = beam.transfer(s)
+    seen = np.fft.rfft(angle * decay, 4 * TICKS)
     if "torque_filter_hz" in more:
-        order = more.get("torque_filter_order", 1)
-        response = response * low_pass(s, more["torque_filter_hz"], order)
-    exact = np.fft.irfft(np.fft.rfft(angle * decay, 4 * TICKS) * response, 4 * TICKS)[:TICKS]
-    apart = (torque - exact / decay)[: TICKS * 9 // 10]
-    assert np.std(apart) < 1e-4 * np.std(torque)
+        seen *= low_pass(s, more["torque_filter_hz"], more.get("torque_filter_order", 1))
+    for sensed, response in ((torque, beam.transfer(s)), (shear, beam.shear(s))):
+        exact = np.fft.irfft(seen * response, 4 * TICKS)[:TICKS]
+        apart = (sensed - exact / decay)[: TICKS * 9 // 10]
+        assert np.std(apart) < 3e-4 * np.std(sensed)
+
+
+def test_shear_is_what_accelerates_the_beam_and_its_tip_mass(rig):
+    # Integral over the beam, and not a derivative at its root.
+    s = 2j * np.pi * np.geomspace(0.1, 100, 50)
+    mass_kg, compliance = 3e-4, 0.02
+    node, weight = np.polynomial.legendre.leggauss(80)
+    length = rig.beam.length_m
+    x = length * (node + 1) / 2
+    grid = PointForceGrid(s, rig.beam, rig.damping)
+    load = rig.beam.bending_stiffness_n_m2 * rig.damping.gamma * s**rig.damping.lambda_
+    load += rig.beam.density_kg_per_m * s**2
+    tip = grid.per_angle(length) / (1 + mass_kg * s**2 * grid.per_force(length, length))
+    pushed = grid.per_force(x, length) * (-mass_kg * s**2 * tip)[:, None]
+    momentum = load * ((grid.per_angle(x) + pushed) @ weight) * length / 2 + mass_kg * s**2 * tip
+    clamped = LoadedBeam(rig.beam, rig.damping, mass_kg)
+    assert clamped.shear(s) == pytest.approx(momentum, rel=1e-9)
+    soft = LoadedBeam(rig.beam, rig.damping, mass_kg, compliance)
+    turned = 1 / (1 + compliance * clamped.transfer(s))
+    assert soft.shear(s) == pytest.approx(momentum * turned, rel=1e-9)
 
 
 def test_a_slower_clock_shows_the_torque_ever_older(rig):
-    _, usual = driven(rig)
-    _, older = driven(rig, clock_rate_difference=-5e-4)
+    _, usual, _ = driven(rig)
+    _, older, _ = driven(rig, clock_rate_difference=-5e-4)
     place = np.arange(TICKS) * (1 - 5e-4)
     whole = place.astype(int)
     # Band-limited: a cubic through four ticks, here of the usual readings.

@@ -11,13 +11,26 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
+from rigd.beam import RealisationError
+from rigd.devices import Obstacle, ObstacleError
 from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig
-from rigd.sim.wire._faults import LINE_KINDS, SERIAL, EventLog, Fault, FaultError, Line
+from rigd.sim.wire._faults import (
+    ENCOUNTERS,
+    LINE_KINDS,
+    SERIAL,
+    EventLog,
+    Fault,
+    FaultError,
+    Line,
+    encounter_of,
+)
 
 _MEMORY_SYNCS = 256
 """SYNCs over which the grid's phase is averaged: a single late one hardly moves it."""
+_READY_IN_S = 0.5
+"""Time until an obstacle is there in real time, longer than the rig takes to make ready for it."""
 _FORGET_PERIODS = 100
 """Periods of silence after which the next SYNC may come from another host with its own phase."""
 _PATIENCE_NS = 5_000_000_000
@@ -267,6 +280,7 @@ class BusSimulation:
         self._awaiting_drive: list[Fault] = []
         self._standing: list[_Standing] = []
         self._cut_lines: dict[str, Fault] = {}
+        self._obstacles: list[tuple[Fault, Obstacle]] = []
         self._enabled_s: float | None = None
         self.periods = 0
         self.moved = 0
@@ -473,6 +487,12 @@ class BusSimulation:
                 f"the bytes 0 to {_CAN_BYTES - 1}."
             )
 
+        if fault.kind in ENCOUNTERS:
+            try:
+                self._simulated.check(encounter_of(fault, 0.0))
+            except (ObstacleError, RealisationError) as error:
+                raise FaultError(f"Fault '{fault}': {error}") from None
+
     def _begin(self, fault: Fault) -> None:
         self._log("simulator", "fault", fault=str(fault))
         values: dict[str, Any] = dict(fault.values)
@@ -502,6 +522,12 @@ class BusSimulation:
             self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
         elif fault.kind in _TRAITS:
             self._stand(fault, drive, _TRAITS[fault.kind], True)
+        elif fault.kind in ENCOUNTERS:
+            now_s = self._simulated.plant.elapsed_s + (0.0 if self._lock_step else _READY_IN_S)
+            encounter = encounter_of(fault, now_s)
+            self._simulated.meet(encounter, wait=self._lock_step)
+            if isinstance(encounter, Obstacle):
+                self._obstacles.append((fault, encounter))
         elif fault.kind == "end":
             self._end(values.get("fault"))
         else:
@@ -539,6 +565,11 @@ class BusSimulation:
                 self._log("simulator", "fault over", fault=ended)
         for standing in [s for s in self._standing if kind in (None, s.fault.kind)]:
             self._end_one(standing)
+        if kind in (None, "obstacle"):
+            obstacles, self._obstacles = self._obstacles, []
+            for fault, obstacle in obstacles:
+                self._simulated.end(obstacle)
+                self._log("simulator", "fault over", fault=str(fault))
         if kind in (None, "cut"):
             cut, self._cut_lines = self._cut_lines, {}
             for device, fault in cut.items():

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from rigd.devices import Encounter, ObstacleError, parse_obstacle
 from rigd.devices.contracts import DeviceError
 from rigd.errors import UserError
 
@@ -85,6 +86,9 @@ _SENDER = {
 _DEVICE = _one_of("drive", "sensor", needed=True)
 _FOR = _positive()
 
+_TEXT = _Key(str, "a value")
+_FOUND = _Key(str, "a value", needed=True)
+
 LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
 KINDS: dict[str, dict[str, _Key]] = {
     "drop": _SENDER | {"bytes": _whole(1, _MOST)},
@@ -105,10 +109,15 @@ KINDS: dict[str, dict[str, _Key]] = {
     "no_pre_operational": {"for": _FOR},
     "no_bit_12": {"for": _FOR},
     "no_watch": {"for": _FOR},
+    "obstacle": {"x": _FOUND, "angle": _FOUND, "stiffness": _TEXT, "damping": _TEXT}
+    | {"side": _TEXT, "rate": _TEXT, "for": _FOR},
+    "knock": {"x": _FOUND, "force": _FOUND, "duration": _FOUND},
 }
-_MOMENTARY = ("emcy", "jump", "restart", "power_cycle")
+_MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
+ENCOUNTERS = ("obstacle", "knock")
+"""Kinds that the beam meets; their keys are those of `rigd.devices.parse_obstacle`."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
@@ -171,7 +180,33 @@ def parse_fault(spec: str) -> Fault:
             raise FaultError(_complaint(spec, f"{kind} needs {name}: {key_of.says}"))
         if key_of.default is not None and not (name == "frames" and "bytes" in values):
             values.setdefault(name, key_of.default)
-    return Fault(kind, values, _time(spec, time) if at else None)
+    fault = Fault(kind, values, _time(spec, time) if at else None)
+    if kind in ENCOUNTERS:
+        try:
+            encounter_of(fault, 0.0)
+        except ObstacleError as error:
+            raise FaultError(_complaint(spec, str(error).partition(": ")[2].rstrip("."))) from None
+    return fault
+
+
+def encounter_of(fault: Fault, now_s: float) -> Encounter:
+    """Return the obstacle or knock that a fault puts in the beam's way from now on.
+
+    Parameters
+    ----------
+    fault
+        One of the `ENCOUNTERS`.
+    now_s
+        Time since the drive was first enabled.
+    """
+    words = [f"{key}={value}" for key, value in fault.values.items() if key != "for"]
+    if fault.kind == "knock":
+        words.append(f"at={now_s!r}")
+    else:
+        words.append(f"from={now_s!r}")
+        if "for" in fault.values:
+            words.append(f"until={now_s + float(fault.values['for'])!r}")
+    return parse_obstacle(",".join(words))
 
 
 def _time(spec: str, text: str) -> float:

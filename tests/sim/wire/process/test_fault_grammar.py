@@ -12,6 +12,13 @@ device = st.sampled_from(["drive", "sensor"])
 positive = st.floats(1e-6, 1e6)
 identifier = whole(0, 0x7FF)
 frames = whole(1, 10**9)
+
+
+def text(numbers):
+    """Numbers as they are written."""
+    return numbers.map(repr)
+
+
 OPTIONAL = {
     "drop": ({"from": sender}, {"id": identifier, "frames": frames}),
     "delay": ({"from": sender, "ms": positive}, {"id": identifier, "frames": frames}),
@@ -31,6 +38,24 @@ OPTIONAL = {
     "no_pre_operational": ({}, {"for": positive}),
     "no_bit_12": ({}, {"for": positive}),
     "no_watch": ({}, {"for": positive}),
+    "obstacle": (
+        {"x": text(st.floats(1e-3, 100)), "angle": text(st.floats(-10, 10))},
+        {
+            "stiffness": text(st.floats(1, 1e7)) | st.just("rigid"),
+            "damping": text(st.floats(0, 1e4)),
+            "side": st.sampled_from(["1", "-1"]),
+            "rate": text(st.floats(-100, 100)),
+            "for": positive,
+        },
+    ),
+    "knock": (
+        {
+            "x": text(st.floats(1e-3, 100)),
+            "force": text(st.floats(-1e3, 1e3)),
+            "duration": text(st.floats(1e-4, 100)),
+        },
+        {},
+    ),
     "end": ({}, {"fault": st.sampled_from(["sto", "freeze", "cut", "drop"])}),
 }
 asked = st.one_of(

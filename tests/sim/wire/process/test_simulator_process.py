@@ -322,6 +322,19 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
     ]
 
 
+def test_obstacles_may_be_there_from_the_start_and_come_later(simulate, rigd_here):
+    simulate("antenna_can", "--lock-step", "--obstacle", "x=0.6,angle=0.3")
+    address = find_simulator("antenna_can")
+    assert address.rig["simulation.obstacles"] == ["x=0.6,angle=0.3"]
+    done = rigd_here("inject", "--profile", "antenna_can", "obstacle,x=0.4,angle=0.2,for=2")
+    assert (done.returncode, done.stdout) == (0, "obstacle,x=0.4,angle=0.2,for=2.0\n")
+    lasting = rigd_here("inject", "--profile", "antenna_can", "obstacle,x=0.4,angle=0.2")
+    assert lasting.stdout.endswith("end,fault=obstacle\n")
+    wrong = rigd_here("inject", "--profile", "antenna_can", "obstacle,x=1.4,angle=0.2")
+    assert wrong.returncode in (1, 2)
+    assert "beyond the tip of the beam" in wrong.stderr
+
+
 def test_a_cut_bus_stays_cut(simulate, connect, rigd_here):
     simulator = simulate()
     host = connect(simulator)
@@ -387,6 +400,8 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
         ),
         (("simulate", "--profile", "antenna_can", "--log", "/nowhere/log"), 1, "cannot be written"),
         (("inject", "--profile", "antenna_can", "cut"), 1, "start it with: rigd simulate"),
+        (("simulate", "--profile", "antenna_can", "--obstacle", "x=2,angle=1"), 2, "the tip"),
+        (("simulate", "--profile", "antenna_can", "--fault", "knock,x=1"), 2, "needs force"),
     ],
 )
 def test_wrong_use_is_told_in_a_sentence(runtime, rigd_here, arguments, code, said):

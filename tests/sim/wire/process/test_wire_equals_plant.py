@@ -22,6 +22,7 @@ from rigd.sim.wire._simulator import ask
 
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
+AND_AN_OBSTACLE = '1, source = "assumed" }\nobstacles = ["x=0.6,angle=0.01,stiffness=3000"]  # '
 RUN = (
     "import sys\n"
     "from rigd.profile import load_profile\n"
@@ -166,6 +167,8 @@ def bare(rig, ticks):
         ),
         ("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
         ("antenna_serial", {}),
+        ("antenna_can", {"seed": AND_AN_OBSTACLE}),
+        ("antenna_serial", {"seed": AND_AN_OBSTACLE}),
     ],
 )
 def test_the_wire_changes_nothing(simulated_profile, name, changes):

@@ -2,9 +2,12 @@
 
 import random
 import struct
+import time
 
+import numpy as np
 import pytest
 
+from rigd.devices import Knock, Obstacle
 from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError, parse_fault
 
 PERIOD_NS = 1_000_000
@@ -320,7 +323,80 @@ def test_a_fault_without_an_end_is_ended(make_world, spec, device, attribute, no
 
 def test_every_fault_that_lasts_is_ended_here():
     held = {spec.partition(",")[0] for spec, *_ in ENDLESS}
-    assert {*held, *LINE_KINDS, "cut"} == set(LASTING)
+    assert {*held, *LINE_KINDS, "cut", "obstacle"} == set(LASTING)
+
+
+def turned_into_an_obstacle(rig, ticks):
+    """Torque of the sensor tick by tick, the motor under a constant torque."""
+    plant = rig.simulated.plant
+    torques = []
+    for tick in ticks:
+        plant.command(0.1)
+        rig.sync(tick)
+        torques.append(plant.coupling_torque_nm)
+    return np.array(torques)
+
+
+def test_an_injected_obstacle_is_met_and_ended(make_world):
+    free, rig, ended = (
+        make_world(lock_step=True),
+        make_world(lock_step=True),
+        make_world(lock_step=True),
+    )
+    for world in (free, rig, ended):
+        world.simulated.plant.enable()
+    before = [turned_into_an_obstacle(world, range(1, 60)) for world in (free, rig, ended)]
+    assert (before[0] == before[1]).all()
+    fault = parse_fault("obstacle,x=0.6,angle=0.15,stiffness=3000")
+    for world in (rig, ended):
+        world.world.inject(fault)
+    later = [turned_into_an_obstacle(world, range(60, 200)) for world in (free, rig, ended)]
+    assert np.abs(later[1] - later[0]).max() > 0.01
+    assert np.array_equal(later[1], later[2])
+    ended.world.inject(parse_fault("end,fault=obstacle"))
+    assert [values["fault"] for *_, values in ended.log.of("fault over")] == [str(fault)]
+    last = [turned_into_an_obstacle(world, range(200, 400)) for world in (free, rig, ended)]
+    assert last[1].mean() > last[2].mean() + 0.01
+
+
+def test_an_injected_knock_comes_once(make_world):
+    rig = make_world(lock_step=True)
+    rig.simulated.plant.enable()
+    rig.sync(*range(1, 20))
+    rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
+    seen = []
+    for tick in range(20, 60):
+        rig.sync(tick)
+        seen.append(rig.simulated.plant.contact_forces_n.max())
+    assert max(seen) == pytest.approx(1.0, abs=0.01)
+    assert seen[12:] == [0.0] * len(seen[12:])
+
+
+def test_in_real_time_the_rig_goes_on_while_an_obstacle_is_made(make_world):
+    rig = make_world()
+    rig.simulated.plant.enable()
+    rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
+    rig.world.inject(parse_fault("obstacle,x=0.6,angle=0.1"))
+    deadline_s = time.monotonic() + 30
+    for tick in range(1, 100_000):
+        rig.sync(tick)
+        assert rig.simulated.plant.elapsed_s == pytest.approx(tick * 1e-3)
+        contact = rig.simulated.plant._contact
+        if contact is not None and len(contact.bodies) == 2:
+            break
+        time.sleep(0.001)
+        assert time.monotonic() < deadline_s
+    assert [type(body) for body in contact.bodies] == [Knock, Obstacle]
+
+
+def test_what_the_beam_cannot_meet_is_refused(make_world):
+    rig = make_world(lock_step=True)
+    with pytest.raises(FaultError, match="beyond the tip"):
+        rig.world.inject(parse_fault("obstacle,x=1.5,angle=0.1"))
+    for _ in range(4):
+        rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
+    with pytest.raises(FaultError, match="4 obstacles and knocks were added"):
+        rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
 
 
 def test_what_two_faults_hold_stays_until_both_are_over(make_world):
