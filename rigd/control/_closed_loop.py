@@ -349,7 +349,7 @@ def check_stability(loop: ClosedLoop) -> str | None:
     if growth > MAX_GROWTH_PER_S:
         raise ControlDesignError(f"{finding}; {remedy}.")
     if loop.model.beam is not None:
-        light = close_loop(_with_light_beam(loop.model, loop.model.beam))
+        light = close_loop(light_beam(loop.model, loop.model.beam))
         pole = light.least_damped()
         if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_TAKEN:
             raise ControlDesignError(
@@ -378,9 +378,20 @@ def _remedy(settings: ControlSettings) -> str:
     )
 
 
-def _with_light_beam(model: LoopModel, beam: Beam) -> LoopModel:
+def light_beam(model: LoopModel, beam: Beam) -> LoopModel:
+    """Give a loop a beam with next to no damping of its own.
+
+    Parameters
+    ----------
+    model
+        The loop.
+    beam
+        The beam.
+    """
     first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
-    return replace(model, damping=Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s))
+    return replace(
+        model, beam=beam, damping=Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s)
+    )
 
 
 def _damping_ratio(pole_rad_s: complex) -> float:

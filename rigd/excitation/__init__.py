@@ -1,8 +1,9 @@
-"""Reference trajectories of a session: chirp, hold, step, multisine, narrow sweeps, from a file.
+"""Reference trajectories: chirp, hold, step, multisine, narrow sweeps, moves, from a file.
 
 A reference is relative to the angle at which the session starts. Every excitation has the same
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). Offers a
-function per kind (`chirp` … `from_csv`, `modes`) and `make_excitation` for one by its name. Whether
+function per kind (`chirp` … `from_csv`, `modes`, `move`) and `make_excitation` for one by its name;
+beside them what moves are made of (`shortest_move`, `slew`, `still_path`, `braking_path`). Whether
 a rig can follow a reference is not known here: `rigd.runner` predicts it.
 """
 

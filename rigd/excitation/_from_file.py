@@ -1,11 +1,9 @@
-"""Reference signals from CSV files, and the opening of files that a user names."""
+"""Reference signals from CSV files."""
 
 import csv
-import os
-import stat
 from math import isfinite
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 import numpy as np
 
@@ -17,6 +15,7 @@ from rigd.excitation._signals import (
     lay_out_segments,
     within_a_turn,
 )
+from rigd.runtime import open_plain_file
 
 MOST_BYTES: Final = 256_000_000
 
@@ -124,33 +123,3 @@ def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> floa
             f"{path}: line {line}: {name} is not a finite number."
         )
     return value
-
-
-# Files that a user names
-
-
-def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
-    """Open a text file of limited size; a pipe without a writer is not waited for.
-
-    Parameters
-    ----------
-    path
-        Name of the file.
-    most_bytes
-        The limit.
-    newline
-        Argument of `open`.
-
-    Raises
-    ------
-    ExcitationError
-        If the file is not of that kind.
-    OSError
-        If it cannot be opened.
-    """
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
-        os.close(fd)
-        raise ExcitationError(f"{path}: is not a file of at most {most_bytes / 1e6:g} MB.")
-    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor

@@ -3,12 +3,20 @@
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Protocol
 
 from rigd.excitation._from_file import from_csv
 from rigd.excitation._narrow_sweeps import LoopPreview, modes
+from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
+from rigd.excitation._touch_passes import touch
 
 Value = float | int | str | Path
+
+
+class RigPreview(LoopPreview, MoveRig, Protocol):
+    """What an excitation that is made for one rig may know of it."""
+
 
 KINDS: Mapping[str, Callable[..., Excitation]] = {
     "chirp": chirp,
@@ -17,6 +25,8 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
     "multisine": multisine,
     "file": from_csv,
     "modes": modes,
+    "move": move,
+    "touch": touch,
 }
 """Functions by the names that the command line and session files use."""
 
@@ -25,7 +35,7 @@ FROM_THE_RIG = frozenset({"rate_hz", "rig"})
 
 
 def make_excitation(
-    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: LoopPreview | None = None
+    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: RigPreview | None = None
 ) -> Excitation:
     """Make one for a rig's rate.
 

@@ -22,7 +22,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
-from rigd.excitation._from_file import open_plain_file
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -32,6 +31,7 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
+from rigd.runtime import open_plain_file
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

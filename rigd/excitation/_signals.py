@@ -3,11 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite, pi
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
+
+if TYPE_CHECKING:
+    from rigd.excitation._touch_passes import Approach
 
 FloatArray = NDArray[np.float64]
 
@@ -29,7 +33,7 @@ class Excitation:
     Attributes
     ----------
     kind
-        ``chirp``, ``hold``, ``step``, ``multisine``, ``file`` or ``modes``.
+        ``chirp``, ``hold``, ``step``, ``multisine``, ``file``, ``modes``, ``move`` or ``touch``.
     parameters
         The options it was made from, and what follows from them, with units in the names.
     rate_hz
@@ -38,6 +42,10 @@ class Excitation:
         Shape (n,), relative to the start angle; read-only.
     segments
         ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
+    stays
+        The motor stays where the reference ends; else it returns to the start angle.
+    approach
+        What the loop does when it detects a touch; None: it does not look for one.
     """
 
     kind: str
@@ -45,6 +53,13 @@ class Excitation:
     rate_hz: float
     reference_rad: FloatArray
     segments: Mapping[str, tuple[int, int]]
+    stays: bool = False
+    approach: "Approach | None" = None
+
+    @property
+    def shows_modes(self) -> bool:
+        """Whether the record can tell of the beam's modes, unlike a move or a search."""
+        return not self.stays and self.approach is None
 
 
 def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
@@ -165,13 +180,15 @@ def assemble(
     rate_hz: float,
     segments: Mapping[str, tuple[int, int]],
     sweep: FloatArray,
+    *,
+    approach: "Approach | None" = None,
 ) -> Excitation:
     """Put a sweep (n,) between rest and ring-down."""
     reference = np.zeros(segments["ring_down"][1])
     reference[slice(*segments["sweep"])] = sweep
     reference[slice(*segments["ring_down"])] = sweep[-1]
     reference.flags.writeable = False
-    return Excitation(kind, parameters, rate_hz, reference, segments)
+    return Excitation(kind, parameters, rate_hz, reference, segments, approach=approach)
 
 
 # Signals

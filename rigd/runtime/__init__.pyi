@@ -14,6 +14,7 @@ from ._locks import HeldError as HeldError
 from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
+from ._plain_files import open_plain_file as open_plain_file
 from ._signals import StopRequest as StopRequest
 from ._signals import held_back as held_back
 from ._signals import ignore as ignore

@@ -1,0 +1,169 @@
+"""Active damping of the beam: the motor that holds it yields to its torque like a dashpot.
+
+A motor that turns at a speed in proportion to the torque that the beam exerts on it takes energy
+out of every mode, whatever the beam is. The reference is moved so; the lag of the loop that follows
+it is made up for by a lead, and slow torques are left out, so that the motor stays where it is.
+Whether loop, delays and beam leave it stable is checked on the closed loop.
+"""
+
+from dataclasses import dataclass, replace
+from math import exp
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import undamped_frequencies_rad_s
+from rigd.control._closed_loop import ClosedLoop, close_loop, light_beam
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_STRENGTH = 0.25
+"""Speed per torque, times the beam's inertia and the frequency of its first mode: its damping ratio
+becomes about half of that. Twice as much gains little, and is less stable at the third mode."""
+_HALVINGS = 5
+_STIFFNESSES = (0.8, 1.0, 1.25)
+"""Stiffness of the beam, over the profile's, for which the loop has to be stable."""
+_SLOW = 0.25
+"""Corner below which torques are left out, over the frequency of the first mode."""
+_MOST_GROWTH_PER_S = 0.02
+"""As much as a loop without it may grow, on a beam that has next to no damping of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class DamperSettings:
+    """Settings of the active damping, for one rig."""
+
+    yield_rad_per_nm_s: float
+    """Speed of the reference per torque of the beam."""
+    lead_s: float
+    """Lead that makes up for the lag of the loop."""
+    slow_rad_s: float
+    """Corner below which torques are left out."""
+    fast_rad_s: float
+    """Corner above which they are."""
+
+
+class VibrationDamper:
+    """Moves a reference so that the beam loses its vibration.
+
+    Parameters
+    ----------
+    settings
+        From `design_damper`.
+    rate_hz
+        Ticks a second.
+
+    Examples
+    --------
+    >>> from rigd.control import DamperSettings, VibrationDamper
+    >>> damper = VibrationDamper(DamperSettings(10.0, 0.025, 4.0, 320.0), rate_hz=1000)
+    >>> damper.step(0.01) < 0  # what pushes the beam forward gives way backward
+    True
+    """
+
+    def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
+        self._law = _Law(settings, rate_hz)
+        self._state = 0.0, 0.0, 0.0
+
+    def step(self, coupling_torque_nm: float) -> float:
+        """Return by how much the reference is moved in this tick, in rad.
+
+        Parameters
+        ----------
+        coupling_torque_nm
+            What the sensor measures.
+        """
+        self._state, moved_rad = self._law.advance(self._state, coupling_torque_nm)
+        return moved_rad
+
+
+_Signal = TypeVar("_Signal", float, Real)
+
+
+class _Law:
+    """The recursion, of numbers in the control loop and of rows over its states in the design."""
+
+    def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
+        self._gain = settings.yield_rad_per_nm_s / rate_hz
+        self._lead = settings.yield_rad_per_nm_s * settings.lead_s
+        self._take = 1.0 - exp(-settings.fast_rad_s / rate_hz)
+        self._leak = 1.0 - exp(-settings.slow_rad_s / rate_hz)
+
+    def advance(
+        self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
+    ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
+        """Return the next state, of both filters and the leaking integral, and the movement."""
+        fast, slow, yielded = state
+        fast = fast + self._take * (torque - fast)
+        slow = slow + self._leak * (fast - slow)
+        swing = fast - slow
+        yielded = yielded - self._leak * yielded + self._gain * swing
+        return (fast, slow, yielded), -yielded - self._lead * swing
+
+
+def design_damper(loop: ClosedLoop) -> DamperSettings | None:
+    """Choose the active damping of a rig.
+
+    Parameters
+    ----------
+    loop
+        Closed loop of the rig.
+
+    Returns
+    -------
+    DamperSettings or None
+        The strongest that leaves the loop stable on beams of several stiffnesses with next to no
+        damping of their own; None where none does, or there is no beam.
+
+    Raises
+    ------
+    RealisationError
+        If such a beam cannot be realised.
+    """
+    model = loop.model
+    if model.beam is None:
+        return None
+    first_rad_s = float(undamped_frequencies_rad_s(model.beam, 1)[0])
+    settings = DamperSettings(
+        yield_rad_per_nm_s=_STRENGTH / (model.beam.inertia_kg_m2 * first_rad_s),
+        lead_s=2.0 / model.settings.pole_rad_s,
+        slow_rad_s=_SLOW * first_rad_s,
+        fast_rad_s=4.0 * model.settings.pole_rad_s,
+    )
+    stiffness = model.beam.bending_stiffness_n_m2
+    beams = [replace(model.beam, bending_stiffness_n_m2=part * stiffness) for part in _STIFFNESSES]
+    loops = [close_loop(light_beam(model, beam)) for beam in beams]
+    for _ in range(_HALVINGS):
+        growths = [damped_poles(each, settings).real.max() for each in loops]
+        if max(growths) <= _MOST_GROWTH_PER_S:
+            return settings
+        settings = replace(settings, yield_rad_per_nm_s=0.5 * settings.yield_rad_per_nm_s)
+    return None
+
+
+def damped_poles(loop: ClosedLoop, settings: DamperSettings) -> Complex:
+    """Return the poles of a closed loop with active damping, in rad/s.
+
+    Parameters
+    ----------
+    loop
+        Closed loop without it.
+    settings
+        Active damping.
+    """
+    n, rate_hz = loop.b.size, loop.model.rate_hz
+    reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
+    fast, slow, yielded = np.eye(3, n + 3, n)
+    states, moved = _Law(settings, rate_hz).advance(
+        (fast, slow, yielded), np.append(reading, np.zeros(3))
+    )
+    a = np.zeros((n + 3, n + 3))
+    a[:n, :n] = loop.a
+    a[:n] += np.outer(loop.b, moved)
+    a[n:] = states
+    eigenvalues = np.linalg.eigvals(a).astype(complex)
+    # Delays leave eigenvalues at zero, as in the loop itself.
+    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > 1e-9]) * rate_hz
+    return poles

@@ -1,0 +1,330 @@
+"""Shapes of moves: quintic, paths that leave a beam at rest, slew, and braking.
+
+A reference is made of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a[j]``. The closed loop
+is linear, so that a mode with the pole s is left at rest where the accelerations' transform
+``Σ a[j] exp(-s j dt)`` is zero: the angle that follows the reference has the same zero. A zero of
+second order (its derivative by s is zero as well) leaves little where the pole is not well known.
+The poles are those of the closed loop with the motor held, for its modes are what rings on.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._signals import positive
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+ROBUST_BELOW_HZ = 60.0
+"""A robust move has zeros of second order for the modes below; those above are too weak to matter
+after a change of 1 % in their frequency."""
+
+_MOST_PEAK = 24.0
+"""Largest acceleration of a path over ``distance / duration²`` before zeros are given up for it:
+four times that of a quintic. A path shorter than about half a period of a mode needs more."""
+
+
+def quintic(duration_s: float, rate_hz: float) -> Real:
+    """Path of least jerk from 0 to 1, with speed and acceleration zero at both ends.
+
+    Parameters
+    ----------
+    duration_s
+        Time from the last tick at 0 to the first at 1.
+    rate_hz
+        Ticks a second.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        ``u³ (10 - 15 u + 6 u²)`` at the n ticks after the start; the last is 1.
+
+    References
+    ----------
+    T. Flash and N. Hogan, Journal of Neuroscience 5 (1985) 1688.
+
+    Examples
+    --------
+    >>> from rigd.excitation import quintic
+    >>> quintic(0.004, 1000.0).round(4)
+    array([0.1035, 0.5   , 0.8965, 1.    ])
+    """
+    n = max(1, round(duration_s * rate_hz))
+    u = np.arange(1, n + 1) / n
+    path: Real = u**3 * (10 - 15 * u + 6 * u**2)
+    return path
+
+
+def still_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
+    """Path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
+
+    The zeros are of second order where the time suffices, else of first order; below about half a
+    period of the slowest mode it is the quintic.
+
+    Parameters
+    ----------
+    duration_s
+        Time from the last tick at 0 to the first at 1.
+    rate_hz
+        Ticks a second.
+    poles_rad_s
+        Shape (m,): one pole of each pair.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Path at the n ticks after the start; the last is 1.
+    """
+    n = max(1, round(duration_s * rate_hz))
+    for order in (2, 1):
+        rows = np.concatenate([_motion_rows(n, rate_hz), zero_rows(n, rate_hz, poles_rad_s, order)])
+        if len(rows) > n:
+            continue
+        acceleration, met = _least_norm(rows, np.array([0.0, 1.0]))
+        if met and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MOST_PEAK:
+            return from_acceleration(acceleration, rate_hz)
+    return quintic(duration_s, rate_hz)
+
+
+def slew(
+    distance_rad: float,
+    *,
+    speed_rad_s: float,
+    acceleration_rad_s2: float,
+    rate_hz: float,
+    poles_rad_s: Complex,
+) -> Real:
+    """Slew at constant speed, in which no mode rings, neither on the way nor at the end.
+
+    The speed is taken up by a pulse of acceleration that leaves all modes at rest, and given up by
+    the same with the other sign. A pulse takes half a period of the slowest mode at least.
+
+    Parameters
+    ----------
+    distance_rad
+        Angle from start to end; either sign.
+    speed_rad_s
+        Speed on the way; lower where the distance is too short to reach it.
+    acceleration_rad_s2
+        Largest acceleration; the pulses become longer until they keep it.
+    rate_hz
+        Ticks a second.
+    poles_rad_s
+        Shape (m,): one pole of each pair.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Reference at the n ticks after the start, relative to the angle there.
+
+    Raises
+    ------
+    ExcitationError
+        If speed or acceleration is not positive.
+    """
+    positive("speed_rad_s", speed_rad_s, "rad/s")
+    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    slowest_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
+    speed = speed_rad_s
+    n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
+    while True:
+        pulse = _pulse(n, rate_hz, poles_rad_s)
+        # Both pulses together go as far as one at full speed.
+        speed = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
+        if pulse is not None and speed * np.abs(pulse).max() <= acceleration_rad_s2:
+            break
+        n = n + max(1, n // 20)
+    cruise = round(abs(distance_rad) / speed * rate_hz) - n
+    # A whole number of ticks on the way: the speed is what fits, by less than a tick's part.
+    speed = abs(distance_rad) * rate_hz / (n + cruise)
+    acceleration = np.concatenate([pulse, np.zeros(cruise), -pulse])
+    return from_acceleration(np.copysign(speed, distance_rad) * acceleration, rate_hz)
+
+
+def _pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
+    """Accelerations (n,) of least norm that change the speed by 1; None: n is too short."""
+    rows = np.concatenate([_motion_rows(n, rate_hz)[:1], zero_rows(n, rate_hz, poles_rad_s, 1)])
+    pulse, met = _least_norm(rows, np.array([1.0]))
+    return pulse if met else None
+
+
+def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
+    """Sum up accelerations (n,) to the reference (n,) at the ticks after the start.
+
+    Parameters
+    ----------
+    acceleration_rad_s2
+        Shape (n,).
+    rate_hz
+        Ticks a second.
+    """
+    reference: Real = np.cumsum(np.cumsum(acceleration_rad_s2)) / rate_hz**2
+    return reference
+
+
+def _motion_rows(n: int, rate_hz: float) -> Real:
+    """Rows (2, n) that give change of speed and distance of n accelerations."""
+    ticks_left = n - np.arange(n)
+    return np.stack([np.full(n, 1.0 / rate_hz), ticks_left / rate_hz**2])
+
+
+def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
+    """Rows (rows, n) that give the real and imaginary part of what n accelerations leave in modes.
+
+    Each mode is referred to the end of the path, where it has decayed. With ``order`` 2 those below
+    `ROBUST_BELOW_HZ` have rows for the derivative by the pole as well.
+
+    Parameters
+    ----------
+    n
+        Ticks of the path.
+    rate_hz
+        Ticks a second.
+    poles_rad_s
+        Shape (m,): one pole of each pair.
+    order
+        Order of the zeros: 1 or 2.
+    """
+    left_s = (n - np.arange(n)) / rate_hz
+    rows: list[Real] = []
+    for pole in poles_rad_s:
+        transform = np.exp(pole * left_s) / rate_hz
+        twice = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        for row in (transform, transform * left_s / left_s[0]) if twice else (transform,):
+            rows.append(row.real)
+            if pole.imag != 0.0:
+                rows.append(row.imag)
+    return np.array(rows).reshape(-1, n)
+
+
+def _least_norm(rows: Real, wanted: Real) -> tuple[Real, bool]:
+    """Solve ``rows @ a = wanted`` (0 for the other rows) by the least a, and say if it was met."""
+    goal = np.zeros(len(rows))
+    goal[: wanted.size] = wanted
+    scale = np.linalg.norm(rows, axis=1)
+    solution = np.linalg.lstsq(rows / scale[:, None], goal / scale, rcond=1e-12)[0]
+    missed = np.abs(rows @ solution - goal) / scale
+    return solution, bool(missed.max() <= 1e-9 * np.linalg.norm(solution))
+
+
+def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
+    """Return what a reference has left in each mode at its end: its accelerations' transform.
+
+    Parameters
+    ----------
+    reference_rad
+        Shape (n,), from rest on.
+    rate_hz
+        Ticks a second.
+    poles_rad_s
+        Shape (m,).
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Complex, in rad/s. Zero: the mode is at rest.
+    """
+    acceleration = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
+    # r[k+1] - 2 r[k] + r[k-1] is of tick k: one before the sample in which it shows.
+    left_s = np.arange(acceleration.size, 0, -1) / rate_hz
+    state: Complex = np.exp(np.outer(poles_rad_s, left_s)) @ acceleration / rate_hz
+    return state
+
+
+# Braking
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Braking:
+    """Table of a braking path: it starts at any tick, without planning.
+
+    The speed falls on a cubic from what it is to zero, and its slope from what it is to zero, so
+    that neither jumps. The path is linear in both: a tick takes two products.
+    """
+
+    rate_hz: float
+    """Ticks a second."""
+    per_speed_s: tuple[float, ...]
+    """Way at the ticks after the start, per speed there."""
+    per_acceleration_s2: tuple[float, ...]
+    """Way at the ticks after the start, per acceleration there."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the start to standstill."""
+        return len(self.per_speed_s) / self.rate_hz
+
+    def path(
+        self, angle_rad: float, speed_rad_s: float, acceleration_rad_s2: float = 0.0
+    ) -> list[float]:
+        """Return the reference at the ticks after the start, in microseconds; the last one stays.
+
+        Parameters
+        ----------
+        angle_rad, speed_rad_s, acceleration_rad_s2
+            The reference at the start and its derivatives.
+        """
+        return [
+            angle_rad + speed_rad_s * way_s + acceleration_rad_s2 * way_s2
+            for way_s, way_s2 in zip(self.per_speed_s, self.per_acceleration_s2, strict=True)
+        ]
+
+
+def braking_path(duration_s: float, rate_hz: float) -> Braking:
+    """Return the table of a braking path.
+
+    Parameters
+    ----------
+    duration_s
+        Time to standstill: `braking_time_s` says which keeps a rig's limits.
+    rate_hz
+        Ticks a second.
+
+    Notes
+    -----
+    With ``u = t / duration``, speed v and acceleration a at the start, the speed is
+    ``v (2 u³ - 3 u² + 1) + a duration (u³ - 2 u² + u)``. From constant speed the largest
+    deceleration is ``1.5 v / duration`` and the way is ``v duration / 2``.
+
+    Examples
+    --------
+    >>> from rigd.excitation import braking_path
+    >>> braking = braking_path(0.1, rate_hz=1000)
+    >>> path_rad = braking.path(0.6, speed_rad_s=1.0)
+    >>> round(path_rad[-1], 6)  # half the way of a motor that goes on
+    0.65
+    """
+    positive("duration_s", duration_s, "s")
+    n = max(2, round(duration_s * rate_hz))
+    time_s = n / rate_hz
+    u = np.arange(1, n + 1) / n
+    per_speed = time_s * (u**4 / 2 - u**3 + u)
+    per_acceleration = time_s**2 * (u**4 / 4 - 2 * u**3 / 3 + u**2 / 2)
+    return Braking(rate_hz, tuple(per_speed.tolist()), tuple(per_acceleration.tolist()))
+
+
+def braked(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
+    """Return a reference that is braked from a tick on, as the control loop does it.
+
+    Parameters
+    ----------
+    reference_rad
+        Shape (n,).
+    tick
+        Last tick at which it is followed; from 2 on, for speed and acceleration.
+    braking
+        Table of the braking path.
+
+    Returns
+    -------
+    ndarray, shape (tick + 1 + m,)
+        The last angle is where it stands still.
+    """
+    before, last, now = (float(value) for value in reference_rad[tick - 2 : tick + 1])
+    rate_hz = braking.rate_hz
+    acceleration = (now - 2 * last + before) * rate_hz**2
+    speed = (now - last) * rate_hz + acceleration / (2 * rate_hz)
+    return np.concatenate([reference_rad[: tick + 1], braking.path(now, speed, acceleration)])

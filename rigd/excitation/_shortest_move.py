@@ -1,0 +1,571 @@
+"""The shortest move that leaves no vibration within a rig's limits: a linear programme.
+
+For a given time the accelerations are found that take the smallest share of the limits of torque,
+speed, tracking error and sensor, and leave every mode at rest. The shortest time is the one at
+which that share is 1. The responses are those of the closed loop to a unit of acceleration, so that
+all limits are linear in the accelerations; Coulomb friction is taken off the torque.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import ceil, inf
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._moves import (
+    ROBUST_BELOW_HZ,
+    Braking,
+    braked,
+    braking_path,
+    from_acceleration,
+    modal_state,
+    quintic,
+    zero_rows,
+)
+from rigd.excitation._signals import (
+    Excitation,
+    ExcitationError,
+    assemble,
+    finite,
+    lay_out_segments,
+    within_a_turn,
+)
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+SHARE_OF_LIMITS: Final = 0.9
+"""Share of torque, speed, tracking error and sensor that a move may take."""
+
+LONGEST_S: Final = 60.0
+"""A move that would take longer is refused."""
+
+_HELD_S: Final = 2e-3
+"""Time for which an acceleration is held, where the move is not so long that it is more."""
+_MOST_PIECES: Final = 60
+_CLOSE: Final = 1.03
+_NEARLY_ALL: Final = 0.93
+"""The search ends at this ratio of a time that suffices to one that does not, or where the move
+takes this part of what it may: a time shorter by 4 % would take more than all."""
+_MOST_ROUNDS: Final = 14
+_FARTHEST: Final = 0.98
+"""Part of the limit of the angle at which a move may end: what is left is for what surpasses it."""
+_BACKWARD: Final = 0.01
+"""Part of its mean speed with which a robust move may go backward."""
+_LEAST_RAD: Final = 1e-3
+_BRAKING_STARTS: Final = 16
+_BRAKING_S: Final = (0.02, 5.0)
+
+
+class Response(Protocol):
+    """Response of the closed loop to a reference: arrays (n,)."""
+
+    @property
+    def angle_rad(self) -> Real:
+        """At the output shaft."""
+
+    @property
+    def velocity_rad_s(self) -> Real:
+        """At the output shaft."""
+
+    @property
+    def torque_nm(self) -> Real:
+        """The command, not limited."""
+
+    @property
+    def coupling_torque_nm(self) -> Real:
+        """What the sensor measures."""
+
+
+@dataclass(frozen=True, slots=True)
+class MovePlant:
+    """What planning a move needs to know of a rig."""
+
+    rate_hz: float
+    """Ticks a second."""
+    respond: Callable[[Real], Response]
+    """Response of the closed loop to a reference (n,) from rest, without friction."""
+    poles_rad_s: Complex
+    """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
+    torque_per_state_nm_s: Real
+    """Shape (m,): amplitude of the coupling torque for what `modal_state` says of a mode."""
+    frequency_uncertainty: Real
+    """Shape (m,): relative standard uncertainty of the modes' frequencies."""
+    settling_s: float
+    """Time in which the loop follows up what the reference has done."""
+    peak_torque_nm: float
+    """Largest torque of the motor."""
+    friction_nm: float
+    """Torque that compensates friction, on top of the linear response's."""
+    largest_acceleration_rad_s2: float
+    """Bound of the reference's acceleration; what the loop's filters make of it counts."""
+    velocity_rad_s: float
+    """Limit of the speed."""
+    tracking_error_rad: float
+    """Limit of reference minus angle."""
+    coupling_torque_nm: float
+    """Range of the sensor."""
+    angle_rad: float
+    """Limit of the angle from the rig's zero, either way."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A planned move."""
+
+    reference_rad: Real
+    """Shape (n,): at the ticks after the start, relative to the angle there; the last one stays."""
+    duration_s: float
+    """Time of the reference."""
+    share: float
+    """Largest share of a limit that it is predicted to take; at most `SHARE_OF_LIMITS`."""
+    residual_nm: float
+    """Coupling torque that the modes are predicted to swing with afterwards: the sum of their
+    amplitudes, each for a frequency that is wrong by its standard uncertainty."""
+    quintic_residual_nm: float
+    """The same of a quintic that takes the same time."""
+
+
+def shortest_move(
+    plant: MovePlant,
+    distance_rad: float,
+    *,
+    start_rad: float = 0.0,
+    robust: bool = False,
+    ringing: Complex | None = None,
+) -> Move:
+    """Plan the shortest move that leaves no vibration.
+
+    Parameters
+    ----------
+    plant
+        The rig.
+    distance_rad
+        Angle from start to end, either sign.
+    start_rad
+        Angle of the start from the rig's zero.
+    robust
+        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, so that frequencies that are
+        wrong by 1 % do no harm, and no turning back; the move takes longer.
+    ringing
+        Shape (m,): state of the modes at the start as of `modal_state`, which the move takes out;
+        None: they are at rest.
+
+    Raises
+    ------
+    ExcitationError
+        If no move of at most `LONGEST_S` keeps the limits.
+
+    Notes
+    -----
+    W. E. Singhose and others describe input shapers as such zeros; the linear programme is that of
+    T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
+    the limits of the rig in place of an impulse's.
+    """
+    search = _Search(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
+    acceleration = search.shortest()
+    reference = from_acceleration(acceleration, plant.rate_hz)
+    n = reference.size
+    usual = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
+    return Move(
+        reference_rad=reference,
+        duration_s=n / plant.rate_hz,
+        share=search.share(reference),
+        residual_nm=_residual_nm(plant, reference, ringing),
+        quintic_residual_nm=_residual_nm(plant, usual, ringing),
+    )
+
+
+def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
+    """Sum of the amplitudes of the modes left, each mode's frequency wrong by its uncertainty."""
+    left = []
+    for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
+        poles = plant.poles_rad_s * (1.0 + off)
+        state = modal_state(np.concatenate([[0.0], reference]), plant.rate_hz, poles)
+        if ringing is not None:
+            state = state + ringing * np.exp(poles * reference.size / plant.rate_hz)
+        left.append(np.abs(state) * plant.torque_per_state_nm_s)
+    return float(np.maximum(*left).sum())
+
+
+class _Search:
+    """Search for the shortest time; one linear programme for each that is tried."""
+
+    def __init__(
+        self,
+        plant: MovePlant,
+        distance_rad: float,
+        start_rad: float,
+        order: int,
+        ringing: Complex | None,
+    ) -> None:
+        self._plant = plant
+        self._distance_rad = distance_rad
+        self._start_rad = start_rad
+        self._order = order
+        self._ringing = ringing
+        self._unit = _UnitResponse(plant)
+        rung_nm = 0.0
+        if ringing is not None:
+            rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
+        # What still rings is fed forward to the motor, and is in the sensor.
+        self._limits = {
+            "torque": SHARE_OF_LIMITS * plant.peak_torque_nm - plant.friction_nm - rung_nm,
+            "velocity": SHARE_OF_LIMITS * plant.velocity_rad_s,
+            "tracking": SHARE_OF_LIMITS * plant.tracking_error_rad,
+            "coupling": SHARE_OF_LIMITS * plant.coupling_torque_nm - rung_nm,
+        }
+        if min(self._limits.values()) <= 0.0:
+            raise ExcitationError(
+                "Friction and the vibration at the start leave nothing of motor.peak_torque_nm or "
+                "sensor.range for a move; wait until the beam is at rest."
+            )
+
+    def shortest(self) -> Real:
+        """Return the accelerations (n,) of the shortest move.
+
+        Raises
+        ------
+        ExcitationError
+            If it would take more than `LONGEST_S`.
+        """
+        rate_hz = self._plant.rate_hz
+        most = round(LONGEST_S * rate_hz)
+        slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
+        n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
+        too_short, found, share_short, share_found = 8, most + 1, inf, 0.0
+        best: Real | None = None
+        for _ in range(_MOST_ROUNDS):
+            share, acceleration = self._least_share(n)
+            if share <= 1.0:
+                found, share_found, best = n, share, acceleration
+            else:
+                too_short, share_short = n, share
+            if share_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
+                break
+            if too_short >= most:
+                break
+            n = _next(too_short, found, share_short, share_found, n, share, self._order)
+            n = min(n, most)
+        if best is None:
+            raise ExcitationError(
+                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad keeps the "
+                "limits of the profile; choose a smaller angle, or look at limits.velocity_rad_s."
+            )
+        return best
+
+    def _least_share(self, n: int) -> tuple[float, Real | None]:
+        """Smallest share of the limits that a move of n ticks takes, and its accelerations (n,).
+
+        Without a solution the share is infinite.
+        """
+        from scipy.optimize import linprog
+
+        plant, rate_hz = self._plant, self._plant.rate_hz
+        held = max(1, round(_HELD_S * rate_hz))
+        pieces = min(ceil(n / held), _MOST_PIECES)
+        edges = np.round(np.linspace(0, n, pieces + 1)).astype(int)
+        scale = plant.largest_acceleration_rad_s2
+
+        zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
+        per_piece = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
+        steps = np.diff(edges) / rate_hz
+        # The centre of a piece's held acceleration, as `from_acceleration` sums them up.
+        left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
+        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_piece])
+        goal = np.zeros(len(equal))
+        goal[1] = self._distance_rad
+        if self._ringing is not None:
+            goal[2:] = np.negative(self._ringing_rows(n))
+        size = np.linalg.norm(equal, axis=1)
+
+        limited, bounded, bounds = self._responses(n, edges, scale)
+        limited = np.concatenate([limited, np.eye(pieces)])
+        share_column = -np.ones((len(limited), 1))
+        none = np.zeros((len(bounded), 1))
+        least = np.block([[limited, share_column], [-limited, share_column], [bounded, none]])
+        below = np.concatenate([np.zeros(2 * len(limited)), bounds])
+        found = linprog(
+            np.append(np.zeros(pieces), 1.0),
+            A_ub=least,
+            b_ub=below,
+            A_eq=np.column_stack([equal / size[:, None], np.zeros(len(equal))]),
+            b_eq=goal / size,
+            bounds=[(None, None)] * pieces + [(0.0, None)],
+            method="highs-ds",
+        )
+        if found.x is None or found.status != 0:
+            return inf, None
+        return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
+
+    def _ringing_rows(self, n: int) -> list[float]:
+        """Return what still rings at the end of the start's state, row by row as of `zero_rows`."""
+        assert self._ringing is not None
+        rows: list[float] = []
+        for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
+            later = state * np.exp(pole * n / self._plant.rate_hz)
+            # The row of the derivative weighs the start by 1.
+            twice = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            for _ in range(2 if twice else 1):
+                rows += [later.real, later.imag] if pole.imag != 0.0 else [later.real]
+        return rows
+
+    def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
+        """Return rows over the pieces: shares of limits; and what has bounds, with these.
+
+        A robust move from rest does not turn back: it goes nowhere but to its end, and the friction
+        of the motor, whose sign the controller takes from the reference, turns round nowhere. One
+        that takes out a vibration has to go to and fro, as the shortest does, within the limit of
+        the angle.
+        """
+        plant = self._plant
+        end = n + round(plant.settling_s * plant.rate_hz)
+        # The ends of all pieces and what lies between them: a programme finds every gap.
+        middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
+        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_PIECES // 2]
+        fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
+        fine = fine.astype(int)
+        coarse = fine[::2]
+        unit = self._unit.up_to(end)
+        rows = [
+            _over_pieces(unit[name], edges, coarse if name == "coupling" else fine)
+            * (scale / self._limits[name])
+            for name in self._limits
+        ]
+        if self._order > 1 and self._ringing is None:
+            forward = np.copysign(scale, self._distance_rad)
+            backward = -forward * _over_pieces(unit["velocity"], edges, coarse)
+            mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
+            return np.concatenate(rows), backward, np.full(len(coarse), _BACKWARD * mean_rad_s)
+        angle = scale * _over_pieces(unit["angle"], edges, coarse)
+        free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
+        return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
+
+    def share(self, reference: Real) -> float:
+        """Largest share of a limit that a reference takes, at every tick."""
+        plant = self._plant
+        held = round(plant.settling_s * plant.rate_hz)
+        whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
+        response = plant.respond(whole)
+        peaks = (
+            (np.abs(response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
+            np.abs(response.velocity_rad_s).max() / plant.velocity_rad_s,
+            np.abs(whole - response.angle_rad).max() / plant.tracking_error_rad,
+            np.abs(response.coupling_torque_nm).max() / plant.coupling_torque_nm,
+            np.abs(self._start_rad + response.angle_rad).max() / plant.angle_rad,
+        )
+        return float(max(peaks))
+
+
+def _next(
+    too_short: int,
+    found: int,
+    share_short: float,
+    share_found: float,
+    n: int,
+    share: float,
+    order: int,
+) -> int:
+    """Choose the number of ticks to try next, from the shares of the limits on either side.
+
+    The share falls with a power of the time: about the third, and more where the modes set the
+    time and not the distance.
+    """
+    if share_found == 0.0:  # none has sufficed yet
+        return int(max(n + 2, round(1.03 * n * min(share, 4.0) ** 0.3)))
+    if share_short == inf and n == found:
+        guess = round(n * max(share, 0.02) ** (0.08 if order > 1 else 0.22))
+    elif share_short == inf:
+        guess = round((too_short * found) ** 0.5)
+    else:
+        power = np.log(share_short / share_found) / np.log(found / too_short)
+        guess = round(1.004 * found * share_found ** (1.0 / power))
+    return int(min(max(guess, too_short + 1), found - 1))
+
+
+class _UnitResponse:
+    """Responses to a reference of acceleration 1, as long as needed."""
+
+    def __init__(self, plant: MovePlant) -> None:
+        self._plant = plant
+        self._rows: dict[str, Real] = {}
+        self._ticks = 0
+
+    def up_to(self, ticks: int) -> dict[str, Real]:
+        """Return the rows at the first ticks at least."""
+        if ticks > self._ticks:
+            self._ticks = max(2 * ticks, 1024)
+            one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
+            reference = np.concatenate([[0.0], one[:-1]])
+            response = self._plant.respond(reference)
+            self._rows = {
+                "torque": response.torque_nm,
+                "velocity": response.velocity_rad_s,
+                "tracking": reference - response.angle_rad,
+                "coupling": response.coupling_torque_nm,
+                "angle": response.angle_rad,
+            }
+        return self._rows
+
+
+def _over_pieces(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
+    """Response (ticks, pieces) to an acceleration of 1 in each piece."""
+    since = ticks[:, None] - edges
+    begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
+    return begun[:, :-1] - begun[:, 1:]
+
+
+# Braking
+
+
+def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
+    """Braking path that keeps the torque limit from wherever on a reference it starts.
+
+    Parameters
+    ----------
+    plant
+        The rig.
+    reference_rad
+        Shape (n,): the reference, from rest on, that may have to be braked.
+
+    Raises
+    ------
+    ExcitationError
+        If none of at most 5 s does.
+
+    Notes
+    -----
+    It is simulated with the closed loop from starts all along the reference. After them the torque
+    is linear in speed and acceleration of the reference there.
+    """
+    held = np.zeros(round(plant.settling_s * plant.rate_hz))
+    starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
+    free_nm = plant.peak_torque_nm - plant.friction_nm
+    duration_s, longest_s = _BRAKING_S
+    while duration_s <= longest_s:
+        braking = braking_path(duration_s, plant.rate_hz)
+        share = 0.0
+        for tick in starts:
+            path = braked(reference_rad, int(tick), braking)
+            response = plant.respond(np.concatenate([path, held + path[-1]]))
+            share = max(share, float(np.abs(response.torque_nm).max()) / free_nm)
+            if share > 1.0:
+                break
+        if share <= 1.0:
+            return braking
+        duration_s *= min(max(share, 1.1), 1.5)
+    raise ExcitationError(
+        f"The reference cannot be braked within {longest_s:g} s by motor.peak_torque_nm = "
+        f"{plant.peak_torque_nm:g} N·m; lower its speed."
+    )
+
+
+# Excitation
+
+
+class MoveRig(Protocol):
+    """What planning a move needs of a rig."""
+
+    @property
+    def start_rad(self) -> float:
+        """Where the motor stands, from the rig's zero."""
+
+    def move_plant(self, path: str | Path) -> MovePlant:
+        """Return the rig for planning, with the beam of an analysis; without a path the profile's.
+
+        Parameters
+        ----------
+        path
+            Document of ``analyze --json``, or empty.
+        """
+
+
+def move(
+    *,
+    rate_hz: float,
+    angle_rad: float | None = None,
+    by_rad: float | None = None,
+    path: str | Path = "",
+    robust: int = 0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 5.0,
+    rig: MoveRig | None = None,
+) -> Excitation:
+    """Move to an angle in the shortest time that leaves no vibration; the motor stays there.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    angle_rad
+        Where to, from the rig's zero.
+    by_rad
+        By how much, in place of `angle_rad`; either sign.
+    path
+        JSON written by ``analyze --json``, whose beam the move is planned for; empty: the
+        profile's.
+    robust
+        1: frequencies that are wrong by 1 % do no harm and the motor does not turn back, but the
+        move takes longer. 0: the shortest.
+    rest_s, ring_down_s
+        Time before and after the move.
+    rig
+        Rig that is moved.
+
+    Raises
+    ------
+    ExcitationError
+        If not exactly one angle is given, the move would leave the limits, or the file is not what
+        it should be.
+    """
+    if rig is None:
+        raise ExcitationError("A move is planned for a rig; run it with its profile.")
+    if (angle_rad is None) == (by_rad is None):
+        raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
+    for option, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
+        if value_rad is not None:
+            finite(option, value_rad, "rad")
+    if robust not in (0, 1):
+        raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
+    start_rad = rig.start_rad
+    target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
+    within_a_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
+    plant = rig.move_plant(path)
+    farthest_rad = _FARTHEST * plant.angle_rad
+    if not abs(target_rad) <= farthest_rad:
+        raise ExcitationError(
+            f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
+            f"{plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either side; "
+            f"choose at most that{'' if by_rad is None else _by_at_most(farthest_rad, start_rad)}."
+        )
+    distance_rad = target_rad - start_rad
+    if abs(distance_rad) < _LEAST_RAD:
+        raise ExcitationError(
+            f"The motor stands at {start_rad:.4g} rad already, and a move is of {_LEAST_RAD:g} rad "
+            "at least; choose another angle."
+        )
+    planned = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
+    segments = lay_out_segments(rate_hz, rest_s, planned.duration_s, ring_down_s)
+    parameters: dict[str, float | int | str] = {
+        "angle_rad": target_rad,
+        "by_rad": distance_rad,
+        "file": Path(path).name if path else "",
+        "robust": robust,
+        "duration_s": planned.duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "limits_share": planned.share,
+        "residual_nm": planned.residual_nm,
+        "quintic_residual_nm": planned.quintic_residual_nm,
+    }
+    made = assemble("move", parameters, rate_hz, segments, planned.reference_rad)
+    return replace(made, stays=True)
+
+
+def _by_at_most(farthest_rad: float, start_rad: float) -> str:
+    """Say by how much the motor may move from where it stands."""
+    low, high = -farthest_rad - start_rad, farthest_rad - start_rad
+    return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

@@ -1,0 +1,225 @@
+"""Passes in search of an obstacle: out at a constant speed until something is met, and back.
+
+Each pass has its own stretch of time, as long as it takes if nothing is met: rest, way out, pause,
+way back. When the loop detects a touch it leaves the reference for another one that fits into
+the same stretch (`after_touch`): it brakes, stays, and goes back to where the pass began. So a
+session has the same number of ticks whatever it meets. Neither way makes the beam ring.
+"""
+
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._moves import Braking, slew, still_path
+from rigd.excitation._shortest_move import MoveRig, shortest_braking
+from rigd.excitation._signals import (
+    Excitation,
+    ExcitationError,
+    assemble,
+    check_ticks,
+    finite,
+    lay_out_segments,
+    not_negative,
+    positive,
+    within_a_turn,
+)
+
+Real = NDArray[np.float64]
+
+_PEAK_SPEED = 2.0
+"""Largest speed of the way back over its mean: that of a path of least jerk, and some more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """Ticks of one pass."""
+
+    begins: int
+    """The way out begins; the rest before it is the pass's own."""
+    returns: int
+    """The way back begins."""
+    ends: int
+    """First tick after it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Approach:
+    """What the control loop needs to know of passes in search of an obstacle."""
+
+    passes: tuple[Pass, ...]
+    """One after the other."""
+    braking: Braking
+    """Table of the path on which it brakes."""
+    hold_ticks: int
+    """Ticks from a touch to the way back."""
+    back: Real
+    """Way back from 0 to 1, at the ticks after its start."""
+    force_limit_n: float
+    """Contact force above which the torque is taken off."""
+
+
+def touch(
+    *,
+    rate_hz: float,
+    angle_rad: float,
+    speed_rad_s: float = 1.0,
+    acceleration_rad_s2: float = 20.0,
+    passes: int = 1,
+    hold_s: float = 0.5,
+    settle_s: float = 1.0,
+    force_limit_n: float = 10.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 1.0,
+    path: str | Path = "",
+    rig: MoveRig | None = None,
+) -> Excitation:
+    """Slew until something is met, then brake, hold and withdraw.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    angle_rad
+        Farthest angle, from the rig's zero.
+    speed_rad_s
+        Speed on the way out.
+    acceleration_rad_s2
+        Largest acceleration of the reference at the beginning and end of the way out.
+    passes
+        How often it goes out.
+    hold_s
+        Time from a touch to the way back, and at the farthest angle if there is none.
+    settle_s
+        Rest before each pass.
+    force_limit_n
+        Contact force above which the torque is taken off and the session ends as a fault; it is
+        watched where the rig measures the base shear.
+    rest_s, ring_down_s
+        Time before and after all passes.
+    path
+        JSON written by ``analyze --json``, whose beam is looked for in the torque; empty: the
+        profile's.
+    rig
+        Rig that is moved.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite or out of range, or the rig cannot brake from that speed.
+    """
+    if rig is None:
+        raise ExcitationError("touch is made for a rig; none was given.")
+    finite("angle_rad", angle_rad, "rad")
+    within_a_turn("angle_rad", angle_rad)
+    by_rad = angle_rad - rig.start_rad
+    if by_rad == 0.0:
+        raise ExcitationError(
+            f"angle_rad = {angle_rad:g} rad is where the motor stands; give another angle."
+        )
+    positive("speed_rad_s", speed_rad_s, "rad/s")
+    positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
+    positive("force_limit_n", force_limit_n, "N")
+    positive("hold_s", hold_s, "s")
+    not_negative("settle_s", settle_s)
+    if passes < 1:
+        raise ExcitationError(f"passes = {passes} must be at least 1.")
+    plant = rig.move_plant(path)
+    out = slew(
+        by_rad,
+        speed_rad_s=speed_rad_s,
+        acceleration_rad_s2=acceleration_rad_s2,
+        rate_hz=rate_hz,
+        poles_rad_s=plant.poles_rad_s,
+    )
+    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], out]))
+    hold_ticks = ceil(hold_s * rate_hz)
+    if hold_s < braking.duration_s:
+        raise ExcitationError(
+            f"hold_s = {hold_s:g} s ends before the motor has stopped, which takes "
+            f"{braking.duration_s:.3g} s; hold longer."
+        )
+    slowest_rad_s = float(np.abs(plant.poles_rad_s).min(initial=np.inf))
+    # One period of the slowest mode at least, in which a path that leaves it at rest is gentle.
+    back_s = max(_PEAK_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s)
+    back = still_path(back_s, rate_hz, plant.poles_rad_s)
+    settle = np.zeros(ceil(settle_s * rate_hz))
+    stretch = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
+    check_ticks("The session", passes * stretch.size, rate_hz)
+    segments = lay_out_segments(rate_hz, rest_s, passes * stretch.size / rate_hz, ring_down_s)
+    first = segments["sweep"][0]
+    approach = Approach(
+        passes=tuple(
+            Pass(
+                begins=start + settle.size,
+                returns=start + stretch.size - back.size,
+                ends=start + stretch.size,
+            )
+            for start in range(first, first + passes * stretch.size, stretch.size)
+        ),
+        braking=braking,
+        hold_ticks=hold_ticks,
+        back=back,
+        force_limit_n=force_limit_n,
+    )
+    parameters: dict[str, float | int | str] = {
+        "angle_rad": angle_rad,
+        "speed_rad_s": speed_rad_s,
+        "acceleration_rad_s2": acceleration_rad_s2,
+        "passes": passes,
+        "hold_s": hold_s,
+        "settle_s": settle_s,
+        "force_limit_n": force_limit_n,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "file": str(path),
+        "by_rad": by_rad,
+        "braking_s": braking.duration_s,
+    }
+    sweep = np.tile(stretch, passes)
+    return assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
+
+
+def after_touch(
+    approach: Approach,
+    ends: int,
+    tick: int,
+    recent_rad: tuple[float, float, float],
+    start_rad: float,
+) -> Real:
+    """Return the rest of a pass after a touch: brake, hold, go back to its start.
+
+    Parameters
+    ----------
+    approach
+        The search.
+    ends
+        First tick after the pass.
+    tick
+        Tick of the detection, before the way back begins.
+    recent_rad
+        Reference two ticks before, one tick before, and at this tick.
+    start_rad
+        Reference where the pass began.
+
+    Returns
+    -------
+    ndarray of shape (ends - tick - 1,)
+        Reference of the ticks after this one, in rad.
+    """
+    braking, back = approach.braking, approach.back
+    before, last, now = recent_rad
+    acceleration = (now - 2 * last + before) * braking.rate_hz**2
+    speed = (now - last) * braking.rate_hz + acceleration / (2 * braking.rate_hz)
+    reference = np.full(ends - tick - 1, start_rad)
+    stopping = braking.path(now, speed, acceleration)
+    returns = reference.size - back.size
+    hold = min(approach.hold_ticks, returns)
+    stays_rad = stopping[-1]
+    reference[:hold] = stays_rad
+    # What is detected in the pause has the rest of it, and there is nothing left to brake.
+    reference[: min(hold, len(stopping))] = stopping[:hold]
+    reference[hold : hold + back.size] = stays_rad + (start_rad - stays_rad) * back
+    return reference
