@@ -1,62 +1,80 @@
 """Sequential test: whether the innovations have ceased to be noise.
 
-For each of the last 1, 2, 4 and 8 ticks the sum of the whitened innovations is compared with what
-noise makes of it. With p channels its square over the number of ticks is chi-squared of p degrees
-of freedom, whose tail sets the threshold for a stated rate of false alarms: with two channels it is
-``exp(-h/2)``, with one it is less. The model's error is allowed for by a share of the torque and
-shear that it predicts.
+The innovations of the last ticks are compared with the signatures of touches. Each comparison is a
+product with a unit vector: a normal deviate of standard deviation 1 in white noise, and the largest
+that any linear test can make of a touch of that place, shape and age. The tail of the normal
+distribution sets the threshold for a stated rate of false alarms. The model's error is allowed for
+by a share of the torque and shear that it predicts, and by what the innovations of the last moments
+have been: where a chirp passes a mode that is not quite where the model has it, they grow.
 
 References
 ----------
-M. Basseville, I. Nikiforov, Detection of Abrupt Changes (1993), chapter 2 (tests of a window).
+M. Basseville, I. Nikiforov, Detection of Abrupt Changes (1993), chapter 7 (generalised likelihood
+ratio of additive changes).
 """
 
 from dataclasses import dataclass
-from math import log
+from math import sqrt
+from statistics import NormalDist
+from typing import Final
 
-from rigd.touch._innovations import FreeBeam, InnovationFilter
+import numpy as np
+from numpy.typing import NDArray
 
-_WINDOWS = (1, 2, 4, 8)
-_LONGEST = _WINDOWS[-1]
+from rigd.touch._innovations import InnovationFilter, ObservedBeam
+
+Real = NDArray[np.float64]
+
+_INDEPENDENT: Final = 0.5
+"""Independent comparisons among the signatures, which overlap, as a share: measured at 4 to 5
+standard deviations."""
+_AGE_TICKS: Final = 8
+"""Ticks over which an error of the model is taken to add up."""
+_RECENT: Final = 1 / 600
+"""Share of a tick in the power of the last moments, from the oldest one that is compared on."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """How sure the detector has to be."""
 
-    false_alarms_per_hour: float = 1e-3
+    false_alarms_per_hour: float = 0.02
     """Expected number in white noise."""
-    model_tolerance: float = 0.02
+    model_tolerance: float = 0.01
     """Share of the predicted torque and shear that is taken to be the model's error."""
 
-    def threshold(self, rate_hz: float) -> float:
-        """Return the level that the square of a window's sum over its length must exceed.
+    def threshold(self, rate_hz: float, signatures: int) -> float:
+        """Return the level, in standard deviations, that a comparison must exceed.
 
         Parameters
         ----------
         rate_hz
             Ticks a second.
+        signatures
+            How many comparisons there are in a tick.
 
         Examples
         --------
         >>> from rigd.touch import DetectorSettings
-        >>> round(DetectorSettings(false_alarms_per_hour=1e-3).threshold(1000.0), 1)
-        46.8
+        >>> round(DetectorSettings().threshold(1000.0, signatures=216), 2)
+        6.57
         """
-        tests_per_hour = 3600.0 * rate_hz * len(_WINDOWS)
-        return 2.0 * log(tests_per_hour / self.false_alarms_per_hour)
+        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT * signatures)
+        return -NormalDist().inv_cdf(0.5 * self.false_alarms_per_hour / tests_per_hour)
 
 
 class TouchDetector:
-    """Watches a record for the first touch.
+    """Watches a record for touches.
 
-    Until `arm` is called it measures the innovations of the beam at rest: where they are greater
-    than the model's noise, the threshold rises by as much.
+    Until `arm` is first called it measures the innovations of the beam at rest: by them, and not by
+    the noise that the model was designed with, it judges from then on.
 
     Parameters
     ----------
     model
         The free beam with its noise.
+    signatures
+        From `rigd.touch.signatures`.
     rate_hz
         Ticks a second.
     settings
@@ -65,44 +83,75 @@ class TouchDetector:
     Attributes
     ----------
     level
-        Largest square of a window's sum over what is allowed, at the last tick; above 1: touched.
-    excess
-        Variance of the innovations at rest over that of the model, at least 1.
+        Largest comparison over what is allowed, at the last tick; above 1: touched.
+    noise
+        Standard deviations of the whitened innovations of torque and shear at rest, once armed.
     """
 
     __slots__ = (
         "_armed",
-        "_channels",
+        "_compare",
+        "_compared",
         "_filter",
-        "_next",
+        "_last",
+        "_measuring",
+        "_place",
+        "_powers",
         "_squares",
-        "_sums",
         "_threshold",
         "_ticks",
         "_tolerance2",
-        "excess",
+        "_windows",
         "level",
+        "noise",
     )
 
-    def __init__(self, model: FreeBeam, rate_hz: float, settings: DetectorSettings) -> None:
+    def __init__(
+        self, model: ObservedBeam, signatures: Real, rate_hz: float, settings: DetectorSettings
+    ) -> None:
         self._filter = InnovationFilter(model)
-        self._threshold = settings.threshold(rate_hz)
-        self._tolerance2 = settings.model_tolerance**2
-        self._channels = model.channels
+        self._threshold = settings.threshold(rate_hz, len(signatures))
+        self._tolerance2 = _AGE_TICKS * settings.model_tolerance**2
         self._armed = False
-        self._squares = 0.0
+        self._measuring = True
+        self._squares = [0.0, 0.0]
         self._ticks = 0
-        # Running totals of the last ticks, in a ring: a window's sum is a difference of two.
-        self._sums = [(0.0, 0.0)] * (_LONGEST + 1)
-        self._next = 0
-        self.excess = 1.0
+        self._compare = np.asfortranarray(signatures).dot
+        self._compared = np.empty(len(signatures))
+        # The last innovations stand twice in a ring, so that they always lie in one piece.
+        width = signatures.shape[1]
+        self._last = np.zeros(2 * width)
+        self._windows = [self._last[start : start + width] for start in range(2, width + 2, 2)]
+        self._place = 0
+        self._powers = [1.0, 1.0]
+        self.noise = (1.0, 1.0)
         self.level = 0.0
 
     def arm(self) -> None:
-        """Judge from the next tick on."""
+        """Judge from the next tick on, by what comes from then on."""
         if self._ticks:
-            self.excess = max(1.0, self._squares / self._ticks / self._channels)
+            torque, shear = (sqrt(square / self._ticks) for square in self._squares)
+            self.noise = torque or 1.0, shear or 1.0
+        self._ticks = 0
+        self._measuring = False
         self._armed = True
+        self._last[:] = 0.0
+        self._powers = [1.0, 1.0]
+
+    def disarm(self) -> None:
+        """Go on following the beam, but judge no more."""
+        self._armed = False
+        self.level = 0.0
+
+    def contact_force_n(self, shear_n: float) -> float:
+        """Return the shear of the last tick less that of the free beam: about the contact force.
+
+        Parameters
+        ----------
+        shear_n
+            Base shear as measured in the last tick.
+        """
+        return shear_n - self._filter.predicted_shear_n
 
     def step(
         self,
@@ -131,20 +180,29 @@ class TouchDetector:
             wrench_stale=wrench_stale,
         )
         torque, shear = filter_.whitened
-        number, sums = self._next, self._sums
-        before_torque, before_shear = sums[number]
-        self._next = number = (number + 1) % (_LONGEST + 1)
-        sums[number] = total_torque, total_shear = before_torque + torque, before_shear + shear
         if not self._armed:
-            self._squares += torque * torque + shear * shear
-            self._ticks += 1
+            if self._measuring:
+                self._squares[0] += torque * torque
+                self._squares[1] += shear * shear
+                self._ticks += 1
             return False
+        torque_noise, shear_noise = self.noise
+        last, place, powers = self._last, self._place, self._powers
+        half = last.size >> 1
+        old_torque, old_shear = last[2 * place : 2 * place + 2].tolist()
+        powers[0] += _RECENT * (old_torque * old_torque - powers[0])
+        powers[1] += _RECENT * (old_shear * old_shear - powers[1])
+        last[2 * place] = last[2 * place + half] = torque / torque_noise
+        last[2 * place + 1] = last[2 * place + 1 + half] = shear / shear_noise
+        compared = self._compared
+        self._compare(self._windows[place], compared)
+        self._place = place + 1 if place + 1 < len(self._windows) else 0
         u, v = filter_.predicted
+        u /= torque_noise
+        v /= shear_noise
+        largest = max(compared.max(), -compared.min())
         error2 = self._tolerance2 * (u * u + v * v)
-        level = 0.0
-        for window in _WINDOWS:
-            old_torque, old_shear = sums[number - window]
-            a, b = total_torque - old_torque, total_shear - old_shear
-            level = max(level, (a * a + b * b) / (window * self.excess + window * window * error2))
-        self.level = level / self._threshold
+        # The power and not its root: an error that swings adds up over the ticks.
+        excess = max(1.0, *powers) * sqrt(1.0 + error2)
+        self.level = float(largest) / (self._threshold * excess)
         return self.level > 1.0

@@ -50,15 +50,15 @@ _ZERO_RAD_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FreeBeam:
+class ObservedBeam:
     """Discrete model of the free beam with its observer, for one rate and sensor.
 
     Examples
     --------
     >>> from rigd.beam import Beam, Damping
-    >>> from rigd.touch import Noise, free_beam
+    >>> from rigd.touch import Noise, observed_beam
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> model = free_beam(beam, Damping(zeta=7e-5), 1000.0, Noise(torque_nm=5e-3, shear_n=0.02))
+    >>> model = observed_beam(beam, Damping(zeta=7e-5), 1000.0, Noise(torque_nm=5e-3, shear_n=0.02))
     >>> model.states, model.matrix.shape
     (39, (43, 42))
     """
@@ -87,7 +87,7 @@ class Noise:
     """Standard deviation of the angle; a resolution of 7e-5 rad makes 2e-5 rad."""
 
 
-def free_beam(
+def observed_beam(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
@@ -95,7 +95,7 @@ def free_beam(
     *,
     tool_inertia_kg_m2: float = 0.0,
     torque_after_angle_s: float = 0.0,
-) -> FreeBeam:
+) -> ObservedBeam:
     """Design filter and observer.
 
     Parameters
@@ -113,7 +113,7 @@ def free_beam(
 
     Returns
     -------
-    FreeBeam
+    ObservedBeam
     """
     filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s)
     both = noise.shear_n is not None
@@ -136,16 +136,16 @@ def free_beam(
     gain[f:, :channels] = observer.gain[:, :channels] @ np.linalg.inv(
         observer.whitening[:channels, :channels]
     )
-    return FreeBeam(matrix, gain, observer.whitening, n, channels)
+    return ObservedBeam(matrix, gain, observer.whitening, n, channels)
 
 
 class InnovationFilter:
-    """Runs a `FreeBeam`; starts at rest at the first angle.
+    """Runs a `ObservedBeam`; starts at rest at the first angle.
 
     Parameters
     ----------
     model
-        From `free_beam`.
+        From `observed_beam`.
 
     Attributes
     ----------
@@ -162,14 +162,19 @@ class InnovationFilter:
         "_gain",
         "_n",
         "_rest_rad",
+        "_unwhitening",
         "_vectors",
         "predicted",
         "whitened",
     )
 
-    def __init__(self, model: FreeBeam) -> None:
+    def __init__(self, model: ObservedBeam) -> None:
         n = self._n = model.states
         self._gain = model.gain
+        self._unwhitening = (0.0, 0.0)
+        if model.channels == 2:
+            of_torque, of_shear = np.linalg.inv(model.whitening)[1].tolist()
+            self._unwhitening = of_torque, of_shear
         self._dot = np.asfortranarray(model.matrix).dot
         # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
         self._vectors = tuple(np.zeros((2, n + 4)))
@@ -215,6 +220,13 @@ class InnovationFilter:
             self._pass(turned_rad, torque_nm, shear_n)
         else:
             self._run(turned_rad, torque_nm, shear_n)
+
+    @property
+    def predicted_shear_n(self) -> float:
+        """Base shear that the angle alone explains; 0 where the model has none."""
+        of_torque, of_shear = self._unwhitening
+        torque, shear = self.predicted
+        return of_torque * torque + of_shear * shear
 
     def _run(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
         n = self._n

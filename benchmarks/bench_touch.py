@@ -1,0 +1,193 @@
+"""Touches: how far off the estimated point is, and whether its intervals and kinds hold.
+
+``bench_touch.py [--cases N] [--after-ms 50,100] [--noise 1] [--seed S]`` simulates N slews into an
+obstacle at rest (`touch_records.py`: modes, fine steps, nothing of the estimator) with places of
+0.05 to 0.97 m, stiffnesses of 100 to 100 000 N/m and speeds of 0.3 to 2 rad/s, and estimates each
+with a model that is off by what it states (as identified from one session). ``--torque-alone``
+leaves the base shear out, ``--exact`` takes the true model. ``--kinds`` takes obstacles that move,
+give way or knock, and two at once, instead.
+
+Printed: median, root mean square and 90 % of the error of the point (all cases, and those between
+0.1 and 0.95 m), the share within the 95 % interval and beyond four standard deviations, kinds, and
+processor time a fit.
+"""
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from touch_records import DAMPED, LINK, RATE_HZ, Obstacle, Slew, Struck, simulate
+
+from rigd.touch import TouchEstimate, TouchEstimator, TouchModel, TouchRecord
+
+Case = tuple[str, Obstacle | tuple[Obstacle, ...], Slew]
+
+RELATIVE_STD = {
+    "bending_stiffness_n_m2": 2e-3,
+    "density_over_stiffness": 5e-4,
+    "zeta": 0.05,
+    "gamma": 0.1,
+}
+"""What the model is off by, relative standard deviations."""
+
+DURATION_S = 0.85
+
+
+def at_rest(count: int, rng: np.random.Generator) -> list[Case]:
+    """Draw springy obstacles at rest."""
+    cases: list[Case] = []
+    for _ in range(count):
+        speed = rng.uniform(0.3, 2.0)
+        obstacle = Obstacle(
+            x_m=rng.uniform(0.05, 0.97),
+            angle_rad=speed * rng.uniform(0.38, 0.55),
+            stiffness_n_per_m=float(np.exp(rng.uniform(np.log(1e2), np.log(1e5)))),
+        )
+        cases.append(("rigid", obstacle, Slew(speed, rng.uniform(15, 40))))
+    return cases
+
+
+def other_kinds(count: int, rng: np.random.Generator) -> list[Case]:
+    """Draw obstacles that move, give way, knock, and two at once, `count` in all."""
+    cases: list[Case] = []
+    for i in range(count):
+        speed = rng.uniform(0.6, 1.5)
+        plain = Obstacle(
+            x_m=rng.uniform(0.15, 0.93),
+            angle_rad=0.5 * speed,
+            stiffness_n_per_m=float(np.exp(rng.uniform(np.log(300), np.log(3e4)))),
+        )
+        kind = ("moving", "yielding", "knock", "two")[i % 4]
+        obstacle: Obstacle | tuple[Obstacle, ...]
+        if kind == "moving":
+            rate = speed * rng.choice([-1.0, -0.5, 0.3, 0.5])
+            obstacle = replace(plain, angle_rad=0.5 * (speed - rate), rate_rad_s=rate)
+        elif kind == "yielding":
+            mobility = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
+            obstacle = replace(plain, mobility_m_per_n_s=mobility)
+        elif kind == "knock":
+            peak = rng.choice([-1, 1]) * rng.uniform(0.5, 4.0)
+            obstacle = replace(plain, knock_n=peak, knock_s=rng.uniform(0.002, 0.02))
+        else:
+            second = plain.angle_rad + rng.uniform(0.0, 0.03)
+            obstacle = (plain, replace(plain, x_m=rng.uniform(0.15, 0.95), angle_rad=second))
+        cases.append((kind, obstacle, Slew(speed, 30.0)))
+    return cases
+
+
+def record_of(struck: Struck, after: int, noticed: int, *, shear: bool) -> TouchRecord:
+    """Cut the record `after` samples behind the detection, `noticed` samples after the touch."""
+    detected = int(struck.touch_s * RATE_HZ) + noticed
+    end = detected + after
+    return TouchRecord(
+        RATE_HZ,
+        struck.angle_rad[:end],
+        struck.torque_nm[:end],
+        struck.shear_n[:end] if shear else None,
+        detected,
+    )
+
+
+def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
+    """Return the true beam, or one that is off by what it states."""
+    model = TouchModel(LINK, DAMPED, source="benchmark")
+    if exact:
+        return model
+    values = {
+        "bending_stiffness_n_m2": LINK.bending_stiffness_n_m2,
+        "density_over_stiffness": LINK.density_over_stiffness,
+        "zeta": DAMPED.zeta,
+        "gamma": DAMPED.gamma,
+    }
+    std = {name: share * values[name] for name, share in RELATIVE_STD.items()}
+    model = replace(model, std=std)
+    for name, deviation in std.items():
+        model = model.changed(name, deviation * rng.standard_normal())
+    return model
+
+
+def table(rows: NDArray[np.float64]) -> str:
+    """Statistics of rows of place, error, standard deviation, inside, seconds."""
+    error = np.abs(rows[:, 1]) * 1e3
+    return (
+        f"{len(rows):4d} cases: median {np.median(error):.2f} mm, rms "
+        f"{np.sqrt(np.mean(error**2)):.2f}, 90 % {np.percentile(error, 90):.2f}, largest "
+        f"{error.max():.1f}; within 95 % interval {rows[:, 3].mean():.0%}, beyond 4 std "
+        f"{np.mean(np.abs(rows[:, 1]) > 4 * rows[:, 2]):.1%}; median std "
+        f"{np.median(rows[:, 2]) * 1e3:.2f} mm; {np.median(rows[:, 4]):.2f} s a fit"
+    )
+
+
+def main() -> None:
+    """Simulate, estimate, print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--after-ms", default="50,100")
+    parser.add_argument("--noise", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=160, help="of the simulation, a sample")
+    parser.add_argument("--torque-alone", action="store_true")
+    parser.add_argument("--exact", action="store_true")
+    parser.add_argument("--kinds", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    given = parser.parse_args()
+    rng = np.random.default_rng(given.seed)
+    cases = (other_kinds if given.kinds else at_rest)(given.cases, rng)
+    records = simulate(
+        [obstacle for _, obstacle, _ in cases],
+        [slew for *_, slew in cases],
+        duration_s=DURATION_S,
+        steps=given.steps,
+        modes=40,
+        seed=given.seed,
+        noise=given.noise,
+    )
+    estimator = TouchEstimator(model_near(rng, exact=given.exact), RATE_HZ)
+    noticed = rng.integers(2, 9, len(cases))
+    for after in map(int, given.after_ms.split(",")):
+        rows, kinds = [], Counter[tuple[str, str]]()
+        for (kind, obstacle, _), struck, late in zip(cases, records, noticed, strict=True):
+            record = record_of(struck, after, int(late), shear=not given.torque_alone)
+            begin = time.process_time()
+            told = estimator.estimate(record)
+            spent = time.process_time() - begin
+            kinds[kind, told.kind] += 1
+            first = obstacle[0] if isinstance(obstacle, tuple) else obstacle
+            if given.verbose:
+                print(sentence(first, kind, told))
+            if told.x_m is not None:
+                low, high = told.x_m.interval_95
+                rows.append(
+                    [
+                        first.x_m,
+                        told.x_m.value - first.x_m,
+                        told.x_m.std,
+                        low <= first.x_m <= high,
+                        spent,
+                    ]
+                )
+        found = np.array(rows, dtype=np.float64)
+        print(f"{after} ms after the detection, point told in {len(found)} of {len(cases)}")
+        print("  all places     ", table(found))
+        inner = (found[:, 0] >= 0.1) & (found[:, 0] <= 0.95)
+        print("  0.1 to 0.95 m  ", table(found[inner]))
+        print("  kinds          ", {f"{a} -> {b}": n for (a, b), n in sorted(kinds.items())})
+
+
+def sentence(obstacle: Obstacle, kind: str, told: TouchEstimate) -> str:
+    """One case."""
+    x = told.x_m
+    point = (
+        "not told" if x is None else f"{(x.value - obstacle.x_m) * 1e3:+.2f} ± {x.std * 1e3:.2f}"
+    )
+    return (
+        f"{kind} at {obstacle.x_m:.3f} m, {obstacle.stiffness_n_per_m:.0f} N/m: {told.kind}, "
+        f"{point} mm, chi² {told.chi2_per_degree:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""Any force at one point: the likelihood of the point whatever the obstacle does.
+
+The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
+covariance that depends on the point; what decides is how both fit together. Works for obstacles
+that move, yield or come from outside as well as for springs, and tells less of each.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.touch._kernels import ContactKernels
+from rigd.touch._physical import Window
+
+Real = NDArray[np.float64]
+
+_SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
+"""Standard deviations of the force, one of which is likely."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlindScan:
+    """Likelihood over the places."""
+
+    x_m: Real
+    """Places, shape (m,)."""
+    log_likelihood: Real
+    """Value at each, the force's size being the likeliest, shape (m,)."""
+    chi2: float
+    """Sum of squared residuals at the best place in units of what its model expects."""
+    degrees: int
+    """What that would be on average."""
+    force_n: Real
+    """Force on the beam at the best place, shape (2 · samples,)."""
+    force_std_n: float
+    """Size of the force assumed there."""
+
+    def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
+        """Best place, its standard deviation and the ends of the places not much less likely.
+
+        Parameters
+        ----------
+        drop
+            Difference in log-likelihood of the ends; 1.92 for 95 %.
+        """
+        fine = np.linspace(self.x_m[0], self.x_m[-1], 4000)
+        curve = np.interp(fine, self.x_m, self.log_likelihood)
+        best = int(np.argmax(self.log_likelihood))
+        at = float(self.x_m[best])
+        if 0 < best < self.x_m.size - 1:
+            low, mid, high = self.log_likelihood[best - 1 : best + 2]
+            bend = low - 2 * mid + high
+            if bend < 0:
+                spacing = self.x_m[1] - self.x_m[0]
+                at += float(np.clip(0.5 * (low - high) / bend, -1, 1) * spacing)
+        likely = fine[curve >= curve.max() - drop]
+        weights = np.exp(curve - curve.max())
+        mean = np.sum(weights * fine) / np.sum(weights)
+        std = float(np.sqrt(np.sum(weights * (fine - mean) ** 2) / np.sum(weights)))
+        return at, std, min(float(likely[0]), at), max(float(likely[-1]), at)
+
+
+class Blind:
+    """Effects of any force, for the likelihood of records of one length.
+
+    Parameters
+    ----------
+    kernels
+        Contact kernels with two steps a sample.
+    every
+        Every so many of their places is scanned.
+    samples
+        Most samples.
+    """
+
+    __slots__ = ("_effects", "_x_m")
+
+    def __init__(self, kernels: ContactKernels, every: int, samples: int) -> None:
+        self._x_m = kernels.x_m[::every]
+        lag = 2 * np.arange(samples)[:, None] - np.arange(2 * samples)
+        self._effects = [
+            np.where(lag >= 0, table[::every][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
+            for table in (kernels.torque, kernels.shear)
+        ]  # (places, samples, forces)
+
+    def scan(self, window: Window) -> BlindScan:
+        """Likelihood over the places.
+
+        Parameters
+        ----------
+        window
+            Whitened innovations, at most as many samples as prepared.
+        """
+        count = window.end - window.first
+        noise = window.motion.noise
+        effects = np.concatenate(
+            [
+                each[:, :count, : 2 * count] / sigma
+                for each, sigma in zip(self._effects, noise, strict=False)
+            ],
+            axis=1,
+        )
+        effects = window.whitening @ effects
+        data = window.data
+        n = data.size
+        square = effects @ effects.transpose(0, 2, 1)
+        large = float(data @ data) + 1.0
+        found = np.empty((_SIZES_N.size, self._x_m.size))
+        quadratic = np.empty_like(found)
+        bordered = np.empty((self._x_m.size, n + 1, n + 1))
+        bordered[:, n, :n] = bordered[:, :n, n] = data
+        bordered[:, n, n] = large
+        for i, size in enumerate(_SIZES_N):
+            bordered[:, :n, :n] = size**2 * square + np.eye(n)
+            factor = np.linalg.cholesky(bordered)
+            diagonal = np.diagonal(factor, axis1=1, axis2=2)
+            quadratic[i] = large - diagonal[:, n] ** 2
+            found[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
+        size, place = np.unravel_index(np.argmax(found), found.shape)
+        variance = _SIZES_N[size] ** 2
+        whole = variance * square[place] + np.eye(n)
+        force = variance * effects[place].T @ np.linalg.solve(whole, data)
+        return BlindScan(
+            x_m=self._x_m,
+            log_likelihood=found.max(axis=0),
+            chi2=float(quadratic[size, place]),
+            degrees=n,
+            force_n=force,
+            force_std_n=float(_SIZES_N[size]),
+        )

@@ -1,0 +1,306 @@
+"""Motion of the beam without a touch, from the measured angle: what the innovations are against.
+
+The exact model is driven by the measured angle from the record's beginning on. What the beam did
+before (it may be vibrating from its slew) adds free vibrations of unknown amplitude, fitted along
+with an offset and a drift of each channel to the samples before the touch.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import PointForceGrid, clamped_free_eigenvalues, mode_shape, poles
+from rigd.touch._kernels import Line
+from rigd.touch._model import TouchModel
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+FINER = 4
+"""Values of the angle per sample, between them by a spline."""
+_BAND = 0.5
+"""Share of the frequencies so reached that the angle has: its own Nyquist frequency, twice."""
+_HIGHEST_HZ = 330.0
+_SETTLE_S = 0.03
+"""Beyond the record's end the angle comes to rest in this time: no jump to ring before it."""
+_SPEED_S = 0.02
+"""Over this time the speed at the record's beginning is measured."""
+BEFORE = 24
+"""Samples over which what a spline makes of one sample fades."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchRecord:
+    """Samples around a touch, from 0.3 s or more before it."""
+
+    rate_hz: float
+    """Samples a second."""
+    angle_rad: Real
+    """Measured angle, shape (n,)."""
+    torque_nm: Real
+    """Measured coupling torque, shape (n,)."""
+    shear_n: Real | None
+    """Measured base shear, shape (n,); None if the profile does not tell it."""
+    detected: int
+    """Index of the sample at which the touch was noticed."""
+
+    def until(self, samples: int) -> "TouchRecord":
+        """Return its first samples.
+
+        Parameters
+        ----------
+        samples
+            How many.
+        """
+        shear = None if self.shear_n is None else self.shear_n[:samples]
+        return TouchRecord(
+            self.rate_hz, self.angle_rad[:samples], self.torque_nm[:samples], shear, self.detected
+        )
+
+
+class FreeBeam:
+    """What of the free motion depends on the model and the record's length only.
+
+    Parameters
+    ----------
+    model
+        The beam.
+    x_m
+        Places where the displacement is wanted, shape (m,).
+    rate_hz
+        Samples a second.
+    samples
+        Most samples of a record.
+    """
+
+    __slots__ = (
+        "_displacement",
+        "_shear",
+        "_torque",
+        "line",
+        "model",
+        "modes",
+        "rate_hz",
+        "x_m",
+    )
+
+    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, samples: int) -> None:
+        from scipy.fft import next_fast_len
+
+        self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
+        n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
+        self.line = Line(n, 1 / (FINER * rate_hz), _BAND)
+        s = self.line.s
+        grid = PointForceGrid(s, model.beam, model.damping)
+        late = np.exp(-s * (model.torque_delay_s - model.angle_delay_s))
+        inertia = model.tool_inertia_kg_m2 * s * s
+        self._torque: Complex = late * (grid.torque_per_angle() + inertia)
+        self._shear: Complex = late * grid.shear_per_angle()
+        self._displacement: Complex = grid.per_angle(x_m).T
+        self.modes = Ringing.of(model, x_m)
+
+    def per_sample(self, place: int, samples: int) -> Real:
+        """Displacement that one sample of the angle makes, in m/rad.
+
+        Parameters
+        ----------
+        place
+            Index of the place.
+        samples
+            How many samples after it are wanted.
+
+        Returns
+        -------
+        ndarray, shape (FINER · (BEFORE + samples),)
+            On the fine steps, from `BEFORE` samples before it on: the spline looks ahead.
+        """
+        unit = np.zeros(3 * BEFORE)
+        unit[BEFORE] = 1.0
+        spectrum = self.line.transformed(_finer(unit, self.rate_hz, self.line)[0])
+        return self.line.in_time(self._displacement[place] * spectrum, FINER * (BEFORE + samples))
+
+    def motion(self, record: TouchRecord, quiet: int, first: int) -> "FreeMotion":
+        """Free motion of one record.
+
+        Parameters
+        ----------
+        record
+            The samples.
+        quiet
+            Number of samples that are certainly before the touch.
+        first
+            Sample from which the displacement is wanted.
+        """
+        n = record.angle_rad.size
+        rate = self.rate_hz
+        angle, start, speed = _finer(record.angle_rad, rate, self.line)
+        spectrum = self.line.transformed(angle)
+        channels = [(record.torque_nm, self._torque)]
+        if record.shear_n is not None:
+            channels.append((record.shear_n, self._shear))
+        t = np.arange(n) / rate
+        late = self.model.torque_delay_s - self.model.angle_delay_s
+        columns = self.modes.channels(t - late)
+        innovations, designs = [], []
+        for i, (measured, transfer) in enumerate(channels):
+            free = self.line.in_time(transfer * spectrum, FINER * n)[::FINER]
+            innovations.append(measured - free)
+            drift = np.zeros((n, 2 * len(channels)))
+            drift[:, 2 * i] = 1.0
+            drift[:, 2 * i + 1] = t - t[quiet // 2]
+            designs.append(np.hstack([columns[i], drift]))
+        fitted = _Fitted.to(innovations, designs, quiet)
+        steps = FINER * n
+        moved = self.line.in_time(self._displacement * spectrum, steps)[:, FINER * first :]
+        fine = np.arange(FINER * first, steps) / (FINER * rate)
+        moved += self.x_m[:, None] * (start + speed * fine)
+        amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
+        moved += self.modes.displacement(fine, amplitudes)
+        return FreeMotion(
+            t=t - self.model.torque_delay_s,
+            innovations=np.array(fitted.innovations),
+            noise=np.array(fitted.noise),
+            design=np.array(designs),
+            spread=np.linalg.cholesky(fitted.covariance).astype(np.float64),
+            ringing=self.modes,
+            angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
+            displacement_m=moved,
+            first_s=first / rate - self.model.angle_delay_s,
+            step_s=1 / (FINER * rate),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FreeMotion:
+    """Innovations of a record, and where the beam would be without a touch."""
+
+    t: Real
+    """Instants that the samples of torque and shear show, shape (n,)."""
+    innovations: Real
+    """Innovations of torque and, if measured, shear, shape (c, n)."""
+    noise: Real
+    """Standard deviation of each channel before the touch, shape (c,)."""
+    design: Real
+    """Columns of what was fitted before the touch, shape (c, n, q)."""
+    spread: Real
+    """Cholesky factor of the covariance of its q amplitudes."""
+    ringing: "Ringing"
+    """The free vibrations among them."""
+    angle_noise_rad: float
+    """Standard deviation of a sample of the angle."""
+    displacement_m: Real
+    """At the places, on fine steps, shape (m, k)."""
+    first_s: float
+    """Instant of the first of them."""
+    step_s: float
+    """Time between two of them."""
+
+
+def _angle_noise(angle: Real) -> float:
+    """Scatter of the samples, encoder steps included: fourth differences show no motion."""
+    return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
+
+
+def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]:
+    """Angle on the steps of the line without the straight motion it begins with, and that."""
+    from scipy.interpolate import CubicSpline
+
+    t = np.arange(angle.size) / rate_hz
+    some = max(4, round(_SPEED_S * rate_hz))
+    curve = np.polyfit(t[:some], angle[:some], 2)
+    start, speed = float(curve[2]), float(curve[1])
+    relative = angle - start - speed * t
+    spline = CubicSpline(t, relative)
+    fine = np.arange(FINER * angle.size) * line.step_s
+    inside = fine[fine <= t[-1]]
+    after = np.arange(1, line.n - inside.size + 1) * line.step_s
+    end = np.polyfit(t[-6:] - t[-1], relative[-6:], 1)[0]
+    ending = relative[-1] + end * _SETTLE_S * (1 - np.exp(-after / _SETTLE_S))
+    fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(after / after[-1], 1.0))
+    return np.concatenate([spline(inside), ending * fade]), start, speed
+
+
+@dataclass(frozen=True, slots=True)
+class Ringing:
+    """Free vibrations of the first modes, as columns of cosines and sines that decay."""
+
+    poles: Complex
+    """Shape (modes,), in rad/s."""
+    root: Complex
+    """Torque and shear per amplitude, shape (2, modes)."""
+    shapes: Real
+    """Displacement at the places per amplitude, shape (modes, places)."""
+
+    @classmethod
+    def of(cls, model: TouchModel, x_m: Real) -> "Ringing":
+        beam, damping = model.beam, model.damping
+        most = 12
+        found = poles(beam, damping, most)[:, 0]
+        count = max(1, int(np.sum(found.imag < 2 * np.pi * _HIGHEST_HZ)))
+        found = found[:count]
+        wave = clamped_free_eigenvalues(count) / beam.length_m
+        z = wave * beam.length_m
+        sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
+        ratio = (np.sinh(z) - np.sin(z)) / (np.cosh(z) + np.cos(z))
+        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * found**damping.alpha)
+        root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
+        shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(count)])
+        # Amplitudes in units that give about the same torque in each mode.
+        scale = 1 / np.abs(root[0])
+        return cls(found.astype(np.complex128), root * scale, shapes * scale[:, None])
+
+    def channels(self, t: Real) -> Real:
+        """Torque and shear, shape (2, t, 2 · modes).
+
+        Parameters
+        ----------
+        t
+            Times from the record's beginning.
+        """
+        swing = np.exp(np.multiply.outer(t, self.poles))
+        parts = [swing * root for root in self.root]
+        return np.array([np.hstack([part.real, -part.imag]) for part in parts])
+
+    def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
+        """At the places, shape (places, t, …).
+
+        Parameters
+        ----------
+        t
+            Times from the record's beginning.
+        amplitudes
+            Amplitudes of cosines and sines, shape (2 · modes, …).
+        """
+        count = self.poles.size
+        swing = np.exp(np.multiply.outer(t, self.poles))
+        moved = np.einsum("tm,mx->xtm", swing, self.shapes)
+        shown: Real = moved.real @ amplitudes[:count] - moved.imag @ amplitudes[count:]
+        return shown
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    values: Real
+    covariance: Real
+    noise: list[float]
+    innovations: list[Real]
+
+    @classmethod
+    def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_Fitted":
+        """Weighted least squares on the quiet samples, weights by the scatter of two rounds."""
+        noise = [1.0] * len(innovations)
+        for _ in range(3):
+            a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
+            b = np.concatenate([e[:quiet] / s for e, s in zip(innovations, noise, strict=True)])
+            normal = a.T @ a
+            ridge = 1e-9 * np.trace(normal) / normal.shape[0]
+            covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+            values = covariance @ (a.T @ b)
+            left = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
+            free = max(quiet - values.size / len(left), quiet / 2)
+            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / free)) for e in left]
+        a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
+        normal = a.T @ a
+        covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+        return cls(values, covariance, noise, left)

@@ -1,0 +1,237 @@
+"""What a force on the beam does in time: displacement, torque and base shear, over the length.
+
+A force is a sum of triangles of unit height, one a step ("hats": it is linear between two steps),
+so that every force history that begins at zero is one; the response to one hat at each of the
+following steps is a kernel. Kernels are inverse Laplace transforms of the exact model, by an FFT
+along a line to the right of the origin: what wraps around is smaller by ``exp(-sigma T)``. By
+reciprocity, torque and shear per force at x are minus the displacement there per angle and per
+displacement of the root.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import Beam, Damping, PointForceGrid
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+WRAPPED = 14.0
+"""``sigma T``: the end of the period wraps around to 1e-6 of itself."""
+
+_OVERSAMPLED = 2
+"""Steps of the inversion in a step of the kernels: above half the step's rate a hat is small."""
+
+_EDGE_M = 0.003
+"""The places begin at this distance from root and tip."""
+
+
+class Line:
+    """Line in the Laplace plane that carries functions of time on ``n`` steps.
+
+    Parameters
+    ----------
+    n
+        Number of steps of the period.
+    step_s
+        Time between two of them.
+    band
+        Share of the frequencies below the Nyquist frequency that are used, the rest being zero.
+    """
+
+    __slots__ = ("_grown", "n", "s", "step_s")
+
+    def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
+        self.n, self.step_s = n, step_s
+        shift = WRAPPED / (n * step_s)
+        kept = round(band * (n // 2)) + 1
+        self.s = shift + 2j * np.pi * np.arange(kept) / (n * step_s)
+        self._grown = np.exp(shift * step_s * np.arange(n))
+
+    def transformed(self, samples: Real) -> Complex:
+        """Return the transform of samples (…, at most n), as of a band-limited function.
+
+        Parameters
+        ----------
+        samples
+            The function at the steps from the first on; zero after them.
+        """
+        from scipy.fft import rfft
+
+        damped = samples / self._grown[: samples.shape[-1]]
+        spectrum: Complex = rfft(damped, self.n, axis=-1)[..., : self.s.size]
+        return spectrum
+
+    def in_time(self, transform: Complex, steps: int) -> Real:
+        """Return the first `steps` samples of what `transformed` would give, along the last axis.
+
+        Parameters
+        ----------
+        transform
+            At the frequencies of the line, last axis.
+        steps
+            How many samples.
+        """
+        from scipy.fft import irfft
+
+        if transform.shape[-1] == self.n // 2 + 1:
+            transform = transform.copy()
+            transform[..., -1] = transform[..., -1].real
+        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._grown[:steps]
+        return samples
+
+
+@dataclass(frozen=True, slots=True)
+class ContactKernels:
+    """Responses to a hat of contact force at places along the beam, on equal steps."""
+
+    x_m: Real
+    """Places, shape (m,)."""
+    step_s: float
+    """Half the width of a hat, and the step of the kernels."""
+    displacement: Real
+    """At the place itself, per N, shape (m, n); the first column is the instant of the peak."""
+    torque: Real
+    """Motor's torque in m, likewise."""
+    shear: Real
+    """Base shear, likewise; per N."""
+
+    @property
+    def steps(self) -> int:
+        """Length of the kernels."""
+        return int(self.displacement.shape[1])
+
+    def at(self, x_m: Real, steps: int) -> "ContactKernels":
+        """Interpolate at other places (cubic, four points).
+
+        Parameters
+        ----------
+        x_m
+            Within the range of the places, shape (k,).
+        steps
+            Length of what is returned.
+        """
+        first, weights = lagrange(x_m, self.x_m)
+        tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
+        return ContactKernels(x_m, self.step_s, *(mixed(t, first, weights) for t in tables))
+
+    def coarser(self, factor: int, steps: int) -> "ContactKernels":
+        """Return the kernels of wider hats.
+
+        Parameters
+        ----------
+        factor
+            Steps of these in one of the wider ones.
+        steps
+            Length of what is returned.
+        """
+        hat = 1 - np.abs(np.arange(1 - factor, factor)) / factor
+        tables = []
+        for table in (self.displacement, self.torque, self.shear):
+            padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
+            # A wide hat that peaks at 0 is narrow ones from 1 - factor to factor - 1.
+            wide = sum(
+                weight
+                * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
+                for i, weight in zip(range(1 - factor, factor), hat, strict=True)
+            )
+            tables.append(np.ascontiguousarray(wide))
+        return ContactKernels(self.x_m, factor * self.step_s, *tables)
+
+
+def contact_kernels(
+    beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
+) -> ContactKernels:
+    """Kernels of the exact model at the places `x_m`.
+
+    Parameters
+    ----------
+    beam, damping
+        Parameters of the exact model.
+    x_m
+        Places along the beam, shape (m,).
+    step_s
+        Time between two values of a kernel.
+    steps
+        Number of values.
+    """
+    from scipy.fft import next_fast_len
+
+    fine = step_s / _OVERSAMPLED
+    n = next_fast_len(2 * _OVERSAMPLED * steps, real=True)
+    line = Line(n, fine)
+    # Two steps later than it acts, so that the hat begins within the period.
+    hat = (2 * (np.cosh(line.s * step_s) - 1) / (step_s * line.s) ** 2) * step_s / fine
+    late = hat * np.exp(-line.s * step_s)
+    grid = PointForceGrid(line.s, beam, damping)
+    stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * line.s**damping.alpha)
+    tables = np.empty((3, x_m.size, steps))
+    for i in range(0, x_m.size, _AT_ONCE):
+        x = x_m[i : i + _AT_ONCE]
+        responses = (
+            grid.per_force(x, x).T,
+            -grid.per_angle(x).T,
+            stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+        )
+        for table, response in zip(tables, responses, strict=True):
+            values = line.in_time(late * response, _OVERSAMPLED * (steps + 1))
+            table[i : i + _AT_ONCE] = values[:, _OVERSAMPLED::_OVERSAMPLED][:, :steps]
+    return ContactKernels(x_m, step_s, *tables)
+
+
+_AT_ONCE = 8
+"""Places evaluated at once: temporaries stay in cache."""
+
+
+def places(length_m: float, spacing_m: float) -> Real:
+    """Places along the beam, equally spaced but for its ends.
+
+    Parameters
+    ----------
+    length_m
+        Length of the beam.
+    spacing_m
+        Greatest distance between two.
+    """
+    n = int(np.ceil((length_m - 2 * _EDGE_M) / spacing_m)) + 1
+    return np.linspace(_EDGE_M, length_m - _EDGE_M, n)
+
+
+def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+    """Cubic interpolation on an equally spaced grid: first of four points, and their weights.
+
+    Parameters
+    ----------
+    at
+        Where, shape (k,).
+    grid
+        At least four increasing points.
+
+    Returns
+    -------
+    first : ndarray of int, shape (k,)
+    weights : ndarray, shape (k, 4)
+    """
+    position = (np.asarray(at) - grid[0]) / (grid[1] - grid[0])
+    first = np.clip(np.floor(position).astype(np.intp) - 1, 0, grid.size - 4)
+    u = position - first
+    weights = np.stack(
+        [
+            -(u - 1) * (u - 2) * (u - 3) / 6,
+            u * (u - 2) * (u - 3) / 2,
+            -u * (u - 1) * (u - 3) / 2,
+            u * (u - 1) * (u - 2) / 6,
+        ],
+        axis=-1,
+    )
+    return first, weights
+
+
+def mixed(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
+    """Rows of a table (m, n), interpolated with what `lagrange` gives; shape (k, n)."""
+    total = weights[:, 0, None] * table[first]
+    for i in range(1, 4):
+        total += weights[:, i, None] * table[first + i]
+    return total

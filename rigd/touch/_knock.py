@@ -1,0 +1,112 @@
+"""A knock from outside: one pulse of force, whatever the antenna does."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.touch._kernels import ContactKernels
+from rigd.touch._physical import Space, Touching, Window
+
+Real = NDArray[np.float64]
+
+_DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+
+
+class Knocking:
+    """Half-sine pulses of force: place, instant, logarithm of the duration, and peak.
+
+    Parameters
+    ----------
+    touching
+        Knows the record's steps.
+    kernels
+        Contact kernels of those steps.
+    every
+        Every so many of their places is a start.
+    """
+
+    __slots__ = ("_every", "_kernels", "_touching")
+
+    def __init__(self, touching: Touching, kernels: ContactKernels, every: int) -> None:
+        self._touching, self._kernels, self._every = touching, kernels, every
+
+    def predicted(self, parameters: Real, window: Window) -> Real:
+        """Effect on the channels, shape (k, c, samples).
+
+        Parameters
+        ----------
+        parameters
+            Rows of place, instant, ln of the duration and peak, shape (k, 4).
+        window
+            Which samples.
+        """
+        motion = window.motion
+        last = motion.t[window.end - 1]
+        steps = int(np.ceil((last - parameters[:, 1].min()) / self._kernels.step_s)) + 3
+        steps = min(steps, self._kernels.steps)
+        local = self._kernels.at(parameters[:, 0], steps)
+        phase = np.arange(steps) * self._kernels.step_s / np.exp(parameters[:, 2:3])
+        force = parameters[:, 3:4] * np.sin(np.pi * np.minimum(phase, 1.0))
+        tables = (local.torque, local.shear)[: motion.noise.size]
+        return self._touching.effects(tables, force, parameters[:, 1], window)
+
+    def starts(self, window: Window, latest: int, count: int) -> Real:
+        """Likeliest candidates of a grid, the peak of each being the best, shape (count, 4).
+
+        Parameters
+        ----------
+        window
+            The samples.
+        latest
+            Last sample at which the knock may begin.
+        count
+            How many.
+        """
+        places = self._kernels.x_m[:: self._every]
+        grid = np.stack(
+            [
+                each.ravel()
+                for each in np.meshgrid(places, np.log(_DURATIONS_S), [1.0], indexing="ij")
+            ],
+            axis=1,
+        )
+        first = window.motion.t[window.first]
+        unit = self.predicted(np.insert(grid, 1, first, axis=1), window)
+        found = []
+        for sample in range(window.first, latest + 1):
+            late = sample - window.first
+            shifted = np.zeros_like(unit)
+            shifted[:, :, late:] = unit[:, :, : unit.shape[2] - late]
+            effect = window.data - window.residuals(shifted)
+            power = np.einsum("kn,kn->k", effect, effect) + 1e-300
+            peak = effect @ window.data / power
+            gain = peak**2 * power
+            rows = np.argsort(-gain)[:count]
+            found.append(
+                np.column_stack(
+                    [
+                        -gain[rows],
+                        grid[rows, 0],
+                        np.full(rows.size, window.motion.t[sample]),
+                        grid[rows, 1],
+                        peak[rows],
+                    ]
+                )
+            )
+        together = np.concatenate(found)
+        return together[np.argsort(together[:, 0])[:count], 1:]
+
+    @staticmethod
+    def space(x_m: tuple[float, float], instants: tuple[float, float]) -> Space:
+        """Ranges of the parameters.
+
+        Parameters
+        ----------
+        x_m, instants
+            Ends of the ranges of place and instant.
+        """
+        return Space(
+            low=np.array([x_m[0], instants[0], np.log(3e-4), -100.0]),
+            high=np.array([x_m[1], instants[1], np.log(0.1), 100.0]),
+            difference=np.array([2e-4, 2e-5, 1e-2, 1e-3]),
+            scale=np.array([3e-3, 1e-3, 0.3, 0.5]),
+        )

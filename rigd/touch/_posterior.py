@@ -1,0 +1,174 @@
+"""What candidates are worth together: population Monte Carlo over place, instant and stiffness.
+
+The likelihood of a bouncing contact is rough, so curvatures at its minima tell too little of it.
+Samples are drawn around the minima, weighted by their likelihood, and drawn again around the best
+of them (adaptive importance sampling with the weights of the deterministic mixture).
+
+References
+----------
+O. Cappé, A. Guillin, J.-M. Marin, C. Robert, Population Monte Carlo, J. Comput. Graph. Stat. 13
+(2004). J.-M. Cornuet et al., Adaptive multiple importance sampling, Scand. J. Stat. 39 (2012).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+
+_FREEDOM = 4.0
+"""Degrees of freedom of the Student distributions that samples are drawn from: heavy tails."""
+_CENTRES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """Weighted samples."""
+
+    samples: Real
+    """Rows of parameters, shape (n, p)."""
+    weights: Real
+    """Adding up to 1, shape (n,)."""
+    chi2: Real
+    """Sum of squared residuals of each."""
+
+    @property
+    def effective(self) -> float:
+        """Number of samples of equal weight that would say as much."""
+        return float(1 / np.sum(self.weights**2))
+
+    def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
+        """Weighted quantiles of a parameter.
+
+        Parameters
+        ----------
+        column
+            Which one.
+        levels
+            Between 0 and 1.
+        """
+        values = self.samples[:, column]
+        order = np.argsort(values)
+        cumulated = np.cumsum(self.weights[order]) - 0.5 * self.weights[order]
+        return np.interp(levels, cumulated, values[order])
+
+    def mean(self, column: int) -> float:
+        """Weighted mean of a parameter.
+
+        Parameters
+        ----------
+        column
+            Which one.
+        """
+        return float(self.weights @ self.samples[:, column])
+
+    def std(self, column: int) -> float:
+        """Weighted standard deviation of a parameter.
+
+        Parameters
+        ----------
+        column
+            Which one.
+        """
+        deviation = self.samples[:, column] - self.mean(column)
+        return float(np.sqrt(self.weights @ deviation**2))
+
+
+def sampled(
+    chi2_of: Callable[[Real], Real],
+    centres: Real,
+    covariances: Real,
+    bounds: tuple[Real, Real],
+    *,
+    scale: float,
+    count: int,
+    rounds: int,
+    enough: float,
+    smallest: Real,
+) -> Posterior:
+    """Draw weighted samples of the posterior, the prior being uniform within the bounds.
+
+    Parameters
+    ----------
+    chi2_of
+        Sum of squared residuals of rows of parameters.
+    centres
+        Minima, shape (k, p).
+    covariances
+        Covariance of each, shape (k, p, p).
+    bounds
+        Low and high end of each parameter.
+    scale
+        Variance of a residual.
+    count
+        Samples in a round.
+    rounds
+        Most rounds.
+    enough
+        Effective number of samples after which no further round is drawn.
+    smallest
+        Least standard deviation that samples are drawn with, shape (p,).
+    """
+    rng = np.random.default_rng(0)  # the same record gives the same answer
+    width = centres.shape[1]
+    low, high = bounds
+    share = np.full(len(centres), 1 / len(centres))
+    samples = np.empty((0, width))
+    chi2 = np.empty(0)
+    density = np.empty(0)
+    proposals: list[tuple[Real, Real, Real]] = []
+    posterior = None
+    for _ in range(rounds):
+        chosen = rng.choice(len(centres), count, p=share)
+        factors = np.linalg.cholesky(covariances)
+        normal = rng.standard_normal((count, width))
+        spread = np.sqrt(_FREEDOM / rng.chisquare(_FREEDOM, count))
+        drawn = centres[chosen] + spread[:, None] * np.einsum("kpq,kq->kp", factors[chosen], normal)
+        inside = np.all((drawn >= low) & (drawn <= high), axis=1)
+        found = np.full(count, np.inf)
+        if inside.any():
+            found[inside] = chi2_of(drawn[inside])
+        proposals.append((centres, covariances, share))
+        density = density + _density(samples, *proposals[-1]) if samples.size else density
+        own = sum(_density(drawn, *each) for each in proposals)
+        samples = np.concatenate([samples, drawn])
+        chi2 = np.concatenate([chi2, found])
+        density = np.concatenate([density, own])
+        logged = -0.5 * (chi2 - chi2.min()) / scale - np.log(density)
+        weights = np.exp(logged - logged.max())
+        weights /= weights.sum()
+        posterior = Posterior(samples, weights, chi2)
+        if posterior.effective > enough and len(proposals) > 1:
+            break
+        # Tempered weights place the next round, so that one lucky sample does not take it all.
+        tempered = weights**0.5
+        tempered /= tempered.sum()
+        best = np.argsort(-tempered)[:_CENTRES]
+        centres, share = samples[best], tempered[best] / tempered[best].sum()
+        mean = tempered @ samples
+        deviation = samples - mean
+        local = np.minimum(
+            np.abs(deviation), 6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest
+        ) * np.sign(deviation)
+        covariance = (local * tempered[:, None]).T @ local
+        shrink = max(len(best), 2) ** (-2 / (width + 4))
+        covariances = np.broadcast_to(
+            shrink * covariance + np.diag(smallest**2), (len(best), width, width)
+        )
+    assert posterior is not None
+    return posterior
+
+
+def _density(samples: Real, centres: Real, covariances: Real, share: Real) -> Real:
+    """Density of a mixture of Student distributions, but for a constant factor."""
+    width = samples.shape[1]
+    total = np.zeros(samples.shape[0])
+    for centre, covariance, weight in zip(centres, covariances, share, strict=True):
+        factor = np.linalg.cholesky(covariance)
+        scaled = np.linalg.solve(factor, (samples - centre).T)
+        distance = np.sum(scaled**2, axis=0)
+        height = weight / np.prod(np.diag(factor))
+        total += height * (1 + distance / _FREEDOM) ** (-(_FREEDOM + width) / 2)
+    return total

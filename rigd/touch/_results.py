@@ -1,0 +1,86 @@
+"""What is told of a touch."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A number and how well it is known."""
+
+    value: float
+    """Its mean."""
+    std: float
+    """Standard deviation."""
+    interval_95: tuple[float, float]
+    """Where it lies in 95 of 100 records."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as a document of JSON types."""
+        return {"value": self.value, "std": self.std, "interval_95": list(self.interval_95)}
+
+
+@dataclass(frozen=True, slots=True)
+class TouchEstimate:
+    """What one touch was."""
+
+    x_m: Estimated | None
+    """Distance of the point from the motor's axis."""
+    time_s: Estimated | None
+    """Instant of the first contact, from the record's first sample."""
+    force_n: Estimated | None
+    """Peak of the contact force's magnitude."""
+    stiffness_n_per_m: Estimated | None
+    """Stiffness of the obstacle."""
+    kind: str
+    """rigid (at rest, springy or not) | yielding | moving | knock | unknown."""
+    model: str
+    """Where the model of the beam came from."""
+    channels: int
+    """1: torque alone; 2: with base shear."""
+    samples: int
+    """How many samples after the detection it rests on."""
+    chi2_per_degree: float
+    """Sum of squared residuals by what noise would leave: about 1 if explained."""
+    places_m: Real
+    """Places of the likelihood, shape (m,)."""
+    log_likelihood: Real
+    """Value at each place whatever the force, shape (m,)."""
+    innovations: Real
+    """Innovations of torque and shear in standard deviations, shape (channels, n)."""
+    innovation_times_s: Real
+    """Their instants, from the record's first sample, shape (n,)."""
+    force_history_n: Real
+    """Magnitude of the contact force, shape (k,)."""
+    force_times_s: Real
+    """Its instants, shape (k,)."""
+
+    def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
+        """Return it as a document of JSON types.
+
+        Parameters
+        ----------
+        start_s
+            Time of the record's first sample, which is added to the instant of touch.
+        """
+        time = self.time_s
+        if time is not None:
+            low, high = time.interval_95
+            time = replace(
+                time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
+            )
+        told = {
+            "x_m": self.x_m,
+            "time_s": time,
+            "force_n": self.force_n,
+            "stiffness_n_per_m": self.stiffness_n_per_m,
+        }
+        return {name: each and each.as_dict() for name, each in told.items()} | {
+            "kind": self.kind,
+            "model": self.model,
+        }

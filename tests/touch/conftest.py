@@ -1,0 +1,41 @@
+"""Records of touches, simulated once."""
+
+import pytest
+from struck_beam import OBSTACLES
+from touch_records import DAMPED, LINK, Slew, simulate
+
+from rigd.touch import TouchEstimator, TouchModel
+
+
+@pytest.fixture(scope="session")
+def struck():
+    """Name → record of one second or so, and the truth."""
+    records = simulate(
+        list(OBSTACLES.values()),
+        [Slew(1.0)] * len(OBSTACLES),
+        duration_s=0.8,
+        steps=40,
+        modes=20,
+        seed=4,
+    )
+    return dict(zip(OBSTACLES, records, strict=True))
+
+
+@pytest.fixture(scope="session")
+def model():
+    """The beam of the records, known well but not exactly."""
+    return TouchModel(
+        LINK,
+        DAMPED,
+        std={
+            "bending_stiffness_n_m2": 5e-4 * LINK.bending_stiffness_n_m2,
+            "density_over_stiffness": 2e-4 * LINK.density_over_stiffness,
+            "zeta": 0.05 * DAMPED.zeta,
+        },
+    )
+
+
+@pytest.fixture(scope="session")
+def estimator(model):
+    """Return an estimator for all records."""
+    return TouchEstimator(model, 1000.0)

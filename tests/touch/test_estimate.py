@@ -1,0 +1,96 @@
+"""Estimates of simulated touches: within a millimetre or two, and within their intervals."""
+
+import json
+
+import numpy as np
+import pytest
+from struck_beam import OBSTACLES, begin_s, cut
+
+from rigd.touch import TouchRecord, estimate_touch
+
+AT_REST = ["soft", "middle", "hard"]
+
+
+@pytest.fixture(scope="module")
+def told(estimator, struck):
+    """Name → estimate from 0.1 s after the detection."""
+    return {name: estimator.estimate(cut(each, 100)) for name, each in struck.items()}
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_point_instant_and_force_of_an_obstacle_at_rest(told, struck, name):
+    estimate, truth = told[name], struck[name]
+    assert estimate.kind == "rigid"
+    assert estimate.x_m.value == pytest.approx(OBSTACLES[name].x_m, abs=3e-3)
+    assert abs(estimate.x_m.value - OBSTACLES[name].x_m) < 4 * estimate.x_m.std
+    assert 1e-4 < estimate.x_m.std < 3e-3
+    touch = estimate.time_s.value + begin_s(truth)
+    assert touch == pytest.approx(truth.touch_s, abs=5e-4)
+    assert estimate.force_n.value == pytest.approx(truth.peak_n, rel=0.35)
+    low, high = estimate.stiffness_n_per_m.interval_95
+    assert low < OBSTACLES[name].stiffness_n_per_m < high
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_first_answer_after_50_ms(estimator, struck, name):
+    estimate = estimator.estimate(cut(struck[name], 50))
+    assert estimate.samples == 50
+    assert estimate.x_m.value == pytest.approx(OBSTACLES[name].x_m, abs=0.01)
+
+
+def test_torque_alone_tells_less(estimator, told, struck):
+    alone = estimator.estimate(cut(struck["middle"], 100, shear=False))
+    assert alone.channels == 1
+    assert alone.x_m.value == pytest.approx(OBSTACLES["middle"].x_m, abs=8e-3)
+    assert alone.x_m.std > told["middle"].x_m.std
+
+
+@pytest.mark.parametrize("name", ["fleeing", "knock"])
+def test_what_is_no_obstacle_at_rest_is_not_called_one(told, name):
+    estimate = told[name]
+    assert estimate.kind in ({"fleeing": "moving", "knock": "knock"}[name], "unknown")
+    if estimate.x_m is not None:
+        low, high = estimate.x_m.interval_95
+        assert low - 2e-3 < OBSTACLES[name].x_m < high + 2e-3
+
+
+def test_the_same_record_gives_the_same_answer(estimator, told, struck):
+    again = estimator.estimate(cut(struck["soft"], 100))
+    assert again.as_dict() == told["soft"].as_dict()
+
+
+def test_a_document_of_json_types(told):
+    document = json.loads(json.dumps(told["middle"].as_dict(start_s=2.0)))
+    assert set(document) == {"x_m", "time_s", "force_n", "stiffness_n_per_m", "kind", "model"}
+    assert document["model"] == "profile"
+    assert set(document["x_m"]) == {"value", "std", "interval_95"}
+    assert document["time_s"]["value"] == pytest.approx(told["middle"].time_s.value + 2.0)
+
+
+def test_force_history_peaks_at_the_force_told(told):
+    estimate = told["soft"]
+    assert estimate.force_history_n.shape == estimate.force_times_s.shape
+    assert estimate.force_history_n.max() == pytest.approx(estimate.force_n.value, rel=0.2)
+    assert estimate.force_times_s[0] == pytest.approx(estimate.time_s.value, abs=1e-3)
+
+
+def test_innovations_are_noise_before_the_touch(told):
+    for estimate in told.values():
+        before = estimate.innovations[:, :380]
+        assert np.std(before, axis=1) == pytest.approx([1.0, 1.0], abs=0.12)
+
+
+def test_without_samples_before_the_touch_nothing_is_told(estimator, struck):
+    record = cut(struck["middle"], 60)
+    late = slice(340, None)
+    short = TouchRecord(
+        1000.0, record.angle_rad[late], record.torque_nm[late], record.shear_n[late], 60
+    )
+    estimate = estimator.estimate(short)
+    assert (estimate.x_m, estimate.kind) == (None, "unknown")
+
+
+@pytest.mark.slow
+def test_once_is_the_same_as_prepared(model, struck, told):
+    estimate = estimate_touch(cut(struck["hard"], 100), model)
+    assert estimate.x_m == told["hard"].x_m

@@ -1,0 +1,86 @@
+"""Contact kernels against closed forms and sums of modes."""
+
+import numpy as np
+import pytest
+from touch_records import DAMPED, LINK
+
+from rigd.beam import Damping, clamped_free_eigenvalues, mode_shape
+from rigd.touch._kernels import Line, contact_kernels, lagrange, places
+
+STEP_S = 1 / 8000
+
+
+@pytest.fixture(scope="module")
+def kernels():
+    return contact_kernels(LINK, DAMPED, places(LINK.length_m, 0.007), STEP_S, 400)
+
+
+@pytest.fixture(scope="module")
+def at_point():
+    return contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400)
+
+
+def ramp_response(poles, t):
+    """Inverse Laplace transform of ``1 / (s² (s - p) (s - q))``."""
+    p, q = poles
+    t = np.maximum(t, 0)
+    slow = t / (p * q) + (p + q) / (p * q) ** 2
+    return (slow + np.exp(p * t) / (p**2 * (p - q)) + np.exp(q * t) / (q**2 * (q - p))).real
+
+
+def test_displacement_is_the_sum_of_the_modes(at_point):
+    count = 60
+    z = clamped_free_eigenvalues(count)
+    shape = np.array([float(mode_shape(i + 1, 0.62 / LINK.length_m)) for i in range(count)])
+    stiffness = (z / LINK.length_m) ** 4 / LINK.density_over_stiffness
+    drag = DAMPED.gamma / LINK.density_over_stiffness + DAMPED.zeta * stiffness
+    t = np.arange(400) * STEP_S
+    total = np.zeros(400)
+    for i in range(count):
+        poles = np.roots([1, drag[i], stiffness[i]]).astype(complex)
+        hat = sum(
+            weight * ramp_response(poles, t + shift) * (t + shift > 0)
+            for weight, shift in ((1, STEP_S), (-2, 0), (1, -STEP_S))
+        )
+        total += shape[i] ** 2 / (LINK.density_kg_per_m * LINK.length_m) * hat / STEP_S
+    assert np.abs(total - at_point.displacement[0]).max() < 3e-4 * np.abs(total).max()
+
+
+def test_a_force_that_stays_is_carried_by_the_root_at_last():
+    damped = Damping(zeta=0.02, alpha=1.0)
+    kernels = contact_kernels(LINK, damped, np.array([0.4]), 2.5e-4, 16000)
+    static = {name: getattr(kernels, name)[0].sum() for name in ("torque", "shear", "displacement")}
+    assert static["shear"] == pytest.approx(-1.0, abs=2e-3)
+    assert static["torque"] == pytest.approx(-0.4, abs=2e-3)
+    compliance = 0.4**3 / (3 * LINK.bending_stiffness_n_m2)
+    assert static["displacement"] == pytest.approx(compliance, rel=5e-3)
+
+
+def test_between_places_kernels_are_interpolated(kernels, at_point):
+    between = kernels.at(np.array([0.62]), 400)
+    for name in ("displacement", "torque", "shear"):
+        exact = getattr(at_point, name)
+        assert np.abs(getattr(between, name) - exact).max() < 1e-4 * np.abs(exact).max()
+
+
+def test_wider_hats_are_sums_of_narrow_ones(at_point):
+    wide = contact_kernels(LINK, DAMPED, np.array([0.62]), 4 * STEP_S, 90)
+    summed = at_point.coarser(4, 90)
+    for name in ("displacement", "torque", "shear"):
+        exact = getattr(wide, name)
+        assert np.abs(getattr(summed, name) - exact).max() < 2e-4 * np.abs(exact).max()
+
+
+def test_a_line_gives_back_what_it_was_given():
+    line = Line(4096, 1e-3)
+    t = np.arange(1000) * 1e-3
+    wave = np.exp(-((t - 0.5) ** 2) / 2e-3)
+    assert line.in_time(line.transformed(wave), 1000) == pytest.approx(wave, abs=1e-6)
+
+
+def test_cubic_interpolation_is_exact_for_cubics():
+    grid = np.linspace(0.1, 0.9, 9)
+    at = np.array([0.1, 0.23, 0.5, 0.88, 0.9])
+    first, weights = lagrange(at, grid)
+    values = sum(weights[:, i] * (grid[first + i] ** 3 - grid[first + i]) for i in range(4))
+    assert values == pytest.approx(at**3 - at)

@@ -1,0 +1,80 @@
+"""Models of the beam: from an analysis, from a profile, and changed in one parameter."""
+
+import json
+
+import pytest
+
+from rigd.beam import Beam, Damping
+from rigd.touch import TouchModel
+
+LENGTH_M = 0.98
+
+
+def quantity(value, std=None, interval=None):
+    return {"value": value, "std": std, "interval_95": interval, "flag": None}
+
+
+PARAMETERS = {
+    "zeta": quantity(7e-5, 1e-6, [6.6e-5, 7.4e-5]),
+    "alpha": quantity(0.99, 0.01, None),
+    "gamma": quantity(0.05, 0.01, [0.03, 0.07]),
+    "lambda": quantity(0.6, None, None),
+    "density_over_stiffness": quantity(0.052, 5e-6, [0.05199, 0.05201]),
+    "bending_stiffness_n_m2": quantity(0.09, 1e-4, [0.0898, 0.0902]),
+    "delay_s": quantity(2e-4, 1e-6, [1.98e-4, 2.02e-4]),
+    "tool_inertia_kg_m2": quantity(1e-5, 0.0, None),
+}
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Write a document with these headlines."""
+
+    def write(*headlines):
+        path = tmp_path / "model.json"
+        path.write_text(json.dumps({"headlines": list(headlines)}))
+        return path
+
+    return write
+
+
+def test_an_analysis_is_read(written):
+    path = written({"file": "a.mcap", "parameters": PARAMETERS})
+    model = TouchModel.from_analysis(path, length_m=LENGTH_M, angle_delay_s=1e-4)
+    assert model.beam == Beam(LENGTH_M, 0.052 * 0.09, 0.09)
+    assert model.damping == Damping(zeta=7e-5, alpha=0.99, gamma=0.05, lambda_=0.6)
+    assert model.tool_inertia_kg_m2 == 1e-5
+    assert model.torque_delay_s == pytest.approx(3e-4)  # older than the angle, by delay_s
+    assert model.source == str(path)
+    assert model.std["bending_stiffness_n_m2"] == pytest.approx(4e-4 / 3.919928)
+    assert model.std["alpha"] == 0.01
+    assert "lambda" not in model.std
+    assert "tool_inertia_kg_m2" not in model.std
+
+
+def test_what_a_structure_does_not_have_is_absent(written):
+    few = {name: PARAMETERS[name] for name in ("density_over_stiffness", "bending_stiffness_n_m2")}
+    model = TouchModel.from_analysis(
+        written({"file": "a.mcap", "parameters": few}),
+        length_m=LENGTH_M,
+        torque_delay_s=5e-4,
+        tool_inertia_kg_m2=2e-5,
+    )
+    assert model.damping == Damping()
+    assert (model.torque_delay_s, model.tool_inertia_kg_m2) == (5e-4, 2e-5)
+
+
+def test_changes_leave_the_rest():
+    model = TouchModel.assumed(Beam(LENGTH_M, 4.7e-3, 0.09), Damping(zeta=7e-5, gamma=0.05))
+    stiffer = model.changed("bending_stiffness_n_m2", 0.009)
+    assert stiffer.beam.bending_stiffness_n_m2 == pytest.approx(0.099)
+    assert stiffer.beam.density_over_stiffness == pytest.approx(model.beam.density_over_stiffness)
+    heavier = model.changed("density_over_stiffness", 0.01 * model.beam.density_over_stiffness)
+    assert heavier.beam.density_kg_per_m == pytest.approx(1.01 * 4.7e-3)
+    assert heavier.beam.bending_stiffness_n_m2 == 0.09
+    assert model.changed("zeta", -1.0).damping.zeta == 0.0
+    assert model.changed("alpha", 0.2).damping.alpha == pytest.approx(1.2)
+    assert model.changed("delay_s", 1e-4).torque_delay_s == pytest.approx(1e-4)
+    assert set(model.std) == {"bending_stiffness_n_m2", "density_over_stiffness", "zeta", "gamma"}
+    with pytest.raises(ValueError, match="is not one of"):
+        model.changed("length", 0.1)
