@@ -5,15 +5,18 @@ from ._format import SAMPLE_SIZE as SAMPLE_SIZE
 from ._format import SAMPLE_TYPES as SAMPLE_TYPES
 from ._format import SAMPLE_WIRE_DTYPE as SAMPLE_WIRE_DTYPE
 from ._format import TIMING_SIZE as TIMING_SIZE
+from ._format import TOUCH_KINDS as TOUCH_KINDS
 from ._format import SessionError as SessionError
 from ._format import SessionExistsError as SessionExistsError
 from ._format import Status as Status
 from ._format import decode_samples as decode_samples
 from ._format import decode_timings as decode_timings
+from ._format import decode_touches as decode_touches
 from ._format import field_tag as field_tag
 from ._format import pack_control_into as pack_control_into
 from ._format import pack_sample_into as pack_sample_into
 from ._format import pack_timing_into as pack_timing_into
+from ._format import pack_touch as pack_touch
 from ._info import SessionInfo as SessionInfo
 from ._info import describe as describe
 from ._info import readable_texts as readable_texts
@@ -29,6 +32,7 @@ from ._reader import check_beginning as check_beginning
 from ._reader import read_controls as read_controls
 from ._reader import read_session as read_session
 from ._reader import read_timings as read_timings
+from ._reader import read_touches as read_touches
 from ._recovery import Recovery as Recovery
 from ._recovery import holds_samples as holds_samples
 from ._recovery import recover as recover
@@ -39,6 +43,9 @@ from ._schema import message_class as message_class
 from ._schema import schema_data as schema_data
 from ._summary import SessionSummary as SessionSummary
 from ._summary import read_summary as read_summary
+from ._touches import packed_touches as packed_touches
+from ._touches import touch_line as touch_line
+from ._touches import touches_of as touches_of
 from ._user_metadata import META_PREFIX as META_PREFIX
 from ._user_metadata import NOTES as NOTES
 from ._user_metadata import MetadataError as MetadataError

@@ -1,10 +1,10 @@
 """Byte layout of a session file's messages, and the errors of session files.
 
-Every message of ``/rig/sample``, ``/rig/control`` and ``/rig/timing`` is protobuf of *fixed
-layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below,
-and all are written, zero or not. Tags are then constant bytes and every message is equally long, so
-one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and any
-protobuf decoder still understands it.
+Every message of ``/rig/sample``, ``/rig/control``, ``/rig/timing`` and ``/rig/touch`` is protobuf
+of *fixed layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the
+order below, and all are written, zero or not. Tags are then constant bytes and every message is
+equally long, so one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of
+them, and any protobuf decoder still understands it.
 
 The control process packs with this module, which therefore imports numpy and the standard library
 only.
@@ -73,6 +73,22 @@ TIMING_TYPES: Final[dict[str, str]] = {
 }
 """Fields of ``rigd.Timing`` with their protobuf types; the first has number 1."""
 
+TOUCH_TYPES: Final[dict[str, str]] = {
+    "t_ns": "sfixed64",
+    "tick": "fixed32",
+    "x_m": "double",
+    "x_std_m": "double",
+    "force_n": "double",
+    "force_std_n": "double",
+    "stiffness_n_per_m": "double",
+    "stiffness_std_n_per_m": "double",
+    "kind": "fixed32",
+}
+"""Fields of ``rigd.Touch`` with their protobuf types; the first has number 1."""
+
+TOUCH_KINDS: Final = ("unknown", "rigid", "yielding", "moving", "knock")
+"""Names of the values 0…4 of its field ``kind``."""
+
 _NUMPY_TYPES: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
 _WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protobuf encoding
 
@@ -98,6 +114,8 @@ class Status(IntFlag):
     """The drive exerts no torque."""
     LATE = 256
     """The tick woke late."""
+    TOUCHED = 512
+    """The loop detected in this tick that the beam has met something."""
 
 
 def field_tag(number: int, protobuf_type: str) -> int:
@@ -151,6 +169,13 @@ TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
 """A timing message as it stands in the file: each field after its tag byte ``tag_NAME``."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
+
+TOUCH_FIELDS: Final = tuple(TOUCH_TYPES)
+TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
+"""A decoded touch."""
+TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
+"""A touch as it stands in the file: each field after its tag byte ``tag_NAME``."""
+TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
 
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
 _pack_control: Final = struct.Struct("<Bq BI" + "Bd" * 6).pack_into
@@ -293,13 +318,53 @@ def pack_timing_into(
     _pack_timing(buffer, offset, 0x09, t_ns, 0x15, tick, 0x19, angle_age_s, 0x21, wrench_age_s)
 
 
+def pack_touch(
+    t_ns: int,
+    tick: int,
+    x_m: float,
+    x_std_m: float,
+    force_n: float,
+    force_std_n: float,
+    stiffness_n_per_m: float,
+    stiffness_std_n_per_m: float,
+    kind: str,
+) -> bytes:
+    """Return one message of a touch, of ``TOUCH_SIZE`` bytes.
+
+    Parameters
+    ----------
+    t_ns
+        Time of the first contact since the session's start.
+    tick
+        Tick in which the loop detected it.
+    x_m, x_std_m
+        Distance of the point from the motor's axis and its standard deviation; NaN, as what
+        follows, where it is not known.
+    force_n, force_std_n
+        Peak of the contact force's magnitude.
+    stiffness_n_per_m, stiffness_std_n_per_m
+        Stiffness of the obstacle.
+    kind
+        One of ``TOUCH_KINDS``; any other counts as unknown.
+    """
+    values = (
+        t_ns, tick, x_m, x_std_m, force_n, force_std_n, stiffness_n_per_m, stiffness_std_n_per_m,
+        TOUCH_KINDS.index(kind) if kind in TOUCH_KINDS else 0,
+    )  # fmt: skip
+    wire = np.zeros(1, TOUCH_WIRE_DTYPE)
+    for number, (name, value) in enumerate(zip(TOUCH_FIELDS, values, strict=True), start=1):
+        wire[f"tag_{name}"] = field_tag(number, TOUCH_TYPES[name])
+        wire[name] = value
+    return wire.tobytes()
+
+
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
     """Tell which messages have every tag of the fixed layout in its place.
 
     Parameters
     ----------
     wire : array (n,) of a wire dtype
-    types : ``SAMPLE_TYPES``, ``CONTROL_TYPES`` or ``TIMING_TYPES``
+    types : of its fields, such as ``SAMPLE_TYPES``
 
     Returns
     -------
@@ -375,3 +440,8 @@ def decode_controls(block: Buffer) -> npt.NDArray[np.void]:
 def decode_timings(block: Buffer) -> npt.NDArray[np.void]:
     """Decode consecutive timing messages of the fixed layout, as `decode_samples` does."""
     return _decode(block, TIMING_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)
+
+
+def decode_touches(block: Buffer) -> npt.NDArray[np.void]:
+    """Decode consecutive messages of touches of the fixed layout, as `decode_samples` does."""
+    return _decode(block, TOUCH_TYPES, TOUCH_WIRE_DTYPE, TOUCH_DTYPE)

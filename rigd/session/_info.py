@@ -14,6 +14,7 @@ import numpy as np
 from rigd.printable import counts_text, grouped, printable
 from rigd.session._format import SessionError, Status
 from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
+from rigd.session._touches import touch_line, touches_of
 from rigd.units import suffix_of, unit_of
 
 _RECOVERED: Final = "recovered_"
@@ -284,13 +285,15 @@ def _utc(utc_ns: int) -> datetime:
 
 
 def _outcome(outcome: dict[str, str]) -> Iterator[tuple[str, str]]:
-    told = {"outcome", "reason", *(_RECOVERED + key for key in _recovery(outcome))}
+    told = {"outcome", "reason", "touches", *(_RECOVERED + key for key in _recovery(outcome))}
     text = outcome.get("outcome", "unknown").capitalize()
     with suppress(KeyError, ValueError):  # of another program, or of a recovery
         text += f": {counts_text(outcome)}"
         told |= _COUNTS
     reason = outcome.get("reason")
     yield "outcome", f"{text}. {reason}" if reason else text
+    for touch in touches_of(outcome):
+        yield "touch", touch_line(touch).removeprefix("Touch ")
     yield from (_rounded(key, value) for key, value in outcome.items() if key not in told and value)
 
 

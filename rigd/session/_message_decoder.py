@@ -1,4 +1,4 @@
-"""Decoder of messages: samples, controls and timings as arrays, from any writer.
+"""Decoder of messages: samples, controls, timings and touches as arrays, from any writer.
 
 Messages of the fixed layout (`rigd.session._format`) are taken as they are. Any other protobuf
 library may put the fields in another order, leave out zeros, number or type them differently: the
@@ -24,6 +24,9 @@ from rigd.session._format import (
     TIMING_DTYPE,
     TIMING_TYPES,
     TIMING_WIRE_DTYPE,
+    TOUCH_DTYPE,
+    TOUCH_TYPES,
+    TOUCH_WIRE_DTYPE,
     Buffer,
     SessionError,
     is_fixed_layout,
@@ -38,6 +41,8 @@ from rigd.session._schema import (
     SAMPLE_TOPIC,
     TIMING_SCHEMA,
     TIMING_TOPIC,
+    TOUCH_SCHEMA,
+    TOUCH_TOPIC,
     message_class,
     schema_data,
 )
@@ -118,6 +123,15 @@ TIMINGS: Final = Layout(
     ("t_ns", "tick"),
     _record_dtype(TIMING_WIRE_DTYPE),
     TIMING_DTYPE,
+)
+
+TOUCHES: Final = Layout(
+    TOUCH_TOPIC,
+    TOUCH_SCHEMA,
+    TOUCH_TYPES,
+    ("t_ns", "tick"),
+    _record_dtype(TOUCH_WIRE_DTYPE),
+    TOUCH_DTYPE,
 )
 
 # Declared type → how to take it where the array has that type, if no value can be lost by it.

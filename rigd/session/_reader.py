@@ -23,6 +23,7 @@ from rigd.session._message_decoder import (
     MAX_CHANNELS,
     SAMPLES,
     TIMINGS,
+    TOUCHES,
     Layout,
     MessageDecoder,
     class_of_channel,
@@ -218,6 +219,21 @@ def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
         As `read_session` does.
     """
     return _read_topic(Path(path), CONTROLS)
+
+
+def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
+    """Read the estimated touches of a session file.
+
+    Returns
+    -------
+    array (n,) of ``TOUCH_DTYPE``; empty if the file has none
+
+    Raises
+    ------
+    SessionError
+        As `read_session` does.
+    """
+    return _read_topic(Path(path), TOUCHES)
 
 
 def _read_topic(path: Path, layout: Layout) -> npt.NDArray[np.void]:

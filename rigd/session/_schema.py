@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
-from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES
+from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES, TOUCH_TYPES
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -19,13 +19,15 @@ FORMAT_VERSION: Final = "1"
 SAMPLE_TOPIC: Final = "/rig/sample"
 CONTROL_TOPIC: Final = "/rig/control"
 TIMING_TOPIC: Final = "/rig/timing"
+TOUCH_TOPIC: Final = "/rig/touch"
 EVENT_TOPIC: Final = "/rig/event"
 
-OWN_TOPICS: Final = (SAMPLE_TOPIC, CONTROL_TOPIC, TIMING_TOPIC, EVENT_TOPIC)
+OWN_TOPICS: Final = (SAMPLE_TOPIC, CONTROL_TOPIC, TIMING_TOPIC, EVENT_TOPIC, TOUCH_TOPIC)
 
 SAMPLE_SCHEMA: Final = "rigd.Sample"
 CONTROL_SCHEMA: Final = "rigd.Control"
 TIMING_SCHEMA: Final = "rigd.Timing"
+TOUCH_SCHEMA: Final = "rigd.Touch"
 EVENT_SCHEMA: Final = "foxglove.Log"
 
 MAX_SCHEMA_BYTES: Final = 1 << 17
@@ -88,7 +90,7 @@ def _event_file() -> "FileDescriptorProto":
 
 @cache
 def schema_data(schema_name: str) -> bytes:
-    """Return the serialised ``FileDescriptorSet`` of one of the four schemas of a session file."""
+    """Return the serialised ``FileDescriptorSet`` of one of the schemas of a session file."""
     from google.protobuf import timestamp_pb2
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
@@ -101,6 +103,7 @@ def schema_data(schema_name: str) -> bytes:
             SAMPLE_SCHEMA: SAMPLE_TYPES,
             CONTROL_SCHEMA: CONTROL_TYPES,
             TIMING_SCHEMA: TIMING_TYPES,
+            TOUCH_SCHEMA: TOUCH_TYPES,
         }[schema_name]
         files = [_fixed_layout_file(schema_name, types)]
     return FileDescriptorSet(file=files).SerializeToString(deterministic=True)

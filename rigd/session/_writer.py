@@ -26,6 +26,8 @@ from rigd.session._format import (
     SAMPLE_WIRE_DTYPE,
     TIMING_SIZE,
     TIMING_WIRE_DTYPE,
+    TOUCH_SIZE,
+    TOUCH_WIRE_DTYPE,
     Buffer,
     SessionError,
     SessionExistsError,
@@ -42,6 +44,8 @@ from rigd.session._schema import (
     SAMPLE_TOPIC,
     TIMING_SCHEMA,
     TIMING_TOPIC,
+    TOUCH_SCHEMA,
+    TOUCH_TOPIC,
     event_class,
     protected_metadata,
     schema_data,
@@ -76,6 +80,7 @@ _CHANNELS: Final = {
     CONTROL_TOPIC: (2, CONTROL_SCHEMA),
     TIMING_TOPIC: (3, TIMING_SCHEMA),
     EVENT_TOPIC: (4, EVENT_SCHEMA),
+    TOUCH_TOPIC: (5, TOUCH_SCHEMA),
 }
 """Topic → the channel's number in the file and the name of its schema."""
 
@@ -107,6 +112,7 @@ class SessionWriter:
         self._samples = bytearray()
         self._controls = bytearray()
         self._timings = bytearray()
+        self._touches = bytearray()
         self._chunk_samples = CHUNK_SAMPLES
         self._events: list[tuple[int, bytes]] = []  # log_time, message
         self._event_count = 0
@@ -211,6 +217,10 @@ class SessionWriter:
         self._timings += self._checked(block, TIMING_SIZE)
         with self._explained():
             self._sync_when_due()
+
+    def write_touches(self, block: Buffer) -> None:
+        """Take n × ``TOUCH_SIZE`` bytes of packed touches, which go with the chunk in progress."""
+        self._touches += self._checked(block, TOUCH_SIZE)
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
         """Record an event in the file.
@@ -376,6 +386,7 @@ class SessionWriter:
             (SAMPLE_TOPIC, samples),
             (CONTROL_TOPIC, controls),
             (TIMING_TOPIC, timings),
+            (TOUCH_TOPIC, np.frombuffer(self._touches, TOUCH_WIRE_DTYPE)),
         ):
             if len(wire):
                 channel, _ = _CHANNELS[topic]
@@ -397,6 +408,7 @@ class SessionWriter:
         self._samples = bytearray()
         self._controls = self._controls[controls.nbytes :]
         self._timings = self._timings[timings.nbytes :]
+        self._touches = bytearray()
         self._events = []
 
     def _sync_when_due(self) -> None:

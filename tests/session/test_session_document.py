@@ -10,7 +10,15 @@ import pytest
 
 from rigd.session import Status, read_session
 from rigd.session import _message_decoder as message_decoder
-from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
+from rigd.session._format import (
+    CONTROL_TYPES,
+    SAMPLE_TYPES,
+    SAMPLE_WIRE_DTYPE,
+    TOUCH_KINDS,
+    TOUCH_SIZE,
+    TOUCH_TYPES,
+    field_tag,
+)
 from rigd.session._mcap_limits import (
     MAX_CHUNK_BYTES,
     MAX_DECLARED_BYTES,
@@ -29,7 +37,8 @@ DOCUMENT = (Path(__file__).parents[2] / "docs" / "session_format.md").read_text(
 
 
 @pytest.mark.parametrize(
-    ("message", "types"), [("Sample", SAMPLE_TYPES), ("Control", CONTROL_TYPES)]
+    ("message", "types"),
+    [("Sample", SAMPLE_TYPES), ("Control", CONTROL_TYPES), ("Touch", TOUCH_TYPES)],
 )
 def test_the_proto_text_is_the_layout(message, types):
     (body,) = re.findall(rf"message {message} {{(.*?)}}", DOCUMENT, re.DOTALL)
@@ -37,6 +46,12 @@ def test_the_proto_text_is_the_layout(message, types):
     assert [(name, kind, int(n)) for kind, name, n in fields] == [
         (name, kind, n) for n, (name, kind) in enumerate(types.items(), start=1)
     ]
+
+
+def test_the_kinds_of_a_touch_are_those_of_the_code():
+    (kinds,) = re.findall(r"kind = 9;\s*// (.*)", DOCUMENT)
+    assert kinds == ", ".join(f"{n} {name}" for n, name in enumerate(TOUCH_KINDS))
+    assert f"({TOUCH_SIZE} bytes), written at the end" in DOCUMENT
 
 
 def test_the_tags_and_sizes_are_those_of_the_layout():

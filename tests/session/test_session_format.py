@@ -18,19 +18,25 @@ from rigd.session._format import (
     SAMPLE_WIRE_DTYPE,
     TIMING_FIELDS,
     TIMING_SIZE,
+    TOUCH_FIELDS,
+    TOUCH_KINDS,
+    TOUCH_SIZE,
     Status,
     decode_controls,
     decode_samples,
     decode_timings,
+    decode_touches,
     is_fixed_layout,
     pack_control_into,
     pack_sample_into,
     pack_timing_into,
+    pack_touch,
 )
 from rigd.session._schema import (
     CONTROL_SCHEMA,
     SAMPLE_SCHEMA,
     TIMING_SCHEMA,
+    TOUCH_SCHEMA,
     message_class,
     schema_data,
 )
@@ -41,6 +47,7 @@ DOUBLE = st.floats()
 SAMPLES = st.tuples(INT64, UINT32, *[DOUBLE] * 10, UINT32, UINT32, UINT32)
 CONTROLS = st.tuples(INT64, UINT32, *[DOUBLE] * 6)
 TIMINGS = st.tuples(INT64, UINT32, DOUBLE, DOUBLE)
+TOUCHES = st.tuples(INT64, UINT32, *[DOUBLE] * 6, st.sampled_from(TOUCH_KINDS))
 
 
 def same(left, right):
@@ -66,7 +73,21 @@ def test_sizes_and_fields_of_the_format():
         "lateness_ns", "work_ns",
     )  # fmt: skip
     assert SAMPLE_DTYPE.names == SAMPLE_FIELDS
-    assert [flag.value for flag in Status] == [1 << bit for bit in range(9)]
+    assert [flag.value for flag in Status] == [1 << bit for bit in range(len(Status))]
+    assert TOUCH_SIZE == 73
+
+
+@given(TOUCHES)
+def test_a_packed_touch_is_decoded_by_protobuf_and_by_numpy(values):
+    data = pack_touch(*values)
+    expected = (*values[:-1], TOUCH_KINDS.index(values[-1]))
+    assert len(data) == TOUCH_SIZE
+    assert all(map(same, protobuf_fields(TOUCH_SCHEMA, data, TOUCH_FIELDS), expected))
+    assert all(map(same, decode_touches(data)[0].item(), expected))
+
+
+def test_a_touch_of_an_unheard_kind_is_unknown():
+    assert decode_touches(pack_touch(1, 2, *[0.0] * 6, "bite"))["kind"] == 0
 
 
 @given(SAMPLES)

@@ -44,7 +44,13 @@ def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
     assert event.timestamp.ToNanoseconds() == record.log_time == kit.START_UTC_NS - 5_000_000
     counts = {summary.channels[i].topic: n for i, n in
               summary.statistics.channel_message_counts.items()}  # fmt: skip
-    assert counts == {"/rig/sample": 1111, "/rig/control": 112, "/rig/timing": 0, "/rig/event": 2}
+    assert counts == {
+        "/rig/sample": 1111,
+        "/rig/control": 112,
+        "/rig/timing": 0,
+        "/rig/event": 2,
+        "/rig/touch": 0,
+    }
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 6  # 1 of channels
     assert summary.statistics.message_start_time == kit.START_UTC_NS - 5_000_000
     assert summary.statistics.message_end_time == kit.START_UTC_NS + 1_110_000_000
