@@ -1,9 +1,9 @@
 """Reader of a session's rings for the live view, and what the publisher is told of a session."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rigd.engine import (
     EVENT,
@@ -66,6 +66,14 @@ class LiveSession:
     recording_id: str
     begins: tuple[int, ...]
     folder: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LiveTouches:
+    """Estimates of touches in the session that is shown."""
+
+    touches: tuple[Mapping[str, Any], ...]
+    """As in JSON documents; a later estimate of a touch takes the place of an earlier one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,9 @@ import collections
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -30,10 +30,10 @@ from rigd.engine import (
 )
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
-from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown
+from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown, LiveTouches
 from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import last_look, look_path, read_look
+from rigd.session import last_look, look_path, read_look, touch_line
 from rigd.view import (
     RETURNING,
     RUNNING,
@@ -118,6 +118,9 @@ class _Publisher:
             match message:
                 case LiveSession():
                     self._begin(message)
+                case LiveTouches(touches):
+                    if self._shown is not None:
+                        self._shown.touched(touches)
                 case LiveEnd():
                     self._finish(message)
         self._outlive()
@@ -233,6 +236,12 @@ class _Shown:
         board[Word.LIVE_DROPPED] = self.dropped
         shown = self.intake.next - self.backlog.samples
         board[Word.LIVE_SEEN] = max(board[Word.LIVE_SEEN], shown)
+
+    def touched(self, touches: "Sequence[Mapping[str, Any]]") -> None:
+        """Draw touches, with a line of each among the events."""
+        picture, t_ns = self.intake.picture, self.intake.t_ns
+        lines = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
+        self.backlog.owe([*picture.touches(touches), *picture.events(lines)])
 
     def finish(self, end: LiveEnd) -> None:
         """Take the rest of it, and what can only be known at its end."""

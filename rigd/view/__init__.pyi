@@ -44,6 +44,7 @@ from ._plots import VERMILION as VERMILION
 from ._plots import Color as Color
 from ._plots import send_columns as send_columns
 from ._recorded import draw_session as draw_session
+from ._recorded import nominal_damping as nominal_damping
 from ._recorded import recorded_blueprint as recorded_blueprint
 from ._rrd_file import SUFFIX as SUFFIX
 from ._rrd_file import RrdFileError as RrdFileError

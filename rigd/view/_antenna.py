@@ -9,7 +9,7 @@ bend by the same factor: so nodes stay where they are, and a tip that rests is d
 
 import collections
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
-from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Color
+from rigd.units import with_half_width
+from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -35,6 +36,7 @@ ANTENNA: Final = "/antenna"
 BEAM: Final = f"{ANTENNA}/beam"
 TRAIL: Final = f"{ANTENNA}/trail"
 LABEL: Final = f"{ANTENNA}/label"
+TOUCH: Final = f"{ANTENNA}/touch"
 
 FACTOR: Final = 2.0
 """How many times larger than it is motion across the beam is drawn.
@@ -56,6 +58,12 @@ _LONGEST_GAP_S: Final = 10.0
 """Longest gap of missing samples that is filled."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
 """First mode's, where the profile has no damping; the least of the paper's fits has half."""
+
+_REMEMBERED_S: Final = 30.0
+"""For so long the shapes are kept on which a touch can be drawn."""
+_ARROW_PER_N: Final = 0.2
+_LONGEST_ARROW: Final = 0.4
+"""Arrow of a contact force, in beam lengths."""
 
 _HOUSING: Color = (105, 110, 120)
 _METAL: Color = (140, 145, 155)
@@ -86,6 +94,9 @@ class Antenna:
         self._newest: tuple[int, Real] | None = None  # tick; time and angle
         self._waiting: Real = np.zeros((0, 2))  # times and angles since the last look
         self._trail: list[_Moment] = []  # not yet sent
+        self._shapes: collections.deque[_Moment] = collections.deque(
+            maxlen=round(_REMEMBERED_S * DRAWN_HZ)
+        )
 
     def frame(self) -> list["Drawing"]:
         """Return the static drawings."""
@@ -113,6 +124,7 @@ class Antenna:
             if self._looks % self._seldom_looks == 0:
                 labels.append(partial(_draw_label, t_ns=t_ns, tip_m=max(self._tips_m)))
         self._trail += [(t_ns, beam_and_line[1:]) for t_ns, beam_and_line in moments]
+        self._shapes += moments
         drawings: list[Drawing] = []
         if moments:
             drawings.append(partial(_draw_lines, entity=BEAM, moments=moments))
@@ -120,6 +132,45 @@ class Antenna:
             drawings.append(partial(_draw_lines, entity=TRAIL, moments=self._trail))
             self._trail = []
         return drawings + labels
+
+    def touch(self, touch: Mapping[str, Any]) -> list["Drawing"]:
+        """Draw the point of a touch, its interval and the force on the beam as it was then.
+
+        Parameters
+        ----------
+        touch
+            As in JSON documents. Without point and time, and without the shape of that time,
+            nothing is drawn.
+        """
+        point, time = touch.get("x_m"), touch.get("time_s")
+        shapes = list(self._shapes)
+        if point is None or time is None or len(shapes) < 2:
+            return []
+        t_ns = round(1e9 * time["value"])
+        after = next((i for i in range(1, len(shapes)) if shapes[i][0] >= t_ns), len(shapes) - 1)
+        (earlier_ns, earlier), (later_ns, later) = shapes[after - 1], shapes[after]
+        if t_ns < earlier_ns:
+            return []  # no shape of that time is left
+        share = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
+        beam = (1 - share) * earlier[1] + share * later[1]
+        moved = later[1] - earlier[1]
+        x = np.array([point["value"], *point["interval_95"]]) / self._length_m
+        x = np.clip(x, 0.0, 1.0)
+        y, ahead = (np.interp(x, beam[:, 0], each) for each in (beam[:, 1], moved[:, 1]))
+        places = np.column_stack([x, y, np.zeros(3)])
+        force = touch.get("force_n")
+        # An obstacle pushes against the motion that met it.
+        push = 0.0 if force is None else -math.copysign(float(force["value"]), float(ahead[0]))
+        return [
+            partial(
+                _draw_touch,
+                number=int(touch["number"]),
+                t_ns=t_ns,
+                places=places,
+                arrow=math.copysign(min(_ARROW_PER_N * abs(push), _LONGEST_ARROW), push),
+                text=touch_label(touch),
+            )
+        ]
 
     def _at_every_tick(self, samples: Records) -> Real:
         """Fill gaps; return times in ns and angles in rad since the sample before, (n, 2)."""
@@ -191,6 +242,18 @@ def label(tip_m: float) -> str:
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return f"tip deflection ± {text} mm, drawn × {FACTOR:g}"
+
+
+def touch_label(touch: Mapping[str, Any]) -> str:
+    """Return the text at a touch: its number and point.
+
+    Parameters
+    ----------
+    touch
+        As in JSON documents.
+    """
+    point = touch["x_m"]
+    return f"touch {touch['number']}: {with_half_width(point['value'], point['interval_95'])} m"
 
 
 def _small_damping(beam: Beam) -> Damping:
@@ -294,3 +357,36 @@ def _draw_label(stream: "RecordingStream", t_ns: int, tip_m: float) -> None:
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     stream.log(LABEL, rr.Points3D.from_fields(labels=[label(tip_m)]))
+
+
+def _draw_touch(
+    stream: "RecordingStream", number: int, t_ns: int, places: Real, arrow: float, text: str
+) -> None:
+    """Draw from the time of a touch on: point, interval along the beam, and force."""
+    import rerun as rr
+
+    stream.set_time(TIMELINE, duration=1e-9 * t_ns)
+    point, ends = places[:1], places[1:]
+    entity = f"{TOUCH}/{number}"
+    stream.log(
+        f"{entity}/interval",
+        rr.LineStrips3D([ends], colors=[VERMILION], radii=rr.Radius.ui_points(4.0)),
+    )
+    stream.log(
+        f"{entity}/point",
+        rr.Points3D(point, radii=rr.Radius.ui_points(5.0), colors=[VERMILION]),
+    )
+    # Of the last touch alone: those of several passes would stand on one another.
+    stream.log(
+        f"{TOUCH}/label",
+        rr.Points3D(point, radii=[0.0], colors=[VERMILION], labels=[text], show_labels=True),
+    )
+    stream.log(
+        f"{entity}/force",
+        rr.Arrows3D(
+            origins=point - [[0.0, arrow, 0.0]],
+            vectors=[[0.0, arrow, 0.0]],
+            colors=[VERMILION],
+            radii=rr.Radius.ui_points(2.0),
+        ),
+    )

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
-from rigd.session import Session, SessionError, Status
+from rigd.session import Session, SessionError, Status, touch_line, touches_of
 from rigd.units import unit_of
 from rigd.view._banner import ended
 from rigd.view._layout import blueprint
@@ -29,6 +29,8 @@ _BLOCK_S: Final = 1.0
 """Part of the session that is drawn at a time: as often as the charts are redrawn."""
 _MOST_SPAN: Final = 10
 """Ticks per sample: what lies between few samples would be made up, and fill the disk."""
+_TOLD_AFTER_S: Final = 0.2
+"""After a touch: by then the antenna's shapes around it are drawn."""
 _LAST_UTC_NS: Final = 2**63 - 1
 _DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
 """Attachments that tell the nominal damping; the first that does counts."""
@@ -181,26 +183,31 @@ def draw_session(
     stream.send_recording_start_time_nanos(session.start_utc_ns)
     for draw in picture.frame():
         draw(stream)
-    for draw in picture.events([*_notes(session)]):
+    for draw in picture.events(sorted(_notes(session), key=lambda note: note.t_ns)):
         draw(stream)
     samples = session.samples
     counts = np.zeros(3, np.int64)
     done, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
+    touches = _touches(session)
     for block, ages in _blocks(samples, timings, block_ticks):
         done += len(block)
         counts += _counts(block, last_tick)
-        last_tick = int(block["tick"][-1])
+        last_tick, t_ns = int(block["tick"][-1]), int(block["t_ns"][-1])
         missed, late, lost = counts.tolist()
         health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
         for draw in (
             *picture.timings(ages),
             *picture.samples(block),
-            *picture.health(int(block["t_ns"][-1]), health),
+            *picture.health(t_ns, health),
         ):
             draw(stream)
+        drawn = [each for each in touches if _TOLD_AFTER_S + each["time_s"]["value"] < 1e-9 * t_ns]
+        for draw in picture.touches(drawn):
+            draw(stream)
+        touches = touches[len(drawn) :]
         on_progress(done / len(samples))
-    for draw in picture.finish():
+    for draw in (*picture.finish(), *picture.touches(touches)):
         draw(stream)
 
 
@@ -242,10 +249,20 @@ def _notes(session: Session) -> Iterator[Note]:
     """Yield the log of the session, and how it ended, which is told elsewhere in the file."""
     for event in session.events:
         yield Note(event.t_ns, event.level, event.message)
+    for touch in _touches(session):
+        yield Note(round(1e9 * touch["time_s"]["value"]), "info", touch_line(touch))
     if session.outcome is not None:
         outcome = session.outcome.get("outcome", "unknown")
         reason = session.outcome.get("reason", "")
         yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
+
+
+def _touches(session: Session) -> list[dict[str, Any]]:
+    """Return the touches of which the file tells when in the record they were, in that order."""
+    last_s = 1e-9 * int(session.samples["t_ns"][-1])
+    timed = [touch for touch in touches_of(session.outcome) if touch["time_s"] is not None]
+    within = [touch for touch in timed if 0.0 <= touch["time_s"]["value"] <= last_s]
+    return sorted(within, key=lambda touch: touch["time_s"]["value"])
 
 
 def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:

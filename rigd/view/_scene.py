@@ -1,7 +1,7 @@
 """Scene of one session: records, events and health come in, drawings for Rerun go out."""
 
 import collections
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -85,6 +85,7 @@ class Scene:
         self._spectrogram_chart = SpectrogramChart(subject, self._spectrogram.frequency_hz, _STEP_S)
         self._columns: list[tuple[float, npt.NDArray[Any]]] = []
         self._notes: collections.deque[Note] = collections.deque(maxlen=_MOST_NOTES)
+        self._touches: dict[int, list[Drawing]] = {}
         self._charts_due = _Periodically(_CHARTS_S)
         self._samples = _Gathering(subject.rate_hz)
         self._timings = _Gathering(subject.rate_hz)
@@ -112,6 +113,7 @@ class Scene:
             self._spectrogram_chart.draw_frame,
             self._spectrogram_chart.draw,
             *self._antenna.frame(),
+            *(drawing for drawings in self._touches.values() for drawing in drawings),
             *(partial(send_note, note=note) for note in self._notes),
             self._recent(self._t_ns),
             *self._banner(),
@@ -134,6 +136,12 @@ class Scene:
             *(partial(send_note, note=note) for note in events),
             self._recent(max(self._t_ns, events[-1].t_ns)),
         ]
+
+    def touches(self, touches: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Take touches as JSON documents have them; a later estimate replaces an earlier one."""
+        drawn = {touch["number"]: self._antenna.touch(touch) for touch in touches}
+        self._touches |= drawn
+        return [drawing for drawings in drawn.values() for drawing in drawings]
 
     def state(self, t_ns: int, state: State) -> list[Drawing]:
         """Take the state of the session; nothing is drawn as long as it stays the same.

@@ -14,6 +14,7 @@ from rigd.view._antenna import (
     FACTOR,
     LABEL,
     TITLE,
+    TOUCH,
     TRAIL,
     TRAIL_S,
     Antenna,
@@ -185,3 +186,63 @@ def test_view_shows_the_antenna_and_its_trail_from_a_fixed_place():
     assert view.name == TITLE
     assert view.origin == ANTENNA
     assert TRAIL in view.visualizer_overrides
+
+
+def known(value, half):
+    return {"value": value, "std": half / 2, "interval_95": [value - half, value + half]}
+
+
+TOUCH_AT_2_S = {
+    "number": 3,
+    "x_m": known(0.49, 0.02),
+    "time_s": known(2.0123, 0.001),
+    "force_n": known(0.5, 0.1),
+}
+
+
+def values_of(batches, component):
+    (batch,) = [each for each in batches if component in each.schema.names]
+    times = batch.column("session_time").cast("int64").to_pylist()
+    return times, np.array(batch.column(component).to_pylist()[0])
+
+
+def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, samples, drawn):
+    drawing = Antenna(subject)
+    for block in blocks(samples, 100):
+        drawing.samples(block)
+    sent = drawn(drawing.touch(TOUCH_AT_2_S))
+    times, (point,) = values_of(sent[f"{TOUCH}/3/point"], "Points3D:positions")
+    assert times == [2_012_300_000]
+    # The exact shape of that very tick.
+    filter_ = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    deflection_m = filter_.feed(samples["angle_rad"][:2013])
+    place = 0.49 / subject.beam.length_m
+    across = np.interp(0.49, filter_.x_m, deflection_m) / subject.beam.length_m
+    y = FACTOR * (samples["angle_rad"][2012] * place + across)
+    # Between two drawn shapes, 50 ms apart, it is interpolated.
+    assert point == pytest.approx([place, y, 0.0], abs=4e-3)
+    _, (interval,) = values_of(sent[f"{TOUCH}/3/interval"], STRIPS)
+    assert interval[:, 0] * subject.beam.length_m == pytest.approx([0.47, 0.51], abs=1e-6)
+    _, (force,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:vectors")
+    _, (origin,) = values_of(sent[f"{TOUCH}/3/force"], "Arrows3D:origins")
+    before = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    then = np.interp(0.49, before.x_m, before.feed(samples["angle_rad"][:1970]))
+    forward = y - FACTOR * (samples["angle_rad"][1969] * place + then / subject.beam.length_m)
+    assert force[1] * forward < 0
+    assert origin + force == pytest.approx(point, abs=1e-6)
+    _, labels = values_of(sent[f"{TOUCH}/label"], "Points3D:labels")
+    assert labels.tolist() == ["touch 3: 0.490 ± 0.020 m"]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"x_m": None}, {"time_s": None}, {"time_s": known(0.01, 0.001)}]
+)
+def test_a_touch_of_unknown_place_or_time_is_not_drawn(subject, samples, changes):
+    drawing = Antenna(subject)
+    drawing.samples(samples)
+    assert drawing.touch(TOUCH_AT_2_S | changes) == []
+    assert drawing.touch(TOUCH_AT_2_S)
+
+
+def test_before_the_beam_is_drawn_there_is_no_place_for_a_touch(subject):
+    assert Antenna(subject).touch(TOUCH_AT_2_S) == []

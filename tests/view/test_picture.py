@@ -1,5 +1,6 @@
 """Everything that is shown of a session, from the samples of a whole one."""
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session._format import TIMING_DTYPE
 from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
+from rigd.view._recorded import draw_session
 from rigd.view._scene import Scene
 from rigd.view._session_info import Health, Note, Subject
 
@@ -156,6 +158,37 @@ def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
     assert found[f"{MAGNITUDE}/measured"].values["LineStrips2D:strips"][-1][0]
     assert found["/spectrogram/levels"].last("DepthImage:buffer")
     assert found["/events"].values["TextLog:text"] == [["The record begins."]]
+
+
+def known(value):
+    return {"value": value, "std": 1e-3, "interval_95": [value - 2e-3, value + 2e-3]}
+
+
+def test_touches_stay_on_the_antenna_for_new_connections(subject, make_samples, shown):
+    picture = Scene(subject)
+    for block in blocks(make_samples(2000), 100):
+        picture.samples(block)
+    touch = {"number": 1, "x_m": known(0.4), "time_s": known(1.5), "force_n": None}
+    picture.touches([touch])
+    picture.touches([touch | {"x_m": known(0.5)}])  # with more data
+    found = shown(picture.frame())["/antenna/touch/1/point"]
+    ((place,),) = found.values["Points3D:positions"]
+    assert place[0] == pytest.approx(0.5 / subject.beam.length_m)
+
+
+def test_a_recorded_session_shows_its_touches(touch_file, drawn, tmp_path):
+    outcome = {"touches": json.dumps([{"number": 1, "x_m": known(0.6), "time_s": known(1.3)}])}
+    session = replace(read_session(touch_file.path), outcome=outcome)
+    timings = np.empty(0, TIMING_DTYPE)
+    found = drawn([lambda stream: draw_session(stream, session, timings)])
+    assert "/antenna/touch/1/point" in found
+    lines = [
+        text
+        for batch in found["/events"]
+        for texts in batch.column("TextLog:text").to_pylist()
+        for text in texts
+    ]
+    assert any(text.startswith("Touch 1: 0.6000 ± 0.0020 m from the axis") for text in lines)
 
 
 @pytest.mark.parametrize(
