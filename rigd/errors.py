@@ -7,6 +7,8 @@
      |    +-- ProfileError          a key of the profile is missing, or its value is out of range
      |    +-- UnknownDeviceError    [devices] names a driver that does not exist
      |    +-- ExcitationError       --amplitude 0, or a CSV file with semicolons
+     |    +-- IdentifiedBeamError   --model of a file that holds no beam
+     |    +-- ObstacleError         --obstacle x=0.62,angle=…: a key is missing or out of range
      |    +-- ControlDesignError    the closed loop would be unstable
      |    +-- RealisationError      the beam's damping has no stable state space
      |    +-- RefusedError          the predicted angle exceeds limits.angle_rad

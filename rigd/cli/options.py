@@ -92,6 +92,17 @@ Hardware = Annotated[
     typer.Option("--hardware", help="Move the hardware, even if another user simulates the rig."),
 ]
 
+Obstacles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--obstacle",
+        metavar="SPEC",
+        help="Put an obstacle in the way of a simulated beam, such as "
+        "x=0.62,angle=0.6,stiffness=3000 (m, rad, N/m), or a knock, such as "
+        "x=0.5,force=2,duration=0.02,at=3 (m, N, s); repeat for each.",
+    ),
+]
+
 Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")]
 Operator = Annotated[str, typer.Option("--operator", help="Operator name, stored in the file.")]
 Specimen = Annotated[str, typer.Option("--specimen", help="Specimen, stored in the file.")]

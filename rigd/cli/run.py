@@ -24,6 +24,7 @@ from rigd.cli.options import (
     Meta,
     NoLook,
     Note,
+    Obstacles,
     Operator,
     Output,
     ProfileName,
@@ -63,6 +64,16 @@ Rest = Annotated[float, typer.Option("--rest", help="Rest before the excitation 
 RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after the excitation (s).")]
 Taper = Annotated[float, typer.Option("--taper", help="Fade-in and fade-out time (s).")]
 
+Model = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        metavar="JSON",
+        readable=False,
+        help="Beam identified by analyze --json (default: the profile's).",
+    ),
+]
+
 
 Parameters = Callable[..., "dict[str, Value]"]
 """Makes an excitation's parameters, by the names they have everywhere else, from its options."""
@@ -92,7 +103,9 @@ def _register(app: typer.Typer, perform: Callable[..., None], parameters: Parame
     )
     command.__annotations__ = {p.name: p.annotation for p in (*own, *common)}
     text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
-    app.command(kind, help=text)(command)
+    # Else the angle -0.3 would be taken for an option.
+    settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
+    app.command(kind, help=text, context_settings=settings)(command)
 
 
 def run_sessions(
@@ -110,12 +123,13 @@ def run_sessions(
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
     hardware: Hardware = False,
+    obstacle: Obstacles = None,
     no_look: NoLook = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note, meta)
-    stop, crew = start_processes(live=live)
+    stop, crew = start_processes(live=live, touch=kind == "touch")
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
 
@@ -135,6 +149,8 @@ def run_sessions(
             quiet_stdout=as_json,
             hardware=hardware,
             look=not no_look,
+            obstacles=obstacle or (),
+            from_angle=kind in ("move", "touch"),
         )
     except SeriesFailedError as error:
         if as_json:
@@ -301,8 +317,88 @@ def modes(
     }
 
 
+@excitation_command
+def touch(
+    angle: Annotated[
+        float, typer.Argument(metavar="ANGLE", help="Farthest angle from the rig's zero (rad).")
+    ],
+    speed: Annotated[float, typer.Option("--speed", help="Speed on the way out (rad/s).")] = 1.0,
+    acceleration: Annotated[
+        float,
+        typer.Option("--acceleration", help="Acceleration at most (rad/s²)."),
+    ] = 20.0,
+    passes: Annotated[int, typer.Option("--passes", min=1, help="Number of passes.")] = 1,
+    hold: Annotated[
+        float, typer.Option("--hold", help="Time from a touch to the way back (s).")
+    ] = 0.5,
+    settle: Annotated[float, typer.Option("--settle", help="Rest before each pass (s).")] = 1.0,
+    force_limit: Annotated[
+        float, typer.Option("--force-limit", help="Largest contact force; more is a fault (N).")
+    ] = 10.0,
+    model: Model = None,
+    rest: Rest = 1.0,
+    ring_down: RingDown = 1.0,
+) -> "dict[str, Value]":
+    """Slew until the beam meets something; brake, hold and withdraw.
+
+    The touch is detected by the torque and base shear that the moving beam itself does not explain.
+
+    Example: rigd run touch 0.8 --speed 0.5 --passes 3
+    """
+    parameters: dict[str, Value] = {
+        "angle_rad": angle,
+        "speed_rad_s": speed,
+        "acceleration_rad_s2": acceleration,
+        "passes": passes,
+        "hold_s": hold,
+        "settle_s": settle,
+        "force_limit_n": force_limit,
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+    }
+    if model is not None:
+        parameters["path"] = model
+    return parameters
+
+
+@excitation_command
+def move(
+    angle: Annotated[
+        float | None, typer.Argument(metavar="ANGLE", help="Angle from the rig's zero (rad).")
+    ] = None,
+    by: Annotated[
+        float | None, typer.Option("--by", help="Angle from where the motor stands (rad).")
+    ] = None,
+    robust: Annotated[
+        bool,
+        typer.Option("--robust", help="Bear frequencies that are wrong by 1 %; takes longer."),
+    ] = False,
+    model: Model = None,
+    rest: Rest = 1.0,
+    ring_down: RingDown = 5.0,
+) -> "dict[str, Value]":
+    """Move to an angle without leaving a vibration, and stay there.
+
+    Example: rigd run move 0.5
+    """
+    parameters: dict[str, Value] = {
+        "robust": int(robust),
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+    }
+    if angle is not None:
+        parameters["angle_rad"] = angle
+    if by is not None:
+        parameters["by_rad"] = by
+    if model is not None:
+        parameters["path"] = model
+    return parameters
+
+
 def _write_json(results: "list[SessionResult]") -> None:
+    from rigd.runner import results_document
+
     try:
-        typer.echo(json.dumps({"sessions": [result.as_dict() for result in results]}))
+        typer.echo(json.dumps(results_document(results)))
     except OSError as error:
         fail(f"The JSON document cannot be written ({error.strerror}).", EXIT_FAILED)

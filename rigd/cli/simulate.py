@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rigd.cli.options import ProfileName, profile_named
+from rigd.cli.options import Obstacles, ProfileName, profile_named
 
 
 def simulate(
@@ -32,6 +32,7 @@ def simulate(
             "--eds", metavar="FILE", help="Simulate the drive that this EDS or DCF file describes."
         ),
     ] = None,
+    obstacle: Obstacles = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing on the terminal.")] = False,
 ) -> None:
     """Simulate the devices of a profile on the wire; Ctrl-C ends it.
@@ -52,7 +53,12 @@ def simulate(
         quiet=quiet,
         eds=eds,
     )
-    raise typer.Exit(simulator.run_simulator(profile_named(profile).rig, options))
+    rig = profile_named(profile).rig
+    if obstacle:
+        from rigd.devices import with_obstacles
+
+        rig = with_obstacles(rig, obstacle)
+    raise typer.Exit(simulator.run_simulator(rig, options))
 
 
 def inject(
@@ -87,6 +93,9 @@ def inject(
     no_bit_12[,for=0.5]                       statusword bit 12 (follows command) stays 0
     no_pre_operational[,for=0.5]              the drive ignores NMT pre-operational
     no_watch[,for=0.5]                        the drive's watchdog does not act
+    obstacle,x=0.6,angle=0.3[,stiffness=3000][,damping=0][,side=1][,rate=0][,for=1]
+                                              an obstacle is in the beam's way (m, rad, N/m)
+    knock,x=0.5,force=2,duration=0.02         the beam is knocked (m, N, s)
     end[,fault=sto]                           end faults of one kind (release the STO), or all
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end

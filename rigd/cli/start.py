@@ -58,7 +58,7 @@ class SessionCommands(TyperGroup):
             raise
 
 
-def start_processes(*, live: bool) -> "tuple[StopRequest, ProcessGroup]":
+def start_processes(*, live: bool, touch: bool = False) -> "tuple[StopRequest, ProcessGroup]":
     """Catch the operator's stop, and start the processes of the first session.
 
     They import what they need while the command line imports the rest, and while it plans.
@@ -69,7 +69,7 @@ def start_processes(*, live: bool) -> "tuple[StopRequest, ProcessGroup]":
     stop = StopRequest()
     stop.catch()
     try:
-        return stop, ProcessGroup(live=live)
+        return stop, ProcessGroup(live=live, touch=touch)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "

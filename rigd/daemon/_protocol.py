@@ -245,7 +245,7 @@ def _checked(request: SomeSession) -> SomeSession:
 
 
 def _value(name: str, given: object, wanted: object) -> Value:
-    if wanted is float:
+    if wanted in (float, float | None):
         return _number(name, given)
     if wanted is int:
         if isinstance(given, int) and not isinstance(given, bool) and abs(given) < 2**63:

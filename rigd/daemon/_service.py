@@ -398,6 +398,7 @@ class Service:
             request.parameters,
             request.force,
             request.notes.specimen,
+            self._start_rad(),
         )
         self._predictions += 1
         try:
@@ -520,6 +521,11 @@ class Service:
 
     # Series
 
+    def _start_rad(self) -> float:
+        """Return where the motor stands, from the rig's zero; 0 while that is not known."""
+        status = self._rig.status()
+        return 0.0 if status is None else status.angle_rad
+
     def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and check that it may be run; in the second thread."""
         notes = request.notes.as_metadata()
@@ -527,7 +533,7 @@ class Service:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
             return Series(
                 profile,
-                excitation_for(profile, request.excitation, request.parameters),
+                excitation_for(profile, request.excitation, request.parameters, self._start_rad()),
                 self._folder,
                 repeat=request.repeat,
                 notes=notes,

@@ -46,6 +46,8 @@ class PredictionJob:
     """Let torques be clipped."""
     specimen: str
     """Name of the specimen; empty: the profile's."""
+    start_rad: float = 0.0
+    """Where the motor stands, from the rig's zero."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
@@ -58,7 +60,7 @@ class PredictionJob:
         )
 
         profile = with_specimen(self.profile, self.specimen)
-        excitation = excitation_for(profile, self.excitation, self.parameters)
+        excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
         plan = predict_session(profile, excitation, force=self.force)
         return {
             "plan": plan_document(profile, excitation, plan),

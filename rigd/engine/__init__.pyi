@@ -5,6 +5,7 @@ from ._ipc import LIVE as LIVE
 from ._ipc import PROCESSES as PROCESSES
 from ._ipc import RECORDER as RECORDER
 from ._ipc import SUPERVISOR as SUPERVISOR
+from ._ipc import TOUCH as TOUCH
 from ._ipc import Child as Child
 from ._ipc import ChildError as ChildError
 from ._ipc import Parent as Parent
@@ -16,6 +17,7 @@ from ._messages import Closed as Closed
 from ._messages import Connected as Connected
 from ._messages import ControlJob as ControlJob
 from ._messages import Ended as Ended
+from ._messages import Ending as Ending
 from ._messages import Failed as Failed
 from ._messages import FileHeader as FileHeader
 from ._messages import Finished as Finished
@@ -26,6 +28,10 @@ from ._messages import RecorderJob as RecorderJob
 from ._messages import Refused as Refused
 from ._messages import SessionJob as SessionJob
 from ._messages import Tare as Tare
+from ._messages import TouchJob as TouchJob
+from ._messages import TouchOrder as TouchOrder
+from ._messages import TouchReady as TouchReady
+from ._messages import TouchTold as TouchTold
 from ._messages import Zero as Zero
 from ._realtime import LOCKED as LOCKED
 from ._realtime import REFUSED as REFUSED

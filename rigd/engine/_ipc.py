@@ -272,6 +272,16 @@ LIVE = Process(
     for_one_session=False,
     loss="it is restarted, the session continues",
 )
+TOUCH = Process(
+    "touch",
+    "rigd.engine.touch_estimator",
+    Word.TOUCH_BEAT,
+    # An estimate takes its time; what it leaves undone is told as such.
+    hung_after_s=None,
+    grace_s=1.0,
+    for_one_session=True,
+    loss="touches are detected but not estimated, the session continues",
+)
 SUPERVISOR = Process(
     "supervisor",
     "",
@@ -282,7 +292,7 @@ SUPERVISOR = Process(
     loss="the control process ends the session as a fault",
 )
 
-PROCESSES = (CONTROL, RECORDER, LIVE, SUPERVISOR)
+PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, SUPERVISOR)
 """All processes, in the order in which they are ended: the one with the torque first."""
 
 

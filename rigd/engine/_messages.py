@@ -9,6 +9,7 @@ control       ControlJob, then SessionJob, Tare, Zero        Connected, then Rea
                                                              Measured or Refused; last Ended
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
+touch         TouchJob                                       TouchReady, then TouchTold
 ============  =============================================  ================================
 
 A message is one of these objects, pickled, behind its length. Each is short enough for a pipe's
@@ -26,10 +27,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rigd.control import DamperSettings
     from rigd.devices import WhatMoves
     from rigd.engine._ring import ReferenceSpec
     from rigd.engine._topics import ChannelSpecs
+    from rigd.excitation import Approach
     from rigd.profile import Profile, RealtimeSettings
+    from rigd.touch import DetectorSettings, ObservedBeam, TouchModel
 
 _LENGTH: Final = struct.Struct("=I")
 _MOST_BYTES: Final = 1 << 24
@@ -54,6 +61,34 @@ class ControlJob:
 
 
 @dataclass(frozen=True, slots=True)
+class Ending:
+    """What follows the record, while the motor is still held; planned before the session."""
+
+    stays: bool = False
+    """The motor stays where the reference ends; else it returns to the start angle."""
+    poles_rad_s: tuple[complex, ...] = ()
+    """Modes that the return leaves at rest; none: nothing is known of the beam."""
+    damper: "DamperSettings | None" = None
+    """Active damping of what still vibrates; None: it is left to itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchOrder:
+    """The obstacle to look for in a session."""
+
+    model: "ObservedBeam"
+    """The beam as it moves freely."""
+    signatures: "NDArray[np.float64]"
+    """What a touch looks like, from `rigd.touch.signatures`."""
+    settings: "DetectorSettings"
+    """How sure the detector has to be."""
+    approach: "Approach"
+    """The passes, and what to do after a touch."""
+    shear_projection: tuple[float, ...] | None
+    """Base shear = projection · wrench; None: it is not measured."""
+
+
+@dataclass(frozen=True, slots=True)
 class SessionJob:
     """The session to run on it."""
 
@@ -63,6 +98,10 @@ class SessionJob:
     """Angles relative to the one at the start."""
     refused: Mapping[str, str] = field(default_factory=dict)
     """What the system did not grant supervisor and recorder, and why."""
+    ending: Ending = field(default_factory=Ending)
+    """What follows the record."""
+    touch: TouchOrder | None = None
+    """What to look for; None: nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +211,8 @@ class Close:
 
     outcome: Mapping[str, str]
     """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
+    touches: bytes = b""
+    """Touches that were estimated, packed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +252,46 @@ class Failed:
     """The file is there already, and is somebody else's."""
     kept: Path | None = None
     """Where the record was saved, if not under the file's own name."""
+
+
+# Touch
+
+
+@dataclass(frozen=True, slots=True)
+class TouchJob:
+    """The session whose touches are to be estimated."""
+
+    channels: "ChannelSpecs"
+    """Shared memory of the rig's processes."""
+    first: int
+    """Records in the ring of samples before the session."""
+    rate_hz: float
+    """Ticks a second."""
+    model: "TouchModel"
+    """The beam."""
+    shear_projection: tuple[float, ...] | None
+    """Base shear = projection · wrench; None: it is not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchReady:
+    """Touches are estimated from now on."""
+
+
+@dataclass(frozen=True, slots=True)
+class TouchTold:
+    """Estimate of a touch."""
+
+    number: int
+    """Number of the touch in its session, from 1 on."""
+    tick: int
+    """Tick of its detection."""
+    final: bool
+    """No better one will come."""
+    document: Mapping[str, Any]
+    """Point, instant, force, stiffness and kind, as in JSON documents."""
+    took_s: float
+    """Time of the calculation."""
 
 
 # On their way

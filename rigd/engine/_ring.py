@@ -19,7 +19,6 @@ receive it: however long the session is, a drive that monitors the loop's heartb
 import mmap
 import os
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -239,7 +238,10 @@ def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpe
     return ReferenceSpec(fd, reference_rad.size)
 
 
-def map_reference(spec: ReferenceSpec) -> Sequence[float]:
-    """Attach to a reference: one Python number per tick, read where it lies."""
-    memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=mmap.ACCESS_READ)
+def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
+    """Attach to a reference: one Python number per tick, read where it lies.
+
+    What is written to it stays in this process.
+    """
+    memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=mmap.ACCESS_COPY)
     return memoryview(memory).cast("d")

@@ -1,4 +1,4 @@
-"""Sequence of a session: tare, enable, hold, record, return, disable, check the tare.
+"""Sequence of a session: tare, enable, hold, record, damp, return, disable, check the tare.
 
 The record is what lies between tick 0 and the last tick of the excitation; everything else runs
 through the same cycle and leaves its results in the metadata.
@@ -11,14 +11,18 @@ from math import inf
 
 import numpy as np
 
+from rigd.control import VibrationDamper
 from rigd.devices import DeviceError
 from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._ipc import Parent
+from rigd.engine._messages import Ending
 from rigd.engine._publish import Display, SampleLog
 from rigd.engine._realtime import page_faults
 from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
 from rigd.engine._timing import SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.engine._topics import Channels
+from rigd.engine._touch_watch import TouchWatch
+from rigd.excitation import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import BY_NAME, LOOK_EVERY, OVERLOADED
@@ -36,6 +40,19 @@ _AGAINST_TORQUE = (
 )
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
+_DAMPING_S = 5.0
+"""Longest active damping: what a beam that vibrates with the sensor's whole range needs twice."""
+_JUDGED_S = 0.4
+"""Time over which the torque is judged: a period of a first mode at 2.5 Hz."""
+_JUDGED_TICKS = 50
+"""Ticks from one judgement to the next."""
+_DAMPED = 1.25
+"""Spread of the torque, over that at rest, up to which the beam counts as damped: what vibrates
+then is less than the noise, and the spread of so short a time scatters by 4 %."""
+_MOST_YIELDED_RAD = 0.1
+"""Farthest that active damping moves the motor."""
+_SHAPED_S = 5.0
+"""A return that takes longer leaves no vibration whatever its shape."""
 
 
 class SessionEnd(Exception):
@@ -77,6 +94,10 @@ class SessionSequence:
         The supervisor.
     stop
         The signals that this process received itself.
+    ending
+        What follows the record.
+    touch
+        Watches the record for a touch; None: nobody does.
     """
 
     def __init__(
@@ -91,7 +112,10 @@ class SessionSequence:
         display: Display,
         parent: Parent,
         stop: StopRequest,
+        ending: Ending,
+        touch: TouchWatch | None = None,
     ) -> None:
+        self._touch = touch
         self._display = display
         self._profile = profile
         self._cycle = cycle
@@ -111,6 +135,9 @@ class SessionSequence:
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
         self._relative_reference = reference_rad
+        self._ending = ending
+        self._return_path = _return_path(profile, ending)
+        self._end_angle_rad = 0.0
         self._start_angle_rad = 0.0
         self._rest_spread_nm = 0.0
         self._recording = False
@@ -243,6 +270,7 @@ class SessionSequence:
         total = len(reference)
         metronome, cycle, log, board = self._metronome, self._cycle, self._log, self._board
         counts, virtual, signals = self.counts, self._clock.virtual, self._stop
+        touch = self._touch
         stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
         self._recording = True
@@ -275,6 +303,8 @@ class SessionSequence:
                 end = self._look()
             if end is None:
                 end = self._step(start_rad + reference[tick])
+                if touch is not None and end is None:
+                    end = self._watch_touch(touch, tick, missed)
             else:
                 self._switch_off_and_observe()
             wait = virtual or end is not None
@@ -294,15 +324,52 @@ class SessionSequence:
         if end is not None:
             raise end
 
-    def go_back(self) -> None:
-        """Return to the start angle on a minimum-jerk path."""
+    def _watch_touch(self, touch: TouchWatch, tick: int, missed: int) -> SessionEnd | None:
+        """Look for a touch in the tick that was just run; the watch changes the reference."""
+        contact = touch.step(tick, missed)
+        if contact is None:
+            return None
+        if contact.detected:
+            self._board[Word.TOUCHES] += 1
+        if contact.ends:
+            self._cycle.torque_off()  # before this tick's sample is written
+            return SessionEnd(contact.ends, contact.message)
+        self._say("info", contact.message)
+        return None
+
+    def damp(self) -> None:
+        """Hold the motor where the record ended, yielding until the beam has come to rest."""
         self._board[Word.PHASE] = Phase.RETURNING
-        distance_rad = self._relative_reference[-1]
-        n = round(self._profile.session.return_s * self._rate_hz)
-        u = np.arange(1, n + 1) / n
-        path = self._start_angle_rad + distance_rad * (1 - u**3 * (10 - 15 * u + 6 * u**2))
-        for reference_rad in path.tolist():
-            self._tick(reference_rad)
+        end_rad = self._end_angle_rad = self._start_angle_rad + self._relative_reference[-1]
+        if self._ending.damper is None:
+            return
+        damper = VibrationDamper(self._ending.damper, self._rate_hz)
+        cycle = self._cycle
+        # Not past the limit of the angle, where the record may have ended.
+        limit_rad = self._profile.limits.angle_rad
+        least_rad = min(0.0, max(-_MOST_YIELDED_RAD, -limit_rad - end_rad))
+        most_rad = max(0.0, min(_MOST_YIELDED_RAD, limit_rad - end_rad))
+        torques_nm = np.zeros(round(_JUDGED_S * self._rate_hz))
+        for tick in range(round(_DAMPING_S * self._rate_hz)):
+            yielded_rad = damper.step(cycle.coupling_torque_nm)
+            self._end_angle_rad = end_rad + min(max(yielded_rad, least_rad), most_rad)
+            self._tick(self._end_angle_rad)
+            torques_nm[tick % torques_nm.size] = cycle.coupling_torque_nm
+            if (
+                tick % _JUDGED_TICKS == 0
+                and tick >= torques_nm.size
+                and float(torques_nm.std()) <= _DAMPED * self._rest_spread_nm
+            ):
+                return
+
+    def go_back(self) -> None:
+        """Return to the start angle, or to where a move ended, without leaving a vibration."""
+        goal_rad = self._start_angle_rad
+        if self._ending.stays:
+            goal_rad += self._relative_reference[-1]
+        distance_rad = goal_rad - self._end_angle_rad
+        for part in self._return_path:
+            self._tick(self._end_angle_rad + distance_rad * part)
 
     def check_tare(self) -> None:
         """Average the sensor again, the drive disabled, to see how far its zero has moved."""
@@ -485,3 +552,14 @@ class SessionSequence:
         # What comes before tick 0 has no time in the file yet.
         t_ns = self._clock.now_ns() - self._metronome.start_ns if self._recording else 0
         write_event(self._channels.events, Event(t_ns, level, message))
+
+
+def _return_path(profile: Profile, ending: Ending) -> list[float]:
+    """Return the way back, tick by tick from 0 to 1; made before anything moves."""
+    duration_s, rate_hz = profile.session.return_s, profile.rig.rate_hz
+    if ending.poles_rad_s and duration_s <= _SHAPED_S:
+        path = still_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
+    else:
+        path = quintic(duration_s, rate_hz)
+    parts: list[float] = path.tolist()
+    return parts

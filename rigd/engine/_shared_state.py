@@ -103,6 +103,10 @@ class Word(IntEnum):
     """Recorded ticks with a stale angle."""
     STALE_WRENCHES = 22
     """Recorded ticks with a stale wrench."""
+    TOUCHES = 23
+    """Touches detected in the record."""
+    # Written by the touch process
+    TOUCH_BEAT = 24
 
 
 UNKNOWN = -1
@@ -174,6 +178,8 @@ class Event:
     """How grave it is."""
     message: str
     """Text for the operator."""
+    notable: bool = False
+    """The operator is to see it at once, grave or not; not in the file."""
 
 
 def write_event(ring: Ring, event: Event) -> None:

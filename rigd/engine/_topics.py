@@ -17,7 +17,7 @@ from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 HURRIED_BUFFERED_S = 160.0
 """What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
-second, and the live view lags."""
+second, and who only looks on lags."""
 _EVENTS = 256
 
 

@@ -42,6 +42,7 @@ from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine._shared_state import Event, Phase, Word, write_event
 from rigd.engine._timing import Clock, RealClock, TickScheduler, VirtualClock
 from rigd.engine._topics import Channels, attach_channels
+from rigd.engine._touch_watch import TouchWatch
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
@@ -175,6 +176,7 @@ class _Attendance:
             if not self._standstill.begun:
                 self._metronome.wait()
                 self._read_at_rest()
+        self._show()
 
     def serve(self) -> None:
         """Serve the supervisor until it is gone, or a stop is asked for between sessions.
@@ -256,13 +258,18 @@ class _Attendance:
             Word.LOST,
             Word.STALE_ANGLES,
             Word.STALE_WRENCHES,
+            Word.TOUCHES,
         ):
             board[word] = 0
         self._warn_of_refusals(job)
         cycle = self._cycle = self._make_cycle(job.profile)
+        reference = map_reference(job.reference)
+        touch = None
+        if job.touch is not None:
+            touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
         procedure = SessionSequence(
             job.profile,
-            map_reference(job.reference),
+            reference,
             cycle,
             self._clock,
             self._metronome,
@@ -271,6 +278,8 @@ class _Attendance:
             self._display,
             self._parent,
             self._stop,
+            job.ending,
+            touch,
         )
         outcome, reason = "complete", ""
         recorded = device_failed = False
@@ -282,6 +291,7 @@ class _Attendance:
             procedure.wait_for_go()
             procedure.record()
             recorded = True
+            procedure.damp()
             procedure.go_back()
             cycle.torque_off()
             procedure.check_tare()

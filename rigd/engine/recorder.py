@@ -94,9 +94,10 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
             case FileHeader():
                 recorder.header = message
                 parent.send(Armed())
-            case Close(outcome):
+            case Close(outcome, touches):
                 recorder.transfer()
                 if recorder.begun:
+                    writer.write_touches(touches)
                     parent.send(recorder.close(outcome))
                 else:
                     writer.discard()

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from rigd.engine import Phase
 from rigd.printable import counts_text, progress_bar
+from rigd.session import touch_line
 
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
@@ -59,7 +60,8 @@ def result_line(session: Mapping[str, Any]) -> str:
         return f"{outcome}: file incomplete, {session['part']}.{reason}"
     if session["path"] is None:
         return f"{outcome}: no record.{reason}"
-    return f"{outcome}: {counts_text(session)}.{reason}"
+    touches = "".join(f" {touch_line(touch)}." for touch in session.get("touches", []))
+    return f"{outcome}: {counts_text(session)}.{reason}{touches}"
 
 
 class ProgressLine:

@@ -52,7 +52,7 @@ class SeriesFailedError(FailureError):
 
 
 def run_in_foreground(
-    build: Callable[[Profile], Excitation],
+    build: Callable[..., Excitation],
     crew: ProcessGroup,
     stop: StopRequest,
     *,
@@ -67,14 +67,16 @@ def run_in_foreground(
     quiet_stdout: bool,
     hardware: bool = False,
     look: bool = False,
+    from_angle: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
+    obstacles: Sequence[str] = (),
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
     Parameters
     ----------
     build
-        Makes the excitation for a rig.
+        Makes the excitation for a rig, from its profile.
     crew
         The processes, started but not yet needed; ended when this returns.
     stop
@@ -90,8 +92,13 @@ def run_in_foreground(
         Tell the operator on standard error, because standard output is for a document.
     look
         Take a quick look at each session, and wait some seconds for the last one.
+    from_angle
+        The excitation depends on where the motor stands: the rig is connected before it is made,
+        with the angle as ``start_rad``.
     prepare
         Changes the profile before it is planned with.
+    obstacles
+        What a simulated beam meets, as on the command line.
 
     Raises
     ------
@@ -112,7 +119,9 @@ def run_in_foreground(
     try:
         # The rig is given up last, when no process uses the devices any more.
         with contextlib.ExitStack() as reserved, crew:
-            profile, moving = load_rig(profile_name, fast=fast, seed=seed, hardware=hardware)
+            profile, moving = load_rig(
+                profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
+            )
             if prepare is not None:
                 profile = prepare(profile)
             _tell(what_moves(profile.rig, moving), err=True)
@@ -122,14 +131,17 @@ def run_in_foreground(
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
             mounted = with_specimen(profile, notes.get("specimen", ""))
+            rig = Rig(profile, fast=fast, crew=crew)
+            if from_angle and not stop.requested:
+                rig.connect(moving)
+                build = partial(build, start_rad=rig.angle_rad)
             series = Series(
                 mounted, build(mounted), folder, repeat=repeat, notes=notes, force=force
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
                 tell(line)
-            rig = Rig(profile, fast=fast, crew=crew)
-            if not stop.requested:
+            if not (stop.requested or rig.connected):
                 rig.connect(moving)
             with _Operator(series.ticks, repeat, tell) as operator:
                 series.run(rig, stop, operator, live=live, looks=looks)
@@ -182,6 +194,8 @@ class _Operator:
         for event in events:
             if event.level in ("warning", "error", "fatal"):
                 self._line.say(f"{event.level.capitalize()}: {event.message}")
+            elif event.notable:
+                self._line.say(event.message)
         self._line.update(
             progress.phase,
             progress.tick,

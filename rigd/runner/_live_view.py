@@ -2,10 +2,11 @@
 
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
-from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
@@ -96,6 +97,11 @@ class LiveView:
         self.look()
         told, self._untold = self._untold, []
         return told
+
+    def touched(self, touches: Sequence[Mapping[str, Any]]) -> None:
+        """Show touches of the session, as in JSON documents."""
+        if touches and self._session is not None:
+            self._send(LiveTouches(tuple(touches)))
 
     def finish(self, outcome: str, reason: str) -> None:
         """Note the end of the session that is shown; its outcome may be unknown."""

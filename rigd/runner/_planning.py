@@ -3,17 +3,32 @@
 import inspect
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, tip_motion
-from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
+from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, participation, poles, tip_motion
+from rigd.control import (
+    ClosedLoop,
+    LoopResponse,
+    check_stability,
+    close_loop,
+    design_damper,
+)
+from rigd.engine import Ending
 from rigd.errors import UserError
-from rigd.excitation import KINDS, Excitation, Value, make_excitation
+from rigd.excitation import (
+    KINDS,
+    Excitation,
+    MovePlant,
+    Value,
+    make_excitation,
+)
+from rigd.identified_beam import read_identified_beam
 from rigd.profile import Profile
 
 Real = NDArray[np.float64]
@@ -24,6 +39,15 @@ _MOST_RAD = 2.0 * math.pi
 """Largest amplitude that an excitation takes."""
 _ROUNDS = 10
 """Steps of the search for the largest amplitude; three or four are needed."""
+_MOST_MODES = 6
+"""Modes that a move leaves at rest; those above are too weak to be seen."""
+_UNSURE = 0.01
+"""Relative uncertainty of the frequencies of a profile's beam, which nobody states."""
+_FILTERS = 1.2
+"""Acceleration of a move's reference over what the peak torque does to the motor alone: some more,
+for the loop follows it through its filters."""
+_SETTLED = 5.0
+"""Time constants of the loop in which it follows up a reference."""
 
 
 class RefusedError(UserError):
@@ -58,6 +82,8 @@ class Plan:
     """What the free end will do, and whether the linear model holds there."""
     refused: str = ""
     """Why it must not be run: a line for each limit that it would leave; empty if it may be run."""
+    ending: Ending = field(default_factory=Ending)
+    """What follows the record, for the control process."""
 
 
 class LoopPreview:
@@ -67,10 +93,13 @@ class LoopPreview:
     ----------
     profile
         Profile of the rig. Its closed loop is computed when first needed.
+    start_rad
+        Where the motor stands, from the rig's zero.
     """
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
         self._profile = profile
+        self.start_rad = start_rad
 
     @property
     def beam(self) -> Beam:
@@ -97,8 +126,86 @@ class LoopPreview:
         firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
         return _share(firm + forcible)
 
+    def move_plant(self, path: str | Path = "") -> MovePlant:
+        """Return the rig for planning a move.
 
-def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value]) -> Excitation:
+        Parameters
+        ----------
+        path
+            Document of ``analyze --json``, whose beam takes the place of the profile's; empty: the
+            profile's.
+
+        Raises
+        ------
+        ExcitationError
+            If the document is not what it should be.
+        ControlDesignError
+            If the loop is unstable with that beam.
+        RealisationError
+            If its damping cannot be realised.
+        """
+        profile = self._profile
+        model, uncertainty = profile.loop_model(), _UNSURE
+        if path:
+            identified = read_identified_beam(path, self.beam.length_m)
+            model = replace(model, beam=identified.beam, damping=identified.damping)
+            uncertainty = identified.frequency_uncertainty
+        # tanh of the speed is not linear: a move takes its largest value off the torque.
+        settings = replace(model.settings, friction_compensation_nm=0.0)
+        loop = close_loop(replace(model, settings=settings))
+        check_stability(loop)
+        ringing = mode_poles(loop)
+        beam = loop.model.beam
+        assert beam is not None
+        # Torque of a mode of the beam for the angle's acceleration: a² rho omega sin(omega t).
+        omega = np.abs(ringing)
+        per_angle = participation(beam, ringing.size) * beam.density_kg_per_m * omega
+        motor = profile.control_motor
+        return MovePlant(
+            rate_hz=model.rate_hz,
+            respond=loop.simulate,
+            poles_rad_s=ringing,
+            torque_per_state_nm_s=per_angle * np.abs(loop.response(omega / (2.0 * math.pi))),
+            frequency_uncertainty=np.full(ringing.size, uncertainty),
+            settling_s=_SETTLED / settings.pole_rad_s,
+            peak_torque_nm=motor.peak_torque_nm,
+            friction_nm=profile.control.friction_compensation_nm,
+            largest_acceleration_rad_s2=_FILTERS * motor.peak_torque_nm / motor.inertia_kg_m2,
+            velocity_rad_s=profile.limits.velocity_rad_s,
+            tracking_error_rad=profile.limits.tracking_error_rad,
+            coupling_torque_nm=_sensor_limit_nm(profile),
+            angle_rad=profile.limits.angle_rad,
+        )
+
+
+def mode_poles(loop: ClosedLoop) -> Complex:
+    """Return the poles of a closed loop that are the modes of its beam, one of each pair.
+
+    What rings on while the motor is held is the closed loop: its poles lie near those of the beam
+    with locked hub, and where the loop damps them they differ.
+
+    Parameters
+    ----------
+    loop
+        Closed loop with a beam.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        In rad/s, of the lowest modes that oscillate and lie within reach of the ticks.
+    """
+    model = loop.model
+    assert model.beam is not None
+    locked = poles(model.beam, model.damping, _MOST_MODES)[:, 0]
+    oscillating = (locked.imag != 0.0) & (np.abs(locked) < 0.5 * math.pi * model.rate_hz)
+    return np.array(
+        [loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked[oscillating]]
+    )
+
+
+def excitation_for(
+    profile: Profile, kind: str, parameters: Mapping[str, Value], start_rad: float = 0.0
+) -> Excitation:
     """Make an excitation for a rig: see `rigd.excitation._named.make_excitation`.
 
     Parameters
@@ -107,8 +214,10 @@ def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value])
         Profile of the rig.
     kind, parameters
         Name and options of the excitation.
+    start_rad
+        Where the motor stands, from the rig's zero; only a move asks for it.
     """
-    return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile))
+    return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile, start_rad))
 
 
 def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
@@ -169,7 +278,15 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
         warnings=tuple(([unstable] if unstable else []) + ([] if refusals else clipped)),
         tip_in_words=_tip_in_words(prediction, profile.rig.beam),
         refused="\n".join(refusals),
+        ending=_ending(loop, stays=excitation.stays),
     )
+
+
+def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
+    """Plan what follows the record: a return that leaves the beam at rest, and active damping."""
+    if loop.model.beam is None:
+        return Ending(stays=stays)
+    return Ending(stays, tuple(map(complex, mode_poles(loop))), design_damper(loop))
 
 
 def largest_amplitude(
@@ -264,12 +381,43 @@ def _has_amplitude(kind: str) -> bool:
 
 
 def _sweep_in_words(excitation: Excitation) -> str:
-    """Say from where to where a chirp sweeps; nothing of any other excitation."""
+    """Say from where to where a chirp sweeps, and where a move or a search goes; else nothing."""
+    if excitation.kind == "move":
+        return _move_in_words(excitation.parameters)
+    if excitation.kind == "touch":
+        return _search_in_words(excitation.parameters)
     if excitation.kind != "chirp":
         return ""
     start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
     down = " down" if stop_hz < start_hz else ""
     return f"sweeps{down} from {start_hz:g} to {stop_hz:g} Hz"
+
+
+def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
+    """Say where a move goes, how long it takes, and what vibration it is predicted to leave."""
+    by_rad, angle_rad, duration_s, share, residual_nm, quintic_nm = (
+        float(parameters[name])
+        for name in (
+            *("by_rad", "angle_rad", "duration_s"),
+            *("limits_share", "residual_nm", "quintic_residual_nm"),
+        )
+    )
+    return (
+        f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms "
+        f"({100 * share:.0f} % of the limits), vibration left {1e3 * residual_nm:.2g} mN·m "
+        f"(quintic {1e3 * quintic_nm:.3g}; beam of {parameters['file'] or 'profile'})"
+    )
+
+
+def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
+    """Say how far and how fast a search for an obstacle goes."""
+    passes = int(parameters["passes"])
+    return (
+        f"goes to {float(parameters['angle_rad']):.4g} rad at {parameters['speed_rad_s']:g} rad/s"
+        f"{f', {passes} times' if passes > 1 else ''}, brakes within "
+        f"{1e3 * float(parameters['braking_s']):.0f} ms of a touch (beam of "
+        f"{parameters['file'] or 'profile'})"
+    )
 
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
@@ -285,7 +433,12 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     tip = None
     if model.beam is not None:
         tip = tip_motion(model.beam, model.damping, response.angle_rad, model.rate_hz)
-    return _peaks(excitation.reference_rad, response, tip)
+    peaks = _peaks(excitation.reference_rad, response, tip)
+    if excitation.kind not in ("move", "touch"):
+        return peaks
+    # These know where they start.
+    start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
+    return replace(peaks, peak_angle_rad=_peak(start_rad + response.angle_rad))
 
 
 def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = None) -> Prediction:

@@ -14,6 +14,7 @@ from rigd.engine import (
     LIVE,
     PROCESSES,
     RECORDER,
+    TOUCH,
     Child,
     ChildError,
     Process,
@@ -35,6 +36,8 @@ class ProcessGroup:
     ----------
     live
         Start the live publisher too.
+    touch
+        Start the process that estimates touches too; else it is started when it is needed.
 
     Raises
     ------
@@ -52,8 +55,9 @@ class ProcessGroup:
         own.
     """
 
-    def __init__(self, *, live: bool) -> None:
+    def __init__(self, *, live: bool, touch: bool = False) -> None:
         self.live = live
+        self._touch = touch
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
@@ -62,7 +66,8 @@ class ProcessGroup:
         try:
             while len(self._fds) < _DESCRIPTORS:
                 self._fds.append(shared_memory_fd())
-            for process in (CONTROL, RECORDER, LIVE) if live else (CONTROL, RECORDER):
+            wanted = {CONTROL: True, RECORDER: True, LIVE: live, TOUCH: touch}
+            for process in (process for process in PROCESSES if wanted.get(process)):
                 self._start(process)
         except (OSError, ChildError):
             self.end()
@@ -92,7 +97,7 @@ class ProcessGroup:
         ChildError
             If it cannot be started.
         """
-        if process in self._used:
+        if process in self._used or process not in self._children:
             if process in self._children:  # the last one may not have been started
                 self._children.pop(process).stop(process.grace_s)
             self._start(process)
@@ -132,7 +137,7 @@ class ProcessGroup:
         from rigd.engine import HURRIED_BUFFERED_S, create_channels
         from rigd.safety import BUFFERED_S
 
-        buffered_s = HURRIED_BUFFERED_S if fast and self.live else BUFFERED_S
+        buffered_s = HURRIED_BUFFERED_S if fast and (self.live or self._touch) else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:

@@ -10,9 +10,9 @@ import platform
 import shlex
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -26,12 +26,14 @@ from rigd.devices import (
     simulated_differently,
     unreachable_simulators,
     what_moves,
+    with_obstacles,
 )
-from rigd.engine import Connected, FileHeader
+from rigd.engine import Connected, Ending, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.runner._planning import RefusedError
+from rigd.runner._touch_search import TouchSearch
 from rigd.safety import Limits
 from rigd.session import META_PREFIX, NOTES, PART_SUFFIX
 from rigd.units import unit_of
@@ -60,10 +62,19 @@ class Order:
     """Operator, specimen, note, number in a series, added metadata: metadata as given."""
     predicted: tuple[tuple[str, str], ...] = ()
     """Predicted peaks and their limits, as metadata."""
+    ending: Ending = field(default_factory=Ending)
+    """What follows the record."""
+    touch: TouchSearch | None = None
+    """What the loop looks for; None: nothing."""
 
 
 def load_rig(
-    name: str, *, fast: bool = False, seed: int | None = None, hardware: bool = False
+    name: str,
+    *,
+    fast: bool = False,
+    seed: int | None = None,
+    hardware: bool = False,
+    obstacles: Sequence[str] = (),
 ) -> tuple[Profile, WhatMoves]:
     """Load a profile and see what would move.
 
@@ -77,9 +88,13 @@ def load_rig(
         Seed of a simulated rig's noise; None keeps the profile's.
     hardware
         The operator says that the hardware is to move.
+    obstacles
+        What a simulated beam meets, beside the obstacles of the profile.
 
     Raises
     ------
+    ObstacleError
+        If an obstacle is not written as it should be, or cannot be simulated on this rig.
     ProfileError, UnknownDeviceError
         If the profile cannot be used.
     RefusedError
@@ -115,6 +130,18 @@ def load_rig(
         assert profile.rig.simulation is not None
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
+    if obstacles:
+        if moving is not WhatMoves.SIMULATED:
+            raise RefusedError(
+                f"--obstacle: {moving.value} of {profile.path} is not simulated here; omit the "
+                "option."
+                + (
+                    " Or inject the obstacle into the simulated rig (rigd inject obstacle,x=…)."
+                    if moving is WhatMoves.SIMULATOR
+                    else ""
+                )
+            )
+        profile = replace(profile, rig=with_obstacles(profile.rig, obstacles))
     return profile, moving
 
 
@@ -360,11 +387,15 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
     if rig.ati_serial is not None:
         metadata["sensor_filter"] = rig.ati_serial.filter
         metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    if any(rig.sensor.shear_projection):
+        metadata["shear_projection"] = ",".join(map(repr, rig.sensor.shear_projection))
     if rig.sensor.filter_hz > 0:
         metadata["torque_filter_hz"] = repr(rig.sensor.filter_hz)
         metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
     if rig.devices.drive == "sim" and rig.simulation is not None:
         metadata["simulation_seed"] = str(rig.simulation.seed)
+        if rig.simulation.obstacles:
+            metadata["simulation_obstacles"] = "; ".join(rig.simulation.obstacles)
     return metadata
 
 

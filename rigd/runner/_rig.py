@@ -99,6 +99,17 @@ class Rig:
         return self._told is not None and self._told.simulated
 
     @property
+    def angle_rad(self) -> float:
+        """Where the motor stands, from the rig's zero.
+
+        Raises
+        ------
+        RigError
+            If the rig is not connected.
+        """
+        return self._require().channels.board[Word.ANGLE_NRAD] * 1e-9
+
+    @property
     def calibration(self) -> Mapping[str, Any] | None:
         """Identity and calibration of the connected sensor; None while not connected."""
         return None if self._told is None or not self.connected else self._told.calibration

@@ -13,10 +13,16 @@ from typing import Any, Final, Protocol
 from rigd.engine import Event
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import plan_document, plan_session, predicted_metadata
+from rigd.runner._planning import (
+    RefusedError,
+    plan_document,
+    plan_session,
+    predicted_metadata,
+)
 from rigd.runner._quick_looks import QuickLooks
 from rigd.runner._request import Order, check_required, choose_path, make_room
 from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
+from rigd.runner._touch_search import touch_search
 from rigd.runtime import StopRequest
 
 _LOOK_PATIENCE_S: Final = 8.0
@@ -134,7 +140,13 @@ class Series:
         self._repeat = repeat
         self._notes = {name: text for name, text in (notes or {}).items() if text}
         check_required(profile, self._notes)
+        if excitation.stays and repeat > 1:
+            raise RefusedError(
+                f"--repeat {repeat}: a {excitation.kind} ends elsewhere than it starts and is run "
+                "once; omit the option."
+            )
         self.plan = plan_session(profile, excitation, force=force)
+        self._touch = touch_search(profile, excitation)
         self.results: list[SessionResult] = []
         self._make_room()
 
@@ -203,6 +215,8 @@ class Series:
                 path,
                 tuple(notes.items()),
                 tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+                self.plan.ending,
+                self._touch,
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:
@@ -210,7 +224,8 @@ class Series:
                 result = rig.run(order, stop, watcher.update, listens)
             self.results.append(result)
             watcher.ended(result)
-            if looks is not None and result.path is not None:
+            # A move that leaves no vibration shows nothing of the modes.
+            if looks is not None and result.path is not None and self._excitation.shows_modes:
                 looks.begin(result.path)
             if not result.went_well:
                 return

@@ -5,12 +5,13 @@ the recorder is ready, shows the progress, passes a stop on, sees that every pro
 has the file closed with the outcome.
 """
 
+import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from rigd.engine import (
     CONTROL,
@@ -41,6 +42,7 @@ from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order, another_path, file_header, part_of
+from rigd.runner._touch_search import TouchEstimates
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
@@ -103,6 +105,7 @@ class SessionFailedError(FailureError):
             part=part,
             hardware=self.hardware,
             look=None,
+            touches=None,
             **self.counts,
         )
 
@@ -145,6 +148,8 @@ class SessionResult:
     """Whether it was the hardware that moved, and nothing simulated; None: not known."""
     look: Path | None = None
     """Path of the quick look at it; None: there is none, or none yet."""
+    touches: tuple[Mapping[str, Any], ...] | None = None
+    """Touches in the order in which they happened; None: none was looked for."""
 
     @property
     def went_well(self) -> bool:
@@ -153,6 +158,7 @@ class SessionResult:
 
     def as_dict(self) -> dict[str, object]:
         """Return it as JSON documents have it."""
+        touches = {} if self.touches is None else {"touches": list(self.touches)}
         return {
             "path": None if self.path is None else str(self.path),
             "part": None if self.part is None else str(self.part),
@@ -167,6 +173,7 @@ class SessionResult:
             "stale_wrenches": self.stale_wrenches,
             "hardware": self.hardware,
             "look": None if self.look is None else str(self.look),
+            **touches,
         }
 
 
@@ -238,6 +245,7 @@ class Session:
         self._drive_at_end = "The drive is disabled."
         self._opened: Path | None = None
         self._kept: Path | None = None
+        self._touches: TouchEstimates | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -279,10 +287,16 @@ class Session:
                 f"No shared memory for a session this long ({error.strerror}); check the "
                 "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
             ) from None
+        order = self._order
+        if order.touch is not None:
+            self._touches = TouchEstimates(crew, order.touch, order.profile.rig.rate_hz)
         self._open_file()
         order = self._order
         self._control_at_work = True
-        job = SessionJob(order.profile, reference, self._refused_to_supervision())
+        touch = None if order.touch is None else order.touch.order
+        job = SessionJob(
+            order.profile, reference, self._refused_to_supervision(), order.ending, touch
+        )
         crew.control.send(job)
         answer = self._listen_to_control()
         if isinstance(answer, Ready):
@@ -439,6 +453,10 @@ class Session:
         events = read_events(self._events.take(16))
         if self._live is not None:
             events += self._live.attend()
+        if self._touches is not None:
+            events += self._touches.attend()
+            if self._live is not None:
+                self._live.touched(self._touches.news())
         self._watcher(
             SessionProgress(
                 Phase(board[Word.PHASE]),
@@ -451,14 +469,20 @@ class Session:
 
     def _close(self, finished: Finished) -> SessionResult:
         self._report()
+        touches = None
         outcome = {
             "outcome": finished.outcome,
             "reason": finished.reason,
             **{name: str(count) for name, count in finished.counts.items()},
             **finished.results,
         }
+        if self._touches is not None:
+            touches = self._touches.finish(self._board[Word.TOUCHES], self._report)
+            outcome["touches"] = json.dumps(touches)
+            self._report()
         self._crew.recorder.wake()
-        self._crew.recorder.send(Close(outcome))
+        packed = b"" if self._touches is None else self._touches.packed()
+        self._crew.recorder.send(Close(outcome, packed))
         closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
@@ -477,7 +501,21 @@ class Session:
             stale_wrenches=counts["stale_wrenches"],
             fault=finished.fault or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
+            touches=None if touches is None else tuple(touches),
         )
+
+
+def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
+    """Return the results of a series as the JSON document of its command.
+
+    Parameters
+    ----------
+    results
+        How its sessions ended.
+    """
+    found = [result.touches for result in results if result.touches is not None]
+    touches = {"touches": [touch for each in found for touch in each]} if found else {}
+    return {"sessions": [result.as_dict() for result in results], **touches}
 
 
 def always() -> bool:

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from processes import child_running, eventually, has_ended, ignored, ignores
 
+from rigd.beam import pressing_force_n
+from rigd.profile import load_profile
 from rigd.session import Status, read_controls, read_session
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -128,6 +130,27 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     sweep = record.samples["angle_reference_rad"][first:end]
     assert np.allclose(np.diff(sweep), 1e-5, atol=1e-9)
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
+
+
+def test_an_obstacle_is_met_and_stands_in_the_file(rigd, tmp_path):
+    options = ("step", "--amplitude", "0.05", "--duration", "1", "--rest", "0.2", "--fast")
+    obstacle = "x=0.62,angle=0.02,stiffness=3000"
+    sessions = []
+    for more in ((), ("--obstacle", obstacle)):
+        folder = tmp_path / str(len(more))
+        rigd("run", *options, "--output", str(folder), *more)
+        [path] = folder.glob("*.mcap")
+        sessions.append(read_session(path))
+    free, touched = sessions
+    assert "simulation_obstacles" not in free.metadata
+    assert touched.metadata["simulation_obstacles"] == obstacle
+    assert touched.metadata["shear_projection"] == "0.0,1.0,0.0,0.0,0.0,0.0"
+    # At the end the beam rests against it: S = F, torque = x F.
+    end = touched.samples[-300:]
+    force_n = pressing_force_n(load_profile("sim").rig.beam, 0.62, 0.03, 3000.0)
+    assert end["fy_n"].mean() == pytest.approx(force_n, abs=0.2 * force_n)
+    assert end["coupling_torque_nm"].mean() == pytest.approx(0.62 * force_n, abs=0.1 * force_n)
+    assert abs(free.samples["fy_n"][-300:].mean()) < 0.2 * force_n
 
 
 def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):

@@ -71,6 +71,8 @@ def test_a_bad_profile_is_refused(rigd_here, tmp_path, change):
         (("--no-such-option",), ("--no-such-option",)),
         (("--output", "taken"), ("taken",)),
         (("--note", "two\nlines"), ("--note",)),
+        (("--obstacle", "x=0.5"), ("Obstacle 'x=0.5'", "'angle' is missing")),
+        (("--obstacle", "x=1.5,angle=1"), ("beyond the tip", "0.98 m")),
     ],
 )
 def test_an_absurd_option_is_refused(rigd_here, tmp_path, arguments, words):

@@ -91,11 +91,29 @@ def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
     assert refused.wrong_use
 
 
+def test_a_move_starts_where_the_motor_stands_and_stays_where_it_went(operated):
+    brief = {"rest_s": 0.1, "ring_down_s": 0.1}
+    reply = operated.ask("start", excitation="move", parameters={"angle_rad": 0.05, **brief})
+    assert "to 0.05 rad" in reply["plan"]["sweep"]
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+    reply = operated.ask("start", excitation="move", parameters={"by_rad": -0.08, **brief})
+    assert reply["plan"]["parameters"]["by_rad"] == pytest.approx(-0.08)
+    assert reply["plan"]["parameters"]["angle_rad"] == pytest.approx(-0.03, abs=1e-3)
+    session = read_session(operated.last["sessions"][0]["path"])
+    assert session.samples["angle_rad"][0] == pytest.approx(0.05, abs=1e-3)
+    refused = operated.ask("start", excitation="move", parameters={"angle_rad": -0.03, **brief})
+    assert "already" in str(refused)
+    assert refused.wrong_use
+    predicted = operated.ask("predict", excitation="move", parameters={"by_rad": 0.1, **brief})
+    assert predicted["plan"]["parameters"]["angle_rad"] == pytest.approx(0.07, abs=1e-3)
+    assert predicted["largest_amplitude_rad"] is None
+
+
 def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(operated):
     operated.ask("start", **SHORT, repeat=2)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "complete"]
     assert len(operated.world.drives) == 1
-    operated.world.countdown, operated.world.then = 2700, fail
+    operated.world.countdown, operated.world.then = 3200, fail
     operated.ask("start", **SHORT, repeat=3)
     assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "fault"]
     assert operated.last["failed"]

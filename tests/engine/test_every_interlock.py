@@ -240,7 +240,7 @@ def resting(make_session):
 
 def test_a_zero_that_moves_during_a_session_is_told(make_session):
     session = resting(make_session)
-    sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.05])
+    sensor(session, wrong_from=7600, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.05])
     finished = session.run().finished
     session.assert_safe()
     assert finished.outcome == "complete"  # the record is what it is
@@ -257,7 +257,7 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
     make_session, operator_tares
 ):
     session = make_session()
-    sensor(session, wrong_from=10_001, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
+    sensor(session, wrong_from=8801, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
     job = session.order()
     session.obey(*[job, *([Tare()] if operator_tares else []), job])
     session.assert_safe()
@@ -274,7 +274,7 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
 
 def test_a_small_drift_is_a_warning(make_session):
     session = resting(make_session)
-    sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.005])
+    sensor(session, wrong_from=7600, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.005])
     finished = session.run().finished
     assert (finished.outcome, finished.reason) == ("complete", "")
     [warning] = [event for event in session.events if event.level == "warning"]

@@ -1,0 +1,126 @@
+"""Watch for a touch in the control loop: after each tick of a search, and what follows at once."""
+
+from dataclasses import dataclass
+
+from rigd.engine._cycle import Cycle
+from rigd.engine._messages import TouchOrder
+from rigd.excitation import after_touch
+from rigd.session import Status
+from rigd.touch import TouchDetector
+
+_ANGLE_STALE = int(Status.ANGLE_STALE)
+_WRENCH_STALE = int(Status.WRENCH_STALE)
+_TOUCHED = int(Status.TOUCHED)
+_HARD_TICKS = 2
+"""Ticks in a row with too great a force: one alone may be a disturbed reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Contact that the loop has detected."""
+
+    message: str
+    """Sentence for the operator."""
+    ends: str = ""
+    """Outcome with which the session ends at once; empty: it goes on."""
+    detected: bool = True
+    """It is a touch by the detector's judgement, and marked so in its sample."""
+
+
+class TouchWatch:
+    """Follows a search, and reacts to a touch.
+
+    On the way out, and in the pause after it, a touch makes the motor brake, stay and go back
+    to where the pass began. On the way back there is nowhere to go: the session is stopped.
+
+    Parameters
+    ----------
+    order
+        The obstacle to look for.
+    cycle
+        Work of a tick, with the readings of the last.
+    reference_rad
+        Reference of the session, relative to its start; what follows a touch is written to it.
+    rate_hz
+        Ticks a second.
+    """
+
+    def __init__(
+        self, order: TouchOrder, cycle: Cycle, reference_rad: "memoryview[float]", rate_hz: float
+    ) -> None:
+        self._cycle = cycle
+        self._reference_rad = reference_rad
+        self._rate_hz = rate_hz
+        self._approach = order.approach
+        self._projection = order.shear_projection
+        self._detector = TouchDetector(order.model, order.signatures, rate_hz, order.settings)
+        self._passes = iter(order.approach.passes)
+        self._pass = next(self._passes)
+        self._arms = self._pass.begins
+        self._hard = 0
+
+    def step(self, tick: int, missed: int) -> Contact | None:
+        """Look at the tick that was just run.
+
+        Parameters
+        ----------
+        tick
+            Its number in the record.
+        missed
+            Ticks that were missed right before it.
+        """
+        cycle, detector = self._cycle, self._detector
+        flags = cycle.flags
+        shear_n = 0.0
+        if self._projection is not None:
+            px, py, pz, qx, qy, qz = self._projection
+            fx, fy, fz, tx, ty, tz = cycle.wrench
+            shear_n = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
+        while tick >= self._pass.ends and (following := next(self._passes, None)) is not None:
+            self._pass = following
+            self._arms = following.begins
+        if self._arms <= tick:
+            self._arms = len(self._reference_rad)
+            detector.arm()
+        touched = detector.step(
+            cycle.angle_rad,
+            cycle.coupling_torque_nm,
+            shear_n,
+            missed=missed,
+            angle_stale=bool(flags & _ANGLE_STALE),
+            wrench_stale=bool(flags & _WRENCH_STALE),
+        )
+        too_hard = self._too_hard(shear_n)
+        if too_hard is not None or not touched:
+            return too_hard
+        cycle.flags |= _TOUCHED
+        if tick >= self._pass.returns:
+            return Contact(
+                "The beam met something on its way back. Find what stands in its way.", "stopped"
+            )
+        self._react(tick)
+        return Contact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
+
+    def _react(self, tick: int) -> None:
+        """Write the rest of the pass anew."""
+        reference, current = self._reference_rad, self._pass
+        self._detector.disarm()
+        recent = reference[max(tick - 2, 0)], reference[max(tick - 1, 0)], reference[tick]
+        start_rad = reference[current.begins - 1] if current.begins else 0.0
+        path = after_touch(self._approach, current.ends, tick, recent, start_rad)
+        reference[tick + 1 : current.ends] = memoryview(path)  # type: ignore[arg-type] # numpy's stubs
+
+    def _too_hard(self, shear_n: float) -> Contact | None:
+        if self._projection is None:
+            return None
+        force_n = abs(self._detector.contact_force_n(shear_n))
+        limit_n = self._approach.force_limit_n
+        self._hard = self._hard + 1 if force_n > limit_n else 0
+        if self._hard < _HARD_TICKS:
+            return None
+        return Contact(
+            f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "
+            "speed, or a higher limit.",
+            "fault",
+            detected=False,
+        )

@@ -1,0 +1,230 @@
+"""Search for an obstacle: what loop and estimator are told, and what comes of a session's touches.
+
+The control loop detects a touch and reacts by itself. The touch process estimates it meanwhile; a
+session goes on without it if it is lost.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import sqrt
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from rigd.engine import (
+    TOUCH,
+    ChildError,
+    Event,
+    TouchJob,
+    TouchOrder,
+    TouchReady,
+    TouchTold,
+)
+from rigd.excitation import Excitation
+from rigd.profile import Profile
+from rigd.session import packed_touches, touch_line
+
+if TYPE_CHECKING:
+    from rigd.runner._process_group import ProcessGroup
+    from rigd.touch import Noise, TouchModel
+
+_STEP_STD: Final = 1 / sqrt(12)
+"""Standard deviation of a value that is rounded to steps of 1."""
+_READY_PATIENCE_S: Final = 20.0
+"""Time for the estimator to prepare on a busy computer; nothing moves yet."""
+_LAST_PATIENCE_S: Final = 10.0
+"""Time for the last estimate after the end of a record."""
+_POLL_S: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class TouchSearch:
+    """The obstacle to look for, for both processes."""
+
+    order: TouchOrder
+    """For the control loop."""
+    model: "TouchModel"
+    """For the estimator."""
+
+
+def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None:
+    """Return what a session is to look for; None: nothing.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    excitation
+        Reference, with its approach if it is a search.
+
+    Raises
+    ------
+    IdentifiedBeamError
+        If the document of the model is not what it should be.
+    """
+    if excitation.approach is None:
+        return None
+    from rigd.touch import DetectorSettings, TouchModel, observed_beam, signatures
+
+    rig = profile.rig
+    sensor = rig.sensor
+    path = str(excitation.parameters["file"])
+    if path:
+        model = TouchModel.from_analysis(
+            path,
+            length_m=rig.beam.length_m,
+            angle_delay_s=rig.encoder.delay_s,
+            torque_delay_s=sensor.delay_s,
+            tool_inertia_kg_m2=sensor.tool_inertia_kg_m2,
+        )
+    else:
+        model = TouchModel.assumed(
+            rig.beam,
+            rig.damping,
+            angle_delay_s=rig.encoder.delay_s,
+            torque_delay_s=sensor.delay_s,
+            tool_inertia_kg_m2=sensor.tool_inertia_kg_m2,
+        )
+    observed = observed_beam(
+        model.beam,
+        model.damping,
+        rig.rate_hz,
+        _noise(profile),
+        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
+        torque_after_angle_s=model.torque_delay_s - model.angle_delay_s,
+    )
+    shear = sensor.shear_projection if any(sensor.shear_projection) else None
+    return TouchSearch(
+        TouchOrder(
+            observed,
+            signatures(model.beam, model.damping, rig.rate_hz, observed),
+            DetectorSettings(),
+            excitation.approach,
+            shear,
+        ),
+        model,
+    )
+
+
+def _noise(profile: Profile) -> "Noise":
+    """Return the noise of the readings, of which the ratio counts: its size is measured at rest."""
+    from rigd.touch import Noise
+
+    rig = profile.rig
+    axes = np.array(rig.sensor.resolution)
+    if rig.simulation is not None:
+        axes = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
+    torque_nm, shear_n = (
+        float(np.linalg.norm(np.array(projection) * axes))
+        for projection in (rig.sensor.projection, rig.sensor.shear_projection)
+    )
+    return Noise(torque_nm, shear_n or None, _STEP_STD * rig.encoder.resolution_rad)
+
+
+class TouchEstimates:
+    """What the touch process tells of one session.
+
+    Parameters
+    ----------
+    crew
+        Processes of the rig, their memory laid out.
+    search
+        The obstacle that is looked for.
+    rate_hz
+        Ticks a second.
+    """
+
+    def __init__(self, crew: "ProcessGroup", search: TouchSearch, rate_hz: float) -> None:
+        self._crew = crew
+        self._rate_hz = rate_hz
+        self._events: list[Event] = []
+        self._news: list[dict[str, Any]] = []
+        self._lost = ""
+        self._told: dict[int, TouchTold] = {}
+        job = TouchJob(
+            crew.channels.specs,
+            crew.channels.samples.written,
+            rate_hz,
+            search.model,
+            search.order.shear_projection,
+        )
+        try:
+            crew.fresh(TOUCH).start(job)
+            if not isinstance(crew[TOUCH].poll(_READY_PATIENCE_S), TouchReady):
+                self._lose(f"The touch process was not ready within {_READY_PATIENCE_S:g} s.")
+        except ChildError as error:
+            self._lose(str(error))
+
+    def attend(self) -> list[Event]:
+        """Take what has come, and return what the operator is to be told."""
+        self._listen(0.0)
+        events, self._events = self._events, []
+        return events
+
+    def finish(self, touches: int, meanwhile: Callable[[], None]) -> list[dict[str, Any]]:
+        """Wait for the last estimates; return what is known of each touch.
+
+        Parameters
+        ----------
+        touches
+            How many the loop has detected.
+        meanwhile
+            Called some times a second.
+
+        Returns
+        -------
+        list of dict
+            In the order in which they happened, as in JSON documents; of one that was not
+            estimated there is its number alone.
+        """
+        deadline_s = time.monotonic() + _LAST_PATIENCE_S
+
+        def missing() -> bool:
+            final = [told for told in self._told.values() if told.final]
+            return len(final) < touches and not self._lost and time.monotonic() < deadline_s
+
+        while missing():
+            self._listen(_POLL_S)
+            meanwhile()
+        return [_document(number, self._told.get(number)) for number in range(1, touches + 1)]
+
+    def packed(self) -> bytes:
+        """Return the last estimates as messages for the session file."""
+        touches = [(told.tick, told.document) for _, told in sorted(self._told.items())]
+        return packed_touches(touches, self._rate_hz)
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return the estimates that came since the last time, for the live view."""
+        news, self._news = self._news, []
+        return news
+
+    def _listen(self, patience_s: float) -> None:
+        if self._lost:
+            return
+        try:
+            while (message := self._crew[TOUCH].poll(patience_s)) is not None:
+                if isinstance(message, TouchTold):
+                    self._told[message.number] = message
+                    self._note(message)
+                patience_s = 0.0
+        except ChildError as error:
+            self._lose(str(error))
+
+    def _note(self, told: TouchTold) -> None:
+        touch = _document(told.number, told)
+        self._news.append(touch)
+        line = touch_line(touch)
+        if not told.final:
+            line = f"{line} (first estimate)"
+        self._events.append(Event(0, "info", line, notable=True))
+
+    def _lose(self, why: str) -> None:
+        self._lost = why
+        text = f"{why} Touches are detected but not estimated; the session continues."
+        self._events.append(Event(0, "warning", text))
+
+
+def _document(number: int, told: TouchTold | None) -> dict[str, Any]:
+    found: Mapping[str, Any] = {} if told is None else told.document
+    return {"number": number, **found}

@@ -1,0 +1,130 @@
+"""What follows a record: the beam is damped actively, and the motor returns or stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.control import DamperSettings
+from rigd.engine._messages import Ending, Finished, Ready
+from rigd.excitation import chirp, step
+from rigd.runner import plan_session
+
+RATE_HZ = 1000.0
+
+
+@pytest.fixture
+def struck():
+    """Some periods at the first mode, after which the beam vibrates for long."""
+    return chirp(
+        rate_hz=RATE_HZ, amplitude_rad=0.02, start_hz=2.57, stop_hz=2.57, duration_s=1.6,
+        rest_s=0.3, ring_down_s=0.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def stepped():
+    """A step, so that the record ends elsewhere than it starts."""
+    return step(rate_hz=RATE_HZ, amplitude_rad=0.05, duration_s=0.5, rest_s=0.3, ring_down_s=0.0)
+
+
+@pytest.fixture
+def two_sessions(make_session, struck):
+    """Run a session twice with an ending; returns it and the virtual time that passed (s)."""
+
+    def run(ending, excitation=struck):
+        session = make_session(excitation=excitation)
+        job = replace(session.order(), ending=ending)
+        session.obey(job, replace(session.order(), ending=ending))
+        outcomes = [finished.outcome for finished in session.parent.said(Finished)]
+        assert outcomes == ["complete", "complete"]
+        session.assert_safe()
+        return session, session.clock.now_ns() * 1e-9
+
+    return run
+
+
+def test_the_next_session_need_not_wait_for_the_beam(two_sessions, struck):
+    ending = plan_session_of(struck)
+    damped, damped_s = two_sessions(ending)
+    left, left_s = two_sessions(replace(ending, damper=None))
+    assert damped_s < left_s - 2.0
+    assert not any("Waiting" in event.message for event in damped.events)
+    assert any("Waiting" in event.message for event in left.events)
+    # The zero of the torque can be checked right after the record, which needs a beam at rest.
+    for session, checked in ((damped, True), (left, False)):
+        for finished in session.parent.said(Finished):
+            assert ("tare_drift_nm" in finished.results) == checked
+
+
+def plan_session_of(excitation):
+    from rigd.profile import load_profile
+
+    return plan_session(load_profile("sim"), excitation).ending
+
+
+def starts_rad(session):
+    return [float(ready.tare["start_angle_rad"]) for ready in session.parent.said(Ready)]
+
+
+def test_the_motor_returns_to_where_it_started(two_sessions, stepped):
+    session, _ = two_sessions(plan_session_of(stepped), stepped)
+    first_rad, second_rad = starts_rad(session)
+    assert second_rad == pytest.approx(first_rad, abs=1e-3)
+
+
+def test_a_move_stays_where_it_went(two_sessions, stepped):
+    session, _ = two_sessions(replace(plan_session_of(stepped), stays=True), stepped)
+    first_rad, second_rad = starts_rad(session)
+    assert second_rad - first_rad == pytest.approx(0.05, abs=1e-3)
+
+
+def test_active_damping_stays_within_the_limit_of_the_angle(make_session):
+    """A record that ends at the limit: the motor yields to the other side only."""
+    excitation = step(
+        rate_hz=RATE_HZ, amplitude_rad=0.2, duration_s=0.3, rest_s=0.3, ring_down_s=0.0
+    )
+    session = make_session(excitation=excitation)
+    limits = replace(session.profile.limits, angle_rad=0.21, stop_angle_rad=0.5)
+    session.profile = replace(session.profile, limits=limits)
+    session.run()
+    assert session.finished.outcome == "complete"
+    assert session.finished.reason == ""
+
+
+def test_a_damper_that_excites_the_beam_ends(two_sessions):
+    """With the sign turned round it feeds the vibration: it ends after its time, and safely."""
+    wrong = Ending(damper=DamperSettings(-2.0, 0.025, 4.0, 320.0))
+    hold = step(rate_hz=RATE_HZ, amplitude_rad=0.005, duration_s=0.2, rest_s=0.2, ring_down_s=0.0)
+    session, _ = two_sessions(wrong, hold)
+    assert np.abs(session.samples["coupling_torque_nm"]).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    "unlike",
+    [
+        lambda p: replace(
+            p,
+            design_motor=p.rig.motor,
+            rig=replace(
+                p.rig, motor=replace(p.rig.motor, inertia_kg_m2=2 * p.rig.motor.inertia_kg_m2)
+            ),
+        ),
+        lambda p: replace(p, rig=replace(p.rig, motor=replace(p.rig.motor, coulomb_nm=0.08))),
+        lambda p: replace(p, rig=replace(p.rig, sensor=replace(p.rig.sensor, delay_s=5e-3))),
+        lambda p: replace(p, control=replace(p.control, feedforward_gain=0.8)),
+        lambda p: replace(
+            p, rig=replace(p.rig, beam=replace(p.rig.beam, bending_stiffness_n_m2=0.075))
+        ),
+    ],
+    ids=["inertia", "friction", "delay", "feed-forward", "stiffness"],
+)
+def test_active_damping_bears_a_rig_unlike_the_profile(make_session, struck, unlike):
+    """What the supervisor planned for the profile damps a rig that is another."""
+    profile = unlike(make_session().profile)
+    session = make_session(excitation=struck, profile=profile)
+    ending = plan_session_of(struck)
+    session.obey(replace(session.order(), ending=ending))
+    assert session.finished.outcome == "complete"
+    assert session.finished.reason == ""
+    assert "tare_drift_nm" in session.finished.results  # the beam was at rest

@@ -1,0 +1,181 @@
+"""What the control loop does about a touch; the detector itself has its own tests."""
+
+from array import array
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigd.engine._messages import TouchOrder
+from rigd.engine._touch_watch import TouchWatch
+from rigd.excitation import Approach, Pass, after_touch, braking_path, quintic
+from rigd.session import Status
+
+RATE_HZ = 1000.0
+BRAKING = braking_path(0.05, RATE_HZ)
+BACK = quintic(0.4, RATE_HZ)
+SHEAR = (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+OUT_TICKS = 500
+
+
+def one_pass(first):
+    """Rest of 200 ticks, way out at 1 rad/s, pause of 300, way back."""
+    out = np.arange(1, OUT_TICKS + 1) / RATE_HZ
+    reference = np.concatenate([np.zeros(200), out, np.full(300, out[-1]), out[-1] * (1 - BACK)])
+    begins = first + 200
+    returns = begins + OUT_TICKS + 300
+    return reference, Pass(begins, returns, first + reference.size)
+
+
+class ScriptedDetector:
+    """Detects in the ticks that the test says, if it is armed."""
+
+    def __init__(self, *_):
+        self.armed_at, self.disarmed_at = [], []
+        self.tick = -1
+        self.armed = False
+        self.at = set()
+        self.force_n = {}
+
+    def arm(self):
+        self.armed = True
+        self.armed_at.append(self.tick + 1)
+
+    def disarm(self):
+        self.armed = False
+        self.disarmed_at.append(self.tick)
+
+    def step(self, angle_rad, torque_nm, shear_n, *, missed, angle_stale, wrench_stale):
+        self.seen = angle_rad, torque_nm, shear_n, missed, angle_stale, wrench_stale
+        self.tick += 1 + missed
+        return self.armed and self.tick in self.at
+
+    def contact_force_n(self, shear_n):
+        return self.force_n.get(self.tick, shear_n)
+
+
+@pytest.fixture
+def search(monkeypatch):
+    """Two passes, watched; the detector is scripted."""
+    monkeypatch.setattr("rigd.engine._touch_watch.TouchDetector", ScriptedDetector)
+    first, one = one_pass(100)
+    second, two = one_pass(100 + first.size)
+    planned = np.concatenate([np.zeros(100), first, second, np.zeros(50)])
+    reference = array("d", planned)
+    cycle = SimpleNamespace(flags=0, wrench=(0.0,) * 6, angle_rad=0.1, coupling_torque_nm=0.2)
+    approach = Approach((one, two), BRAKING, 200, BACK, force_limit_n=5.0)
+    order = TouchOrder(None, None, None, approach, SHEAR)
+    watch = TouchWatch(order, cycle, memoryview(reference), RATE_HZ)
+    return SimpleNamespace(
+        watch=watch,
+        cycle=cycle,
+        reference=reference,
+        planned=planned,
+        one=one,
+        two=two,
+        detector=watch._detector,
+    )
+
+
+def run(search, until=None):
+    """Run the ticks; returns what each contact was, by its tick."""
+    contacts = {}
+    for tick in range(until or search.planned.size):
+        search.cycle.flags = 0
+        contact = search.watch.step(tick, 0)
+        if contact is not None:
+            contacts[tick] = contact
+            if contact.ends:
+                break
+    return contacts
+
+
+def test_without_a_touch_the_reference_stays(search):
+    assert run(search) == {}
+    assert np.array_equal(search.reference, search.planned)
+    assert search.detector.armed_at == [search.one.begins, search.two.begins]
+
+
+def test_after_a_touch_it_brakes_holds_and_goes_back(search):
+    tick = search.one.begins + 300
+    search.detector.at = {tick}
+    contacts = run(search, tick + 1)
+    assert search.cycle.flags & Status.TOUCHED
+    assert contacts[tick].message == f"Touch detected at {tick / RATE_HZ:.3f} s."
+    assert not contacts[tick].ends
+    reference = np.array(search.reference)
+    speed = np.diff(reference) * RATE_HZ
+    assert speed[tick - 1] == pytest.approx(1.0)
+    # No step in angle or speed: the deceleration is that of the braking path at most.
+    slowing = np.diff(speed[tick - 1 : tick + 60]) * RATE_HZ
+    assert np.abs(slowing).max() <= 1.5 / BRAKING.duration_s + 1e-6
+    stands = reference[tick + 60 : tick + 200]
+    assert np.ptp(stands) == 0.0
+    assert stands[0] == pytest.approx(reference[tick] + 0.5 * BRAKING.duration_s, abs=1e-3)
+    assert reference[tick + 200 + BACK.size] == pytest.approx(0.0)
+    assert not reference[tick + 200 + BACK.size : search.two.begins].any()
+    assert np.array_equal(reference[search.one.ends :], search.planned[search.one.ends :])
+
+
+def test_it_looks_again_in_the_next_pass(search):
+    search.detector.at = {search.one.begins + 100, search.one.ends + 50, search.two.begins + 100}
+    contacts = run(search)
+    assert list(contacts) == [search.one.begins + 100, search.two.begins + 100]
+    assert search.detector.armed_at == [search.one.begins, search.two.begins]
+
+
+def test_a_touch_in_the_pause_leaves_the_motor_where_it_is(search):
+    tick = search.one.returns - 10
+    search.detector.at = {tick}
+    run(search, tick + 1)
+    reference = np.array(search.reference)
+    assert np.allclose(reference[tick + 1 : search.one.returns], search.planned[tick])
+    assert reference[search.one.ends - 1] == pytest.approx(0.0)
+
+
+def test_a_touch_on_the_way_back_stops_the_session(search):
+    tick = search.one.returns + 20
+    search.detector.at = {tick}
+    (contact,) = run(search).values()
+    assert contact.ends == "stopped"
+    assert "way back" in contact.message
+    assert search.cycle.flags & Status.TOUCHED
+
+
+def test_too_great_a_force_ends_as_a_fault(search):
+    tick = search.one.begins + 50
+    search.detector.force_n = {tick - 20: -6.0, tick: -6.0, tick + 1: -6.0}
+    contacts = run(search)
+    assert list(contacts) == [tick + 1]
+    assert contacts[tick + 1].ends == "fault"
+    assert "6 N exceeds force_limit_n = 5 N" in contacts[tick + 1].message
+
+
+def test_the_detector_is_told_all(search):
+    search.cycle.wrench = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    search.cycle.flags = int(Status.ANGLE_STALE | Status.WRENCH_STALE)
+    search.watch.step(3, 3)
+    assert search.detector.seen == (0.1, 0.2, 2.0, 3, True, True)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    tick=st.integers(300, 999),
+    speed=st.floats(-3.0, 3.0),
+    hold=st.integers(50, 300),
+)
+def test_what_follows_a_touch_is_smooth_and_ends_at_the_start(tick, speed, hold):
+    approach = Approach((), BRAKING, hold, BACK, 1.0)
+    recent = tuple(0.3 + speed * k / RATE_HZ for k in (-2, -1, 0))
+    ends = 1000 + BACK.size
+    path = after_touch(approach, ends, tick, recent, -0.2)
+    assert path.shape == (ends - tick - 1,)
+    assert path[-1] == pytest.approx(-0.2)
+    if ends - tick - 1 - BACK.size < 50:
+        return  # too late to brake: it stood in the pause already
+    whole = np.concatenate([recent, path])
+    jump = np.abs(np.diff(whole, 2)).max() * RATE_HZ**2
+    back = 6 * (abs(path[60] + 0.2) + 0.2) / 0.4**2
+    assert jump <= max(1.6 * abs(speed) / BRAKING.duration_s, back) + 1e-6
