@@ -18,6 +18,7 @@ import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
 from analysis.cli.standard_streams import standard_streams
+from analysis.cli.touch import TOUCH_EPILOG, touch_command
 from analysis.cli.welch_options import (
     Band,
     Estimator,
@@ -95,6 +96,7 @@ _GARBAGE: Final = 20_000
 """Objects more than before from which garbage is looked for."""
 
 _COMMANDS: Final = {
+    "touch": "Estimate where, when and how hard the antenna met something.",
     "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
     "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
     "export frf": "Write the frequency response of a session (.csv, .mat, .uff).",
@@ -129,6 +131,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("import", epilog=IMPORT_EPILOG)(import_command)
+app.command("touch", epilog=TOUCH_EPILOG)(touch_command)
 app.add_typer(export_app, name="export")
 
 

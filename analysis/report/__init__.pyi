@@ -16,9 +16,14 @@ from ._record_figures import FIGURES as FIGURES
 from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
+from ._table import terminal_table as terminal_table
 from ._text import analysis_tables as analysis_tables
 from ._text import record_text as record_text
 from ._text import result_text as result_text
 from ._text import summary_table as summary_table
+from ._touch_page import write_touch_report as write_touch_report
+from ._touch_tables import session_lines as session_lines
+from ._touch_tables import touches_document as touches_document
+from ._touch_tables import touches_table as touches_table
 from ._write import figures_of_paper as figures_of_paper
 from ._write import write_report as write_report

@@ -1,0 +1,136 @@
+"""Command `analyze touch`: where, when and how hard recorded antennas met something."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from analysis.cli.sessions import NoSessionsError, Outputs, session_files
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.touch import TouchedSession
+
+TOUCH_EPILOG = """\
+Example: analyze touch sessions/*.mcap --model beam.json --report touches
+
+Exit code: 0 done, 1 a file could not be analysed, 2 usage error, 130 stopped by Ctrl-C."""
+
+
+def touch_command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION", readable=False, help="Session files (.mcap), or folders of them."
+        ),
+    ],
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            readable=False,
+            help="JSON of analyze with the beam to assume.  [default: the profile in each file]",
+        ),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the touches as JSON; - for standard output."),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write a report with figures to this new folder."),
+    ] = None,
+) -> None:
+    """Estimate where, when and how hard the antenna met something.
+
+    Takes the touches that were detected during a session; in a session without any it looks for
+    them in the record.
+    """
+    from analysis.report import OutputError, OutputExistsError, check_new_file, report_folders
+    from rigd.identified_beam import IdentifiedBeamError
+
+    outputs = Outputs(report, json)
+    try:
+        files = session_files(files)
+        if json is not None and not outputs.json_to_stdout:
+            check_new_file(json, "--json")
+        if report is not None:
+            report_folders(files[:1], report)
+        code = _analyse(files, model, outputs)
+    except (OutputExistsError, IdentifiedBeamError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        code = 2
+    except (NoSessionsError, OutputError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        code = 1
+    except KeyboardInterrupt:
+        typer.echo("Stopped.", err=True)
+        code = 130
+    raise typer.Exit(code)
+
+
+def _analyse(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int:
+    from analysis.report import (
+        document_text,
+        new_folder,
+        session_lines,
+        terminal_table,
+        touches_document,
+        touches_table,
+        write_new,
+        write_touch_report,
+    )
+
+    sessions, errors = _sessions(files, model)
+    document = touches_document(sessions, errors)
+    if outputs.json is not None and not outputs.json_to_stdout:
+        write_new(outputs.json, document_text(document))
+    if outputs.report is not None and sessions:
+        with new_folder(outputs.report) as part:
+            write_touch_report(sessions, errors, part)
+    console = outputs.console()
+    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    for session in sessions:
+        for line in session_lines(session):
+            say(line)
+    if any(session.touches for session in sessions):
+        say("")
+        console.print(terminal_table(touches_table(sessions)))
+    if outputs.json_to_stdout:
+        typer.echo(document_text(document, ascii_only=True), nl=False)
+    if outputs.report is not None and sessions:
+        say(f"Report: {outputs.report / 'report.html'}")
+    return 1 if errors else 0
+
+
+def _sessions(
+    files: Sequence[Path], model: Path | None
+) -> tuple[list[TouchedSession], dict[str, str]]:
+    """Analyse every file; return what was found, and the message by failed file."""
+    from analysis.record import RecordError
+    from analysis.touch import TouchAnalysis
+    from rigd.printable import progress_bar
+    from rigd.session import SessionError
+
+    found: list[TouchedSession] = []
+    errors: dict[str, str] = {}
+    analysis = TouchAnalysis(model)
+    with progress_bar() as progress:
+        task = progress.add_task("", total=len(files))
+        for number, file in enumerate(files):
+
+            def on_step(what: str, name: str = file.name) -> None:
+                progress.update(task, description=f"{name}: {what}")
+
+            try:
+                found.append(analysis.session(file, on_step))
+            except (SessionError, RecordError, MemoryError) as error:
+                message = str(error) or f"{file}: not enough memory; close other programs."
+                errors[str(file)] = message
+                progress.console.print(f"Error: {message}", markup=False, soft_wrap=True)
+            progress.update(task, completed=number + 1)
+    return found, errors

@@ -1,0 +1,94 @@
+"""Touches of recorded sessions, against the truth of an independent simulation."""
+
+from math import atan2
+
+import numpy as np
+import pytest
+
+from analysis.record import RecordError
+from analysis.touch import TouchAnalysis, _detections, _model
+from rigd.identified_beam import IdentifiedBeamError
+from rigd.session import SessionError, read_session
+
+
+def test_a_marked_touch_is_estimated(touched, touch_file):
+    (touch,) = touched.touches
+    found, truth = touch.estimate, touch_file.obstacle
+    assert (touched.found, touched.has_shear, touched.warnings) == ("loop", True, ())
+    assert found.kind == "rigid"
+    assert found.x_m.value == pytest.approx(truth.x_m, abs=4e-3)
+    assert touch.start_s + found.time_s.value == pytest.approx(touch_file.time_s, abs=5e-4)
+    assert found.force_n.value == pytest.approx(touch_file.peak_n, rel=0.2)
+    low, high = found.stiffness_n_per_m.interval_95
+    assert 0.6 * low < truth.stiffness_n_per_m < 1.6 * high
+
+
+def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
+    (touch,) = touched.touches
+    # The obstacle is met by the straight antenna at this angle; the bent one is ahead or behind.
+    assert atan2(*touch.point_m[::-1]) == pytest.approx(touch_file.obstacle.angle_rad, abs=3e-3)
+    assert np.hypot(*touch.point_m) == pytest.approx(touch_file.obstacle.x_m, abs=4e-3)
+    inner, outer = np.hypot(*touch.ends_m.T)
+    assert inner < np.hypot(*touch.point_m) < outer
+    assert touch.antenna_m[0] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_one_that_is_not_marked_is_found(touch_file, tmp_path):
+    path = touch_file.write(tmp_path / "a.mcap", marked=False)
+    session = read_session(path)
+    model = _model(session, 1000.0, None)
+    for shear in ((0.0, 1.0, 0.0, 0.0, 0.0, 0.0), None):
+        ((tick, _),) = _detections(session, model, 1000.0, shear)
+        assert 0 < tick - 1000 * touch_file.time_s < 40
+
+
+def test_before_the_touch_nothing_is_found(touch_file, touch_analysis, tmp_path):
+    length = round(1000 * touch_file.time_s) - 1
+    path = touch_file.write(tmp_path / "a.mcap", marked=False, length=length)
+    session = touch_analysis.session(path)
+    assert (session.found, session.touches) == ("record", ())
+
+
+def test_missed_ticks_are_bridged(touch_file, touch_analysis, touched, tmp_path):
+    first = round(1000 * touch_file.time_s)
+    gap = {first - 200, first - 199, first + 20}
+    session = touch_analysis.session(touch_file.write(tmp_path / "a.mcap", gap=gap))
+    x_m = session.touches[0].estimate.x_m.value
+    assert x_m == pytest.approx(touched.touches[0].estimate.x_m.value, abs=5e-3)
+
+
+def test_one_at_the_end_of_the_record_is_not_estimated(touch_file, touch_analysis, tmp_path):
+    length = round(1000 * touch_file.time_s) + 10
+    session = touch_analysis.session(touch_file.write(tmp_path / "a.mcap", length=length))
+    (touch,) = session.touches
+    assert (touch.estimate, touch.point_m) == (None, None)
+    assert "Touch 1: not estimated; it takes 0.3 s of record before" in session.warnings[0]
+    assert set(touch.as_dict()) >= {"number", "tick", "angle_rad"}
+
+
+def test_without_shear_it_says_so(touch_file, touch_analysis, tmp_path):
+    path = touch_file.write(
+        tmp_path / "a.mcap", marked=False, length=1000, metadata={"shear_projection": "0,0,0,0,0,0"}
+    )
+    session = touch_analysis.session(path)
+    assert not session.has_shear
+    assert "by the torque alone" in session.warnings[0]
+
+
+@pytest.mark.parametrize("text", ["0,1,0", "a,b,c,d,e,f", "nan,1,0,0,0,0"])
+def test_a_wrong_projection_is_named(touch_file, touch_analysis, tmp_path, text):
+    path = touch_file.write(tmp_path / "a.mcap", metadata={"shear_projection": text})
+    with pytest.raises(RecordError, match=r"a\.mcap: shear_projection is .*must be six numbers"):
+        touch_analysis.session(path)
+
+
+def test_without_a_profile_a_model_is_asked_for(touch_file, touch_analysis, tmp_path):
+    path = touch_file.write(tmp_path / "a.mcap", profile="")
+    with pytest.raises(SessionError, match=r"give --model FILE"):
+        touch_analysis.session(path)
+
+
+def test_a_wrong_model_is_named(touch_file, tmp_path):
+    (tmp_path / "model.json").write_text("{}")
+    with pytest.raises(IdentifiedBeamError, match="has no headlines"):
+        TouchAnalysis(tmp_path / "model.json").session(touch_file.path)

@@ -1,0 +1,112 @@
+"""`analyze touch`: table, JSON, report, and what it says of wrong requests."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from analysis.cli.app import app
+from analysis.report import _style as style
+from analysis.report import touches_document, touches_table, write_touch_report
+from analysis.report._table import csv_text
+from analysis.report._touch_figures import touch_illustrations
+
+
+@pytest.fixture
+def analyze(monkeypatch, touch_analysis):
+    """Run the command; the model is prepared once for all tests."""
+    monkeypatch.setattr(
+        "analysis.touch.TouchAnalysis", lambda model: touch_analysis if model is None else None
+    )
+    return lambda *arguments: CliRunner().invoke(app, ["touch", *map(str, arguments)])
+
+
+def test_it_tells_touches_and_writes_them_as_json(analyze, touch_file, tmp_path):
+    out = tmp_path / "touches.json"
+    result = analyze(touch_file.path, "--json", out)
+    assert result.exit_code == 0, result.output
+    assert "touch.mcap: 1 touch, detected during the session. Model: the nominal" in result.stdout
+    assert "obstacle at rest" in result.stdout
+    (touch,) = json.loads(out.read_text())["touches"]
+    assert touch["file"] == str(touch_file.path)
+    low, high = touch["x_m"]["interval_95"]
+    assert low < touch["x_m"]["value"] < high
+    assert (touch["number"], touch["kind"], touch["detected"]) == (1, "rigid", "loop")
+
+
+def test_json_may_go_to_standard_output_alone(analyze, touch_file):
+    result = analyze(touch_file.path, "--json", "-")
+    assert len(json.loads(result.stdout)["touches"]) == 1
+    assert "1 touch" in result.stderr
+
+
+def test_a_file_that_cannot_be_read_does_not_take_the_others_along(analyze, touch_file, tmp_path):
+    result = analyze(touch_file.path, tmp_path / "none.mcap", "--json", tmp_path / "a.json")
+    assert result.exit_code == 1
+    assert "Error: " in result.stderr
+    assert "none.mcap cannot be read" in result.stderr
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert len(document["touches"]) == len(document["errors"]) == 1
+
+
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_nothing_is_overwritten(analyze, touch_file, tmp_path, option):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").touch()
+    result = analyze(touch_file.path, option, tmp_path / "there")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"Error: {option} ")
+
+
+def test_a_wrong_model_ends_it(touch_file, tmp_path):
+    (tmp_path / "m.json").write_text("[]")
+    arguments = ["touch", str(touch_file.path), "--model", str(tmp_path / "m.json")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"Error: {tmp_path / 'm.json'}: has no headlines")
+
+
+def test_a_session_may_be_called_touch(touch_file, tmp_path):
+    (tmp_path / "touch.mcap").write_bytes(b"")
+    result = CliRunner().invoke(app, [str(tmp_path / "touch.mcap"), "--method", "record"])
+    assert "is empty, nothing was recorded to it" in result.stderr
+
+
+def test_the_report_has_a_map_and_the_evidence(touched, tmp_path):
+    write_touch_report([touched, touched], {"b.mcap": "b.mcap is damaged."}, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "<title>2 sessions: touches</title>" in page
+    assert "Left out: b.mcap is damaged." in page
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names >= {"map.png", "touch_1.png", "touch_2.png"}
+    assert page.count("<figure ") == 3
+    assert "http" not in page.replace("http://www.w3.org", "")
+    assert json.loads((tmp_path / "touches.json").read_text()) == touches_document(
+        [touched, touched], {"b.mcap": "b.mcap is damaged."}
+    )
+
+
+def test_of_a_lopsided_interval_the_ends_are_told(touched):
+    (touch,) = touched.touches
+    x_m = replace(touch.estimate.x_m, value=0.92, interval_95=(0.48, 0.94))
+    estimate = replace(touch.estimate, x_m=x_m, kind="unknown", force_history_n=np.empty(0))
+    estimate = replace(estimate, force_times_s=np.empty(0), force_n=None, time_s=None)
+    session = replace(touched, touches=(replace(touch, estimate=estimate),))
+    (cells,) = touches_table([session]).shown_rows
+    assert "0.48 to 0.94" in [cell.text for cell in cells]
+    assert "cannot tell" in [cell.text for cell in cells]
+    with style.styled():
+        drawn = list(touch_illustrations([session]))
+    assert [each.name for each in drawn] == ["map", "touch_1"]
+
+
+def test_the_table_has_numbers_for_programs(touched):
+    (row,) = csv.DictReader(io.StringIO(csv_text(touches_table([touched]))))
+    estimate = touched.touches[0].estimate
+    assert float(row["x_m"]) == estimate.x_m.value
+    assert float(row["x_m_std"]) == estimate.x_m.std
+    assert float(row["time_s"]) == touched.touches[0].start_s + estimate.time_s.value
