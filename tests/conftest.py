@@ -25,7 +25,8 @@ from rigd.runtime import use_one_thread
 
 pytest_plugins = [
     "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "rewritten_once",
-    "shared_memory_closed", "shipped_profile", "standstill", "synthetic_sessions", "web_daemon",
+    "shared_memory_closed", "shipped_profile", "standstill", "synthetic_sessions", "touch_sessions",
+    "web_daemon",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
@@ -316,3 +317,30 @@ def short_chirps(made_once):
         subprocess.run(command, check=True, capture_output=True, timeout=300)
 
     return sorted(made_once("short_chirps", make).glob("*.mcap"))
+
+
+@pytest.fixture
+def analysed(tmp_path):
+    """Write the document of an analysis that found the profile's beam, or something else."""
+
+    from rigd.profile import load_profile
+
+    def write(**other):
+        rig = load_profile("sim").rig
+        beam, damping = rig.beam, rig.damping
+        values = {
+            "zeta": damping.zeta,
+            "alpha": damping.alpha,
+            "gamma": damping.gamma,
+            "lambda": damping.lambda_,
+            "density_over_stiffness": beam.density_over_stiffness,
+            "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
+        }
+        parameters = {name: {"value": value, "std": 2e-4 * value} for name, value in values.items()}
+        parameters |= other
+        parameters = {name: entry for name, entry in parameters.items() if entry is not None}
+        path = tmp_path / "model.json"
+        path.write_text(json.dumps({"headlines": [{"parameters": parameters}]}))
+        return path
+
+    return write

@@ -58,7 +58,7 @@ CHANGES = (
     # Soon enough for a short session to see it.
     ("recorder_lag_s = { value = 12.0", f"recorder_lag_s = {{ value = {RECORDER_LAG_S}"),
     ("\ntare_s = { value = 1.0", "\ntare_s = { value = 0.5"),
-    ("return_s = { value = 2.0", "return_s = { value = 0.3"),
+    ("return_s = { value = 0.8", "return_s = { value = 0.3"),
 )
 DIRECT_CHANGES = (
     *CHANGES,
