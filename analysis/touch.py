@@ -365,7 +365,7 @@ def _detections(
     Returns
     -------
     list of tuple
-        Of each touch the tick at which it is noticed, and the one from which the beam was free
+        For each touch the tick at which it is noticed, and the one from which the beam was free
         before it.
     """
     samples = session.samples

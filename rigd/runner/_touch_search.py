@@ -33,7 +33,7 @@ _STEP_STD: Final = 1 / sqrt(12)
 """Standard deviation of a value that is rounded to steps of 1."""
 _READY_PATIENCE_S: Final = 20.0
 """Time for the estimator to prepare on a busy computer; nothing moves yet."""
-_LAST_PATIENCE_S: Final = 10.0
+_LAST_PATIENCE_S: Final = 30.0
 """Time for the last estimate after the end of a record."""
 _POLL_S: Final = 0.05
 

@@ -41,7 +41,7 @@ _FIRST_S = 0.022
 """After the detection: what the grid of starts is compared with."""
 _STAGES_S = (0.05, 0.1, 0.2)
 """After the detection: what is explained, the longest only if the point is not well known yet."""
-_WELL_KNOWN_M = 1e-3
+_WELL_KNOWN_M = 2e-3
 _HISTORY_S = 1.5
 _LONGEST_S = _STAGES_S[-1]
 _NEAR_TIP = 0.8

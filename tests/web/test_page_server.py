@@ -18,6 +18,7 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
+from rigd.excitation import KINDS
 from rigd.web import _library, _live
 
 ACTING = {
@@ -88,7 +89,7 @@ def test_a_page_that_opens_is_told_of_rig_state_and_model(served, pages):
         "name": "amplitude_rad", "unit": "rad", "default": 0.025, "help": "Amplitude A.",
     }  # fmt: skip
     assert all(option["help"] for kind in hello["excitations"].values() for option in kind)
-    assert set(hello["excitations"]) == {"chirp", "hold", "step", "multisine", "file", "modes"}
+    assert set(hello["excitations"]) == set(KINDS)
 
 
 def test_specimens_that_have_a_file_are_offered(served, pages, tmp_path, monkeypatch):
