@@ -4,7 +4,8 @@ The bend is computed, from the measured angle and the exact model; no sensor see
 
 Lengths are drawn in beam lengths, so that every antenna fills the same picture. The beam points
 along x and the motor turns it about z. What moves it across is drawn larger than it is, angle and
-bend by the same factor: so nodes stay where they are, and a tip that rests is drawn at rest.
+bend by the same factor: so nodes stay where they are, and a tip that rests is drawn at rest. Where
+the motor goes far, in moves and searches, all is drawn to scale.
 """
 
 import collections
@@ -44,7 +45,8 @@ FACTOR: Final = 2.0
 The paper's chirp turns the motor by 25 mrad, and when it passes the first resonance the tip swings
 by a third of the beam's length: the one is still seen, the other still in the picture.
 """
-TITLE: Final = f"Antenna (displacement × {FACTOR:g})"
+_TO_SCALE: Final = ("move", "touch")
+TITLE: Final = "Antenna"
 
 DRAWN_HZ: Final = 20.0
 TRAIL_S: Final = 0.5
@@ -91,6 +93,7 @@ class Antenna:
         self._looks = 0
         lately = max(1, round(looks_hz * TRAIL_S))
         self._tips_m: collections.deque[float] = collections.deque(maxlen=lately)
+        self._to_scale = subject.excitation in _TO_SCALE
         self._newest: tuple[int, Real] | None = None  # tick; time and angle
         self._waiting: Real = np.zeros((0, 2))  # times and angles since the last look
         self._trail: list[_Moment] = []  # not yet sent
@@ -120,9 +123,12 @@ class Antenna:
             self._looks += 1
             t_ns, angle_rad = int(look[-1, 0]), float(look[-1, 1])
             if self._looks % self._looks_a_drawing == 0:
-                moments.append((t_ns, lines(angle_rad, deflection_m / self._length_m)))
+                deflection = deflection_m / self._length_m
+                drawn = (to_scale if self._to_scale else lines)(angle_rad, deflection)
+                moments.append((t_ns, drawn))
             if self._looks % self._seldom_looks == 0:
-                labels.append(partial(_draw_label, t_ns=t_ns, tip_m=max(self._tips_m)))
+                text = label(max(self._tips_m), to_scale=self._to_scale)
+                labels.append(partial(_draw_label, t_ns=t_ns, text=text))
         self._trail += [(t_ns, beam_and_line[1:]) for t_ns, beam_and_line in moments]
         self._shapes += moments
         drawings: list[Drawing] = []
@@ -154,20 +160,24 @@ class Antenna:
         share = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
         beam = (1 - share) * earlier[1] + share * later[1]
         moved = later[1] - earlier[1]
+        along = np.linspace(0.0, 1.0, len(beam))
         x = np.array([point["value"], *point["interval_95"]]) / self._length_m
-        x = np.clip(x, 0.0, 1.0)
-        y, ahead = (np.interp(x, beam[:, 0], each) for each in (beam[:, 1], moved[:, 1]))
-        places = np.column_stack([x, y, np.zeros(3)])
+        places, ahead = (
+            np.column_stack([np.interp(x, along, axis) for axis in each.T])
+            for each in (beam, moved)
+        )
         force = touch.get("force_n")
+        size = 0.0 if force is None else min(_ARROW_PER_N * abs(force["value"]), _LONGEST_ARROW)
         # An obstacle pushes against the motion that met it.
-        push = 0.0 if force is None else -math.copysign(float(force["value"]), float(ahead[0]))
+        way = float(np.linalg.norm(ahead[0]))
+        arrow = -size / way * ahead[0] if way > 0 else np.zeros(3)
         return [
             partial(
                 _draw_touch,
                 number=int(touch["number"]),
                 t_ns=t_ns,
                 places=places,
-                arrow=math.copysign(min(_ARROW_PER_N * abs(push), _LONGEST_ARROW), push),
+                arrow=arrow,
                 text=touch_label(touch),
             )
         ]
@@ -237,11 +247,25 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     return drawn
 
 
-def label(tip_m: float) -> str:
+def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
+    """Return the same as `lines`, turned and bent as they are.
+
+    Parameters
+    ----------
+    angle_rad, deflection
+        See `lines`.
+    """
+    along = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+    across = np.array([-along[1], along[0], 0.0])
+    line = np.linspace(0.0, 1.0, deflection.size)[:, None] * along
+    return np.stack([line, line + deflection[:, None] * across]).astype(np.float32)
+
+
+def label(tip_m: float, *, to_scale: bool = False) -> str:
     """Return the text of the tip's deflection, to two figures or 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
-    return f"tip deflection ± {text} mm, drawn × {FACTOR:g}"
+    return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {FACTOR:g}'}"
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
@@ -351,16 +375,16 @@ def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_Momen
     stream.send_columns(entity, [time], [column], strict=True)
 
 
-def _draw_label(stream: "RecordingStream", t_ns: int, tip_m: float) -> None:
+def _draw_label(stream: "RecordingStream", t_ns: int, text: str) -> None:
     """Label the true deflection of the tip."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    stream.log(LABEL, rr.Points3D.from_fields(labels=[label(tip_m)]))
+    stream.log(LABEL, rr.Points3D.from_fields(labels=[text]))
 
 
 def _draw_touch(
-    stream: "RecordingStream", number: int, t_ns: int, places: Real, arrow: float, text: str
+    stream: "RecordingStream", number: int, t_ns: int, places: Real, arrow: Real, text: str
 ) -> None:
     """Draw from the time of a touch on: point, interval along the beam, and force."""
     import rerun as rr
@@ -384,8 +408,8 @@ def _draw_touch(
     stream.log(
         f"{entity}/force",
         rr.Arrows3D(
-            origins=point - [[0.0, arrow, 0.0]],
-            vectors=[[0.0, arrow, 0.0]],
+            origins=point - arrow,
+            vectors=[arrow],
             colors=[VERMILION],
             radii=rr.Radius.ui_points(2.0),
         ),
