@@ -271,6 +271,8 @@ class TouchJob:
     """The beam."""
     shear_projection: tuple[float, ...] | None
     """Base shear = projection · wrench; None: it is not measured."""
+    realtime: "RealtimeSettings | None" = None
+    """Where the loop runs, from whose core it keeps off; None: not in real time."""
 
 
 @dataclass(frozen=True, slots=True)

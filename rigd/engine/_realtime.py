@@ -72,6 +72,22 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
     return {name: _attempt(setting) for name, setting in wanted.items()}
 
 
+def keep_off_loop(loop_cpu: int) -> None:
+    """Keep this process off the loop's core, if it may use another one.
+
+    The loop comes before it in any case, but not while the kernel clears or compacts memory for it.
+
+    Parameters
+    ----------
+    loop_cpu
+        ``realtime.cpu``, which says where the loop runs.
+    """
+    core, _ = _core_of_loop(loop_cpu, Path("/"))
+    others = os.sched_getaffinity(0) - {core}
+    if others:
+        os.sched_setaffinity(0, others)
+
+
 class Precedence:
     """Puts this process before the ordinary ones and behind the loop, until it is released.
 

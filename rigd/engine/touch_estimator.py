@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rigd.engine._ipc import Parent
 from rigd.engine._messages import TouchJob, TouchReady, TouchTold
+from rigd.engine._realtime import keep_off_loop
 from rigd.engine._ring import Observer
 from rigd.engine._shared_state import Word
 from rigd.engine._topics import attach_channels
@@ -31,6 +32,8 @@ def main() -> None:
     ignore_signals()
     parent = Parent()
     job: TouchJob = parent.receive_job()
+    if job.realtime is not None:
+        keep_off_loop(job.realtime.cpu)
     channels = attach_channels(job.channels)
     reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)

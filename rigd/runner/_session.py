@@ -289,7 +289,9 @@ class Session:
             ) from None
         order = self._order
         if order.touch is not None:
-            self._touches = TouchEstimates(crew, order.touch, order.profile.rig.rate_hz)
+            profile = order.profile
+            realtime = None if self._virtual else profile.realtime
+            self._touches = TouchEstimates(crew, order.touch, profile.rig.rate_hz, realtime)
         self._open_file()
         order = self._order
         self._control_at_work = True

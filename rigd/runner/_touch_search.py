@@ -26,6 +26,7 @@ from rigd.profile import Profile
 from rigd.session import packed_touches, touch_line
 
 if TYPE_CHECKING:
+    from rigd.profile import RealtimeSettings
     from rigd.runner._process_group import ProcessGroup
     from rigd.touch import Noise, TouchModel
 
@@ -133,9 +134,17 @@ class TouchEstimates:
         The obstacle that is looked for.
     rate_hz
         Ticks a second.
+    realtime
+        Where the loop runs; None: not in real time.
     """
 
-    def __init__(self, crew: "ProcessGroup", search: TouchSearch, rate_hz: float) -> None:
+    def __init__(
+        self,
+        crew: "ProcessGroup",
+        search: TouchSearch,
+        rate_hz: float,
+        realtime: "RealtimeSettings | None" = None,
+    ) -> None:
         self._crew = crew
         self._rate_hz = rate_hz
         self._events: list[Event] = []
@@ -148,6 +157,7 @@ class TouchEstimates:
             rate_hz,
             search.model,
             search.order.shear_projection,
+            realtime,
         )
         try:
             crew.fresh(TOUCH).start(job)
