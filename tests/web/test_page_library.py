@@ -25,8 +25,10 @@ ACTING = {
 
 
 @pytest.fixture
-def two(served, record_briefly, write_look):
+def two(served, record_briefly, write_look, monkeypatch):
     """Two sessions, of which one has a quick look and a report."""
+    # What runs only while nothing else does may not run for minutes beside the other tests.
+    monkeypatch.setattr(_jobs, "give_way", lambda _: None)
     for name, specimen in (("first", "antenna"), ("second", "")):
         record_briefly(name, day=float(name == "second"), specimen=specimen).replace(
             served.folder / f"{name}.mcap"
