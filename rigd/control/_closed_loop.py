@@ -320,10 +320,24 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     c[2], c[3] = torque, speed
     d = np.array([0.0, 0.0, torque_from_reference, speed_from_reference, 0.0])
 
+    poles = continuous_poles(a, model.rate_hz)
+    return ClosedLoop(a, b, c, d, model, cuts, poles[np.argsort(-poles.real)])
+
+
+def continuous_poles(a: Real, rate_hz: float) -> Complex:
+    """Return the modes of ``x[k+1] = a x[k]`` as poles in continuous time, in rad/s.
+
+    Parameters
+    ----------
+    a
+        Shape (n, n).
+    rate_hz
+        Ticks a second.
+    """
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays leave eigenvalues at zero: they have died out after a few ticks.
-    poles = np.log(eigenvalues[np.abs(eigenvalues) > _DEAD]) * model.rate_hz
-    return ClosedLoop(a, b, c, d, model, cuts, poles[np.argsort(-poles.real)])
+    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > _DEAD]) * rate_hz
+    return poles
 
 
 def check_stability(loop: ClosedLoop) -> str | None:

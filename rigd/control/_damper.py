@@ -8,13 +8,13 @@ Whether loop, delays and beam leave it stable is checked on the closed loop.
 
 from dataclasses import dataclass, replace
 from math import exp
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import undamped_frequencies_rad_s
-from rigd.control._closed_loop import ClosedLoop, close_loop, light_beam
+if TYPE_CHECKING:
+    from rigd.control._closed_loop import ClosedLoop
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -27,8 +27,6 @@ _STIFFNESSES = (0.8, 1.0, 1.25)
 """Stiffness of the beam, over the profile's, for which the loop has to be stable."""
 _SLOW = 0.25
 """Corner below which torques are left out, over the frequency of the first mode."""
-_MOST_GROWTH_PER_S = 0.02
-"""As much as a loop without it may grow, on a beam that has next to no damping of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +101,7 @@ class _Law:
         return (fast, slow, yielded), -yielded - self._lead * swing
 
 
-def design_damper(loop: ClosedLoop) -> DamperSettings | None:
+def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     """Choose the active damping of a rig.
 
     Parameters
@@ -122,6 +120,10 @@ def design_damper(loop: ClosedLoop) -> DamperSettings | None:
     RealisationError
         If such a beam cannot be realised.
     """
+    # Late: the control process damps by what was designed before, and starts sooner without these.
+    from rigd.beam import undamped_frequencies_rad_s
+    from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, light_beam
+
     model = loop.model
     if model.beam is None:
         return None
@@ -137,13 +139,14 @@ def design_damper(loop: ClosedLoop) -> DamperSettings | None:
     loops = [close_loop(light_beam(model, beam)) for beam in beams]
     for _ in range(_HALVINGS):
         growths = [damped_poles(each, settings).real.max() for each in loops]
-        if max(growths) <= _MOST_GROWTH_PER_S:
+        # As much as a loop without it may grow, on beams with next to no damping of their own.
+        if max(growths) <= MAX_GROWTH_PER_S:
             return settings
         settings = replace(settings, yield_rad_per_nm_s=0.5 * settings.yield_rad_per_nm_s)
     return None
 
 
-def damped_poles(loop: ClosedLoop, settings: DamperSettings) -> Complex:
+def damped_poles(loop: "ClosedLoop", settings: DamperSettings) -> Complex:
     """Return the poles of a closed loop with active damping, in rad/s.
 
     Parameters
@@ -153,6 +156,8 @@ def damped_poles(loop: ClosedLoop, settings: DamperSettings) -> Complex:
     settings
         Active damping.
     """
+    from rigd.control._closed_loop import continuous_poles
+
     n, rate_hz = loop.b.size, loop.model.rate_hz
     reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
     fast, slow, yielded = np.eye(3, n + 3, n)
@@ -163,7 +168,4 @@ def damped_poles(loop: ClosedLoop, settings: DamperSettings) -> Complex:
     a[:n, :n] = loop.a
     a[:n] += np.outer(loop.b, moved)
     a[n:] = states
-    eigenvalues = np.linalg.eigvals(a).astype(complex)
-    # Delays leave eigenvalues at zero, as in the loop itself.
-    poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > 1e-9]) * rate_hz
-    return poles
+    return continuous_poles(a, rate_hz)

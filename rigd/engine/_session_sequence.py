@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,11 +22,13 @@ from rigd.engine._realtime import page_faults
 from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
 from rigd.engine._timing import SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.engine._topics import Channels
-from rigd.engine._touch_watch import TouchWatch
 from rigd.excitation import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import BY_NAME, LOOK_EVERY, OVERLOADED
+
+if TYPE_CHECKING:
+    from rigd.engine._touch_watch import TouchWatch
 
 _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
@@ -113,7 +116,7 @@ class SessionSequence:
         parent: Parent,
         stop: StopRequest,
         ending: Ending,
-        touch: TouchWatch | None = None,
+        touch: "TouchWatch | None" = None,
     ) -> None:
         self._touch = touch
         self._display = display
@@ -324,7 +327,7 @@ class SessionSequence:
         if end is not None:
             raise end
 
-    def _watch_touch(self, touch: TouchWatch, tick: int, missed: int) -> SessionEnd | None:
+    def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
         """Look for a touch in the tick that was just run; the watch changes the reference."""
         contact = touch.step(tick, missed)
         if contact is None:

@@ -42,7 +42,6 @@ from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine._shared_state import Event, Phase, Word, write_event
 from rigd.engine._timing import Clock, RealClock, TickScheduler, VirtualClock
 from rigd.engine._topics import Channels, attach_channels
-from rigd.engine._touch_watch import TouchWatch
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
@@ -266,6 +265,8 @@ class _Attendance:
         reference = map_reference(job.reference)
         touch = None
         if job.touch is not None:
+            from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
+
             touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
         procedure = SessionSequence(
             job.profile,
