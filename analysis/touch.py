@@ -38,9 +38,8 @@ from rigd.touch import (
     TouchRecord,
     around_touch,
     base_shear_n,
-    observed_beam,
-    signatures,
     touch_record,
+    watched_beam,
 )
 from rigd.view import nominal_damping
 
@@ -380,16 +379,8 @@ def _detections(
         None if shear is None else _noise(shear_n[resting]),
         _angle_noise(samples["angle_rad"], resting),
     )
-    observed = observed_beam(
-        model.beam,
-        model.damping,
-        rate_hz,
-        noise,
-        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
-        torque_after_angle_s=model.torque_delay_s - model.angle_delay_s,
-    )
-    shapes = signatures(model.beam, model.damping, rate_hz, observed)
-    detector = TouchDetector(observed, shapes, rate_hz, DetectorSettings())
+    beam = watched_beam(model, rate_hz, noise)
+    detector = TouchDetector(beam, rate_hz, DetectorSettings())
     armed = False
     found: list[tuple[int, int]] = []
     quiet = round(_QUIET_S * rate_hz)

@@ -18,7 +18,7 @@ from rigd.excitation import chirp, slew
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview
 from rigd.sim import SimulatedRig
-from rigd.touch import DetectorSettings, Noise, TouchDetector, observed_beam, signatures
+from rigd.touch import DetectorSettings, Noise, TouchDetector, TouchModel, watched_beam
 
 Real = NDArray[np.float64]
 
@@ -71,9 +71,8 @@ def detector_of(profile: Profile) -> TouchDetector:
     rig, simulation = profile.rig, profile.rig.simulation
     assert simulation is not None
     noise = Noise(simulation.torque_noise_nm, simulation.force_noise_n, 2e-5)
-    model = observed_beam(rig.beam, rig.damping, rig.rate_hz, noise)
-    known = signatures(rig.beam, rig.damping, rig.rate_hz, model)
-    return TouchDetector(model, known, rig.rate_hz, DetectorSettings())
+    beam = watched_beam(TouchModel(rig.beam, rig.damping), rig.rate_hz, noise)
+    return TouchDetector(beam, rig.rate_hz, DetectorSettings())
 
 
 def with_rig(profile: Profile, **changes: object) -> Profile:

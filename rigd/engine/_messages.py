@@ -27,16 +27,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
-    import numpy as np
-    from numpy.typing import NDArray
-
     from rigd.control import DamperSettings
     from rigd.devices import WhatMoves
     from rigd.engine._ring import ReferenceSpec
     from rigd.engine._topics import ChannelSpecs
     from rigd.excitation import Approach
     from rigd.profile import Profile, RealtimeSettings
-    from rigd.touch import DetectorSettings, ObservedBeam, TouchModel
+    from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
 
 _LENGTH: Final = struct.Struct("=I")
 _MOST_BYTES: Final = 1 << 24
@@ -76,10 +73,8 @@ class Ending:
 class TouchOrder:
     """The obstacle to look for in a session."""
 
-    model: "ObservedBeam"
-    """The beam as it moves freely."""
-    signatures: "NDArray[np.float64]"
-    """What a touch looks like, from `rigd.touch.signatures`."""
+    beam: "WatchedBeam"
+    """What the detector knows of the beam."""
     settings: "DetectorSettings"
     """How sure the detector has to be."""
     approach: "Approach"

@@ -53,7 +53,7 @@ class TouchWatch:
         self._rate_hz = rate_hz
         self._approach = order.approach
         self._projection = order.shear_projection
-        self._detector = TouchDetector(order.model, order.signatures, rate_hz, order.settings)
+        self._detector = TouchDetector(order.beam, rate_hz, order.settings)
         self._passes = iter(order.approach.passes)
         self._pass = next(self._passes)
         self._arms = self._pass.begins

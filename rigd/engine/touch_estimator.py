@@ -19,10 +19,16 @@ from rigd.engine._shared_state import Word
 from rigd.engine._topics import attach_channels
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import Status, decode_samples
-from rigd.touch import CONTACT_S, FINAL_S, HISTORY_S, TouchEstimator, around_touch, touch_record
+from rigd.touch import (
+    CONTACT_S,
+    FINAL_S,
+    FIRST_S,
+    HISTORY_S,
+    TouchEstimator,
+    around_touch,
+    touch_record,
+)
 
-_FIRST_S = 0.05
-"""Data after a detection for the first estimate."""
 _BLOCK = 250
 _IDLE_S = 0.005
 
@@ -70,7 +76,7 @@ class TouchFollower:
         self._estimator = estimator
         self._job = job
         self._history = round(HISTORY_S * job.rate_hz)
-        self._first, self._final = (round(s * job.rate_hz) for s in (_FIRST_S, FINAL_S))
+        self._first, self._final = (round(s * job.rate_hz) for s in (FIRST_S, FINAL_S))
         self._samples: NDArray[np.void] | None = None
         self._waiting: deque[tuple[int, int, int]] = deque()
         """Number and tick of the touches whose last estimate is to come, and the tick from which

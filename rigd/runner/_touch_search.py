@@ -66,7 +66,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     """
     if excitation.approach is None:
         return None
-    from rigd.touch import DetectorSettings, TouchModel, observed_beam, signatures
+    from rigd.touch import DetectorSettings, TouchModel, watched_beam
 
     rig = profile.rig
     sensor = rig.sensor
@@ -87,25 +87,9 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
             torque_delay_s=sensor.delay_s,
             tool_inertia_kg_m2=sensor.tool_inertia_kg_m2,
         )
-    observed = observed_beam(
-        model.beam,
-        model.damping,
-        rig.rate_hz,
-        _noise(profile),
-        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
-        torque_after_angle_s=model.torque_delay_s - model.angle_delay_s,
-    )
+    beam = watched_beam(model, rig.rate_hz, _noise(profile))
     shear = sensor.shear_projection if any(sensor.shear_projection) else None
-    return TouchSearch(
-        TouchOrder(
-            observed,
-            signatures(model.beam, model.damping, rig.rate_hz, observed),
-            DetectorSettings(),
-            excitation.approach,
-            shear,
-        ),
-        model,
-    )
+    return TouchSearch(TouchOrder(beam, DetectorSettings(), excitation.approach, shear), model)
 
 
 def _noise(profile: Profile) -> "Noise":

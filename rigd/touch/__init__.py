@@ -1,7 +1,7 @@
 """Touch: whether, where and how hard the beam has met something, from its torque and base shear.
 
 Offers the innovations of the free beam (`observed_beam`, `InnovationFilter`), which the control
-loop computes tick by tick, and the sequential test on them (`signatures`, `TouchDetector`).
+loop computes tick by tick, and the sequential test on them (`watched_beam`, `TouchDetector`).
 
 `TouchEstimator` estimates one touch after another with one model of the beam (`TouchModel`, read
 from an analysis or taken from the profile) and tells point, instant, force and stiffness with

@@ -21,7 +21,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._innovations import InnovationFilter, ObservedBeam
+from rigd.touch._innovations import InnovationFilter
+from rigd.touch._signatures import WatchedBeam
 
 Real = NDArray[np.float64]
 
@@ -71,10 +72,8 @@ class TouchDetector:
 
     Parameters
     ----------
-    model
-        The free beam with its noise.
-    signatures
-        From `rigd.touch.signatures`.
+    beam
+        From `rigd.touch.watched_beam`.
     rate_hz
         Ticks a second.
     settings
@@ -106,10 +105,9 @@ class TouchDetector:
         "noise",
     )
 
-    def __init__(
-        self, model: ObservedBeam, signatures: Real, rate_hz: float, settings: DetectorSettings
-    ) -> None:
-        self._filter = InnovationFilter(model)
+    def __init__(self, beam: WatchedBeam, rate_hz: float, settings: DetectorSettings) -> None:
+        signatures = beam.signatures
+        self._filter = InnovationFilter(beam.observed)
         self._threshold = settings.threshold(rate_hz, len(signatures))
         self._tolerance2 = _AGE_TICKS * settings.model_tolerance**2
         self._armed = False

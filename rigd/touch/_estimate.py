@@ -30,6 +30,7 @@ from rigd.touch._physical import (
 )
 from rigd.touch._posterior import Posterior, sampled
 from rigd.touch._results import Estimated, TouchEstimate
+from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
 
 Real = NDArray[np.float64]
 
@@ -37,13 +38,11 @@ _SPACING_M = 0.007
 _NOTICED_S = (0.013, 0.04, 0.12)
 """A touch is noticed at most so long after it: the longer ones are tried if the shorter fail."""
 _TWO_SIDED_95 = 1.959964
-_FIRST_S = 0.022
+_GRID_S = 0.022
 """After the detection: what the grid of starts is compared with."""
-_STAGES_S = (0.05, 0.1, 0.2)
+_STAGES_S = (FIRST_S, 0.1, FINAL_S)
 """After the detection: what is explained, the longest only if the point is not well known yet."""
 _WELL_KNOWN_M = 2e-3
-_HISTORY_S = 1.5
-_LONGEST_S = _STAGES_S[-1]
 _NEAR_TIP = 0.8
 """Share of the length beyond which contacts are shorter, and steps finer."""
 
@@ -150,15 +149,15 @@ class _Tables:
         self.model, self.rate_hz = model, rate_hz
         self.x_m = places(model.beam.length_m, _SPACING_M)
         finer = 4 * max(1, round(4000 / rate_hz))
-        steps = round((_LONGEST_S + _NOTICED_S[-1] + 0.01) * rate_hz * finer)
+        steps = round((FINAL_S + _NOTICED_S[-1] + 0.01) * rate_hz * finer)
         self.finest = contact_kernels(
             model.beam, model.damping, self.x_m, 1 / (finer * rate_hz), steps
         )
         self.middle = self.finest.coarser(2, steps // 2)
         self.coarse = self.finest.coarser(finer // 4, steps // (finer // 4))
         half = self.finest.coarser(finer // 2, steps // (finer // 2))
-        self.blind = Blind(half, 2, round((_STAGES_S[0] + _NOTICED_S[-1]) * rate_hz) + 1)
-        self.most = round((_HISTORY_S + _LONGEST_S) * rate_hz) + 1
+        self.blind = Blind(half, 2, round((FIRST_S + _NOTICED_S[-1]) * rate_hz) + 1)
+        self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
         self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
         self._starts: dict[int, Starts] = {}
 
@@ -185,8 +184,8 @@ class _Estimation:
     def __init__(self, tables: _Tables, record: TouchRecord, noticed_s: float) -> None:
         rate = tables.rate_hz
         self.tables, self.rate = tables, rate
-        self.begin = max(0, record.detected - round(_HISTORY_S * rate))
-        end = min(record.angle_rad.size, record.detected + round(_LONGEST_S * rate))
+        self.begin = max(0, record.detected - round(HISTORY_S * rate))
+        end = min(record.angle_rad.size, record.detected + round(FINAL_S * rate))
         self.record = TouchRecord(
             rate,
             record.angle_rad[self.begin : end],
@@ -220,12 +219,12 @@ class _Estimation:
                 window = self.window(seconds)
             predict = self.predicting(starts)
             rest = self.explained("rigid", predict, window, starts, self.space(3))
-            known = seconds > _STAGES_S[0] and rest.posterior.std(0) < _WELL_KNOWN_M
+            known = seconds > FIRST_S and rest.posterior.std(0) < _WELL_KNOWN_M
             if known or self.available <= round(seconds * self.rate):
                 break
             starts = self._cloud(rest.posterior)
         explanations = [rest]
-        blind = self.tables.blind.scan(self.window(_STAGES_S[0]))
+        blind = self.tables.blind.scan(self.window(FIRST_S))
         if not self._fits(rest, window) or self._changes(rest, blind, window):
             explanations += self._others(blind, window)
         return self._answer(explanations, blind, window)
@@ -260,7 +259,7 @@ class _Estimation:
     def _first_starts(self) -> Real:
         """Return the likeliest candidates of the grid, after a second look."""
         tables = self.tables
-        window = self.window(_FIRST_S)
+        window = self.window(_GRID_S)
         grid = tables.starts(window.end - window.first)
         starts, chi2 = grid.marched(self.motion, window, self.detected)
         starts = starts[np.lexsort((chi2, starts[:, 0]))]
@@ -268,7 +267,7 @@ class _Estimation:
         best = starts.reshape(-1, count, 3)[:, :4].reshape(-1, 3)
         coarse = Touching(tables.coarse, tables.x_m, self.motion)
         again = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0], self.window(_STAGES_S[0]), best
+            lambda rows, window: coarse.predicted(rows, window)[0], self.window(FIRST_S), best
         )
         return best[np.argsort(again)[:12]]
 
@@ -330,7 +329,7 @@ class _Estimation:
         The model's parameters, and the steps of the march.
         """
         tables, model, motion = self.tables, self.tables.model, self.motion
-        whole = self.window(_LONGEST_S)
+        whole = self.window(FINAL_S)
         fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
         touching = Touching(tables.middle, tables.x_m, motion)
         middle = touching.predicted(best, whole)[0][0]
@@ -428,14 +427,14 @@ class _Estimation:
             grid = np.meshgrid(likely, instants, np.log(_STIFFNESSES), extra, indexing="ij")
             starts = np.stack([each.ravel() for each in grid], axis=1)
             coarse = self._marching(kind, self.tables.coarse, side)
-            for span, count in ((_FIRST_S, 80), (_STAGES_S[0], 10)):
+            for span, count in ((_GRID_S, 80), (FIRST_S, 10)):
                 chi2 = chi2_of(coarse, self.window(span), starts)
                 starts = starts[np.argsort(chi2)[:count]]
             march = self._marching(kind, self.tables.middle, side)
             found.append(self.explained(kind, march, window, starts, self._moving_space(kind)))
         touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
         knocking = Knocking(touching, self.tables.middle, 2)
-        starts = knocking.starts(self.window(_STAGES_S[0]), self.detected, 10)
+        starts = knocking.starts(self.window(FIRST_S), self.detected, 10)
         rest = self.space(3)
         space = knocking.space(self.edges, (rest.low[1], rest.high[1]))
         found.append(self.explained("knock", knocking.predicted, window, starts, space))

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
-"""Record before a detection that is kept for the estimate: as much as the estimator takes."""
+"""Record before a detection that an estimate rests on."""
 CONTACT_S: Final = 0.8
 """For so long after a detection the beam of a search may still touch what it has met."""
+FIRST_S: Final = 0.05
+"""Record after a detection that the first estimate rests on."""
 FINAL_S: Final = 0.2
 """Record after a detection that the last estimate rests on."""
 

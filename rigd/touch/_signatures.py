@@ -5,13 +5,18 @@ places and a few shapes of the force the exact model tells torque and base shear
 held; the filter of the innovations makes of them what the detector has to look for.
 """
 
+from dataclasses import dataclass
 from math import pi
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid
-from rigd.touch._innovations import InnovationFilter, ObservedBeam
+from rigd.touch._innovations import InnovationFilter, Noise, ObservedBeam, observed_beam
+
+if TYPE_CHECKING:  # a loop that watches does not read models
+    from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
 
@@ -27,6 +32,39 @@ _FINER = 8
 """Steps of the calculation in a tick."""
 _WRAPPED = 10.0
 """The end of the transform's period wraps around to exp(-10) of itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WatchedBeam:
+    """What a `TouchDetector` knows of a beam."""
+
+    observed: ObservedBeam
+    """The beam as it moves freely, with its noise."""
+    signatures: Real
+    """What a touch looks like, from `signatures`."""
+
+
+def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBeam:
+    """Prepare the detection of touches.
+
+    Parameters
+    ----------
+    model
+        The beam.
+    rate_hz
+        Ticks a second.
+    noise
+        Noise of the channels.
+    """
+    observed = observed_beam(
+        model.beam,
+        model.damping,
+        rate_hz,
+        noise,
+        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
+        torque_after_angle_s=model.torque_delay_s - model.angle_delay_s,
+    )
+    return WatchedBeam(observed, signatures(model.beam, model.damping, rate_hz, observed))
 
 
 def signatures(beam: Beam, damping: Damping, rate_hz: float, model: ObservedBeam) -> Real:

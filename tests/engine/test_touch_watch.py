@@ -66,7 +66,7 @@ def search(monkeypatch):
     reference = array("d", planned)
     cycle = SimpleNamespace(flags=0, wrench=(0.0,) * 6, angle_rad=0.1, coupling_torque_nm=0.2)
     approach = Approach((one, two), BRAKING, 200, BACK, force_limit_n=5.0)
-    order = TouchOrder(None, None, None, approach, SHEAR)
+    order = TouchOrder(None, None, approach, SHEAR)
     watch = TouchWatch(order, cycle, memoryview(reference), RATE_HZ)
     return SimpleNamespace(
         watch=watch,

@@ -12,6 +12,7 @@ from rigd.touch import (
     InnovationFilter,
     Noise,
     TouchDetector,
+    WatchedBeam,
     observed_beam,
     signatures,
 )
@@ -85,8 +86,8 @@ def innovations(model, readings):
 
 
 def detector_of(model):
-    known = signatures(BEAM, DAMPING, RATE_HZ, model)
-    return TouchDetector(model, known, RATE_HZ, DetectorSettings())
+    beam = WatchedBeam(model, signatures(BEAM, DAMPING, RATE_HZ, model))
+    return TouchDetector(beam, RATE_HZ, DetectorSettings())
 
 
 def detection(model, readings):
