@@ -309,18 +309,10 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
     """Return the identified model, or the one that the file's attachments state."""
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
-    angle_delay_s, torque_delay_s = (
-        stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")
-    )
-    tool_inertia_kg_m2 = stated_tool_inertia_kg_m2(session)
+    stated = {key: stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")}
+    stated["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
     if path is not None:
-        return TouchModel.from_analysis(
-            path,
-            length_m=beam.length_m,
-            angle_delay_s=angle_delay_s,
-            torque_delay_s=torque_delay_s,
-            tool_inertia_kg_m2=tool_inertia_kg_m2,
-        )
+        return TouchModel.from_analysis(path, length_m=beam.length_m, **stated)
     attached = (session.attachments.get(name, b"") for name in _DESCRIPTIONS)
     damping: Damping | None = next(filter(None, map(nominal_damping, attached)), None)
     if damping is None:
@@ -328,13 +320,7 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(
-        beam,
-        damping,
-        angle_delay_s=angle_delay_s,
-        torque_delay_s=torque_delay_s,
-        tool_inertia_kg_m2=tool_inertia_kg_m2,
-    )
+    return TouchModel.assumed(beam, damping, **stated)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:

@@ -138,12 +138,31 @@ def mode_mean(n: int) -> Real:
     >>> print(mode_mean(3).round(4))
     [ 0.783  -0.4339  0.2544]
     """
+    mean: Real = 2 * (-1.0) ** np.arange(n) * root_shear_ratio(n) / clamped_free_eigenvalues(n)
+    return mean
+
+
+def root_shear_ratio(n: int) -> Real:
+    """Third over second derivative of each mode shape at the axis, over -k; shape (n,).
+
+    There a mode of mean square 1 and wave number k has the curvature ``2 k² (-1)^(i - 1)``.
+
+    Parameters
+    ----------
+    n
+        Number of modes, from the first on.
+
+    Examples
+    --------
+    >>> from rigd.beam import root_shear_ratio
+    >>> print(root_shear_ratio(3).round(4))
+    [0.7341 1.0185 0.9992]
+    """
     z = clamped_free_eigenvalues(n)
     decay = np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
-    sigma = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
-    mean: Real = 2 * (-1.0) ** np.arange(n) * sigma / z
-    return mean
+    ratio: Real = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
+    return ratio
 
 
 def participation(beam: Beam, n: int) -> Real:

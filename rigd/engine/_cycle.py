@@ -24,10 +24,7 @@ from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import runtime_folder
 from rigd.safety import LimitWatch, Violation
-from rigd.session import Status
-
-AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
-
+from rigd.session import WRENCH_FIELDS, Status
 
 REMEDY = (
     "The zero of the angle and its limits are invalid: check the encoder, its cable and shield, "
@@ -426,7 +423,7 @@ class Rest:
         return {"tare_s": repr(self.duration_s)} | {
             f"tare_{what}_{axis}": repr(value)
             for what, values in (("mean", self.mean), ("std", self.spread))
-            for axis, value in zip(AXES, values, strict=True)
+            for axis, value in zip(WRENCH_FIELDS, values, strict=True)
         }
 
 

@@ -13,7 +13,6 @@ from dataclasses import asdict
 from rigd.control import PidController, design_pid
 from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
 from rigd.engine._cycle import (
-    AXES,
     Cycle,
     Rest,
     Standstill,
@@ -45,6 +44,7 @@ from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
+from rigd.session import WRENCH_FIELDS
 
 _SILENCE_S = 1.0
 """Time for which a device may be silent between sessions."""
@@ -338,8 +338,8 @@ class _Attendance:
         self._cycle.tare = rest.mean
         self._watch.tared_nm = float(rest.torques_nm.mean())
         return {
-            "mean": dict(zip(AXES, rest.mean, strict=True)),
-            "std": dict(zip(AXES, rest.spread, strict=True)),
+            "mean": dict(zip(WRENCH_FIELDS, rest.mean, strict=True)),
+            "std": dict(zip(WRENCH_FIELDS, rest.spread, strict=True)),
             "torque_std_nm": rest.torque_spread_nm,
         }
 

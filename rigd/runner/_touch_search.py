@@ -70,23 +70,16 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
 
     rig = profile.rig
     sensor = rig.sensor
+    stated = {
+        "angle_delay_s": rig.encoder.delay_s,
+        "torque_delay_s": sensor.delay_s,
+        "tool_inertia_kg_m2": sensor.tool_inertia_kg_m2,
+    }
     path = str(excitation.parameters["file"])
     if path:
-        model = TouchModel.from_analysis(
-            path,
-            length_m=rig.beam.length_m,
-            angle_delay_s=rig.encoder.delay_s,
-            torque_delay_s=sensor.delay_s,
-            tool_inertia_kg_m2=sensor.tool_inertia_kg_m2,
-        )
+        model = TouchModel.from_analysis(path, length_m=rig.beam.length_m, **stated)
     else:
-        model = TouchModel.assumed(
-            rig.beam,
-            rig.damping,
-            angle_delay_s=rig.encoder.delay_s,
-            torque_delay_s=sensor.delay_s,
-            tool_inertia_kg_m2=sensor.tool_inertia_kg_m2,
-        )
+        model = TouchModel.assumed(rig.beam, rig.damping, **stated)
     beam = watched_beam(model, rig.rate_hz, _noise(profile))
     shear = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(TouchOrder(beam, DetectorSettings(), excitation.approach, shear), model)

@@ -53,6 +53,9 @@ SAMPLE_TYPES: Final[dict[str, str]] = {
 }
 """Fields of ``rigd.Sample`` with their protobuf types; the first has number 1."""
 
+WRENCH_FIELDS: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+"""Fields of ``rigd.Sample`` with the wrench, in the order of the projections."""
+
 CONTROL_TYPES: Final[dict[str, str]] = {
     "t_ns": "sfixed64",
     "tick": "fixed32",

@@ -10,7 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import PointForceGrid, clamped_free_eigenvalues, mode_shape, poles
+from rigd.beam import (
+    PointForceGrid,
+    clamped_free_eigenvalues,
+    mode_shape,
+    poles,
+    root_shear_ratio,
+)
 from rigd.touch._kernels import Line
 from rigd.touch._model import TouchModel
 
@@ -240,10 +246,9 @@ class Ringing:
         count = max(1, int(np.sum(found.imag < 2 * np.pi * _HIGHEST_HZ)))
         found = found[:count]
         wave = clamped_free_eigenvalues(count) / beam.length_m
-        z = wave * beam.length_m
         sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-        ratio = (np.sinh(z) - np.sin(z)) / (np.cosh(z) + np.cos(z))
         stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * found**damping.alpha)
+        ratio = root_shear_ratio(count)
         root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
         shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(count)])
         # Amplitudes in units that give about the same torque in each mode.

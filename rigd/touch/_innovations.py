@@ -23,6 +23,7 @@ from rigd.beam import (
     PointForceGrid,
     clamped_free_eigenvalues,
     poles_for_eigenvalues,
+    root_shear_ratio,
 )
 
 Real = NDArray[np.float64]
@@ -377,8 +378,6 @@ def _observer(
     a[even, even + 1], a[even + 1, even] = -turning.imag, turning.imag
     zeros = np.arange(2 * m, n)
     a[zeros, zeros] = 1.0
-    # At the root of a mode of wave number k the third derivative is sigma k times the second.
-    sigma = (np.cosh(z) + np.cos(z)) / (np.sinh(z) + np.sin(z))
     c[0, even] = 1.0
     c[np.arange(channels), zeros] = 1.0
     sizes = np.array([noise.torque_nm, noise.shear_n or 0.0])
@@ -388,7 +387,7 @@ def _observer(
     q[even] = q[even + 1] = variance[0] * (_OBSERVER_RAD_S / rate_hz) ** 2
     q[zeros] = variance[:channels] * (_ZERO_RAD_S / rate_hz) ** 2
     if both:
-        c[1, even] = sigma[ringing] * wave_number
+        c[1, even] = root_shear_ratio(_OBSERVED_MODES)[ringing] * wave_number
     used = c[:channels]
     r = np.diag(variance[:channels])
     covariance = solve_discrete_are(a.T, used.T, np.diag(q), r)

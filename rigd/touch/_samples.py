@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.session import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
@@ -16,8 +17,6 @@ FIRST_S: Final = 0.05
 """Record after a detection that the first estimate rests on."""
 FINAL_S: Final = 0.2
 """Record after a detection that the last estimate rests on."""
-
-_AXES: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 
 
 def around_touch(
@@ -88,6 +87,6 @@ def base_shear_n(
     shear_projection
         Six numbers: base shear = projection · wrench.
     """
-    wrench = np.array([samples[axis] for axis in _AXES])
+    wrench = np.array([samples[axis] for axis in WRENCH_FIELDS])
     shear: NDArray[np.float64] = np.array(shear_projection) @ wrench
     return shear

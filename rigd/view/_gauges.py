@@ -8,14 +8,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session import Status
+from rigd.session import WRENCH_FIELDS, Status
 
 Records = npt.NDArray[Any]
 
 NEAR: Final = 0.8
 """Fraction of a limit from which on a gauge is near it, as the interlocks' warnings."""
 
-WRENCH: Final = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 
 UNITS: Final = {
     "angle": "rad",
@@ -23,7 +22,7 @@ UNITS: Final = {
     "tracking_error": "rad",
     "torque_command": "N·m",
     "i2t": "N·m",
-} | {field.partition("_")[0]: "N" if field.endswith("_n") else "N·m" for field in WRENCH}
+} | {field.partition("_")[0]: "N" if field.endswith("_n") else "N·m" for field in WRENCH_FIELDS}
 """Units of the gauges, by name."""
 
 
@@ -90,7 +89,7 @@ class Gauges:
             "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
             "torque_command": _peak(torque_nm),
             "i2t": self._rms_nm(torque_nm),
-        } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH}
+        } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH_FIELDS}
         return self.beside(peaks)
 
     def beside(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
