@@ -8,7 +8,8 @@ is then estimated as it is during a session (`rigd.touch`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
+from math import inf, pi, sqrt
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from analysis.record_checks import (
     stated_delay_s,
     stated_rate_hz,
     stated_tool_inertia_kg_m2,
+    stated_torque_filter_s,
 )
 from rigd.beam import Damping
 from rigd.session import Session, SessionError, Status, read_session
@@ -32,6 +34,7 @@ from rigd.touch import (
     DetectorSettings,
     FreeBeam,
     Noise,
+    SensorFilter,
     TouchDetector,
     TouchEstimator,
     TouchModel,
@@ -61,6 +64,8 @@ _LEAST_REST_S: Final = 0.5
 """Beginning by which the test judges the noise, where the file states no longer rest."""
 _QUIET_S: Final = 0.5
 """After so long without a detection the next one is another touch: the beam bounces."""
+_MOST_OF_TICK: Final = 0.99
+"""Filters of more than a hundred records a tick are not told from that."""
 _MOST_FOUND: Final = 20
 """More touches than that in a record that was no search: it is the model that does not fit."""
 _MOST_OF_MODEL: Final = 5.0
@@ -270,7 +275,7 @@ class TouchAnalysis:
     def _prepared_for(self, model: TouchModel, rate_hz: float) -> _Prepared:
         key = (
             model.beam, model.damping, model.tool_inertia_kg_m2, model.angle_delay_s,
-            model.torque_delay_s, rate_hz,
+            model.torque_delay_s, model.sensor_filter, rate_hz,
         )  # fmt: skip
         if key not in self._prepared:
             x_m = np.linspace(0.0, model.beam.length_m, _POINTS)
@@ -309,7 +314,10 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
     """Return the identified model, or the one that the file's attachments state."""
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
-    stated = {key: stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")}
+    stated: dict[str, Any] = {
+        key: stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")
+    }
+    stated["sensor_filter"] = _sensor_filter(session, rate_hz)
     stated["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
     if path is not None:
         return TouchModel.from_analysis(path, length_m=beam.length_m, **stated)
@@ -321,6 +329,30 @@ def _model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
     return TouchModel.assumed(beam, damping, **stated)
+
+
+def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
+    """Return the sensor's low-pass filter, and the one that makes samples of its records."""
+    order, constant_s = max(enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1))
+    corner_hz = 1 / (2 * pi * constant_s) if constant_s else 0.0
+    kind = session.metadata.get("sensor_filter", "")
+    if not kind:
+        return SensorFilter(corner_hz, order)
+    delay_s = session.number("sensor_filter_delay_s", 0.0)
+    # A mean of n records of a tick is (n - 1) / 2n of a tick old, the triangle twice as much.
+    share = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(kind, inf)
+    if not 0.0 <= share < _MOST_OF_TICK:
+        raise RecordError(
+            f"{session.path}: sensor_filter is {kind[:100]!r} with sensor_filter_delay_s = "
+            f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
+            f"or a triangle (shorter than a period); correct the file's metadata."
+        )
+    records = round(1 / (1 - share))
+    weights = np.full(records, 1 / records)
+    if kind == "triangle":
+        weights = np.convolve(weights, weights)
+    spacing_s = 2 * delay_s / max(weights.size - 1, 1)
+    return SensorFilter(corner_hz, order, tuple(weights.tolist()), spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:

@@ -119,7 +119,8 @@ class TouchFollower:
         part = around_touch(self._samples, tick, job.rate_hz, free_from)
         record = touch_record(part, tick, job.rate_hz, job.shear_projection)
         began_s = time.monotonic()
-        document = self._estimator.estimate(record).as_dict(int(part["tick"][0]) / job.rate_hz)
+        told = self._estimator.estimate(record, scan=False)
+        document = told.as_dict(int(part["tick"][0]) / job.rate_hz)
         return TouchTold(number, tick, final, document, time.monotonic() - began_s)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rigd.devices import RigParameters
 from rigd.engine import (
     TOUCH,
     ChildError,
@@ -28,7 +29,7 @@ from rigd.session import packed_touches, touch_line
 if TYPE_CHECKING:
     from rigd.profile import RealtimeSettings
     from rigd.runner._process_group import ProcessGroup
-    from rigd.touch import Noise, TouchModel
+    from rigd.touch import Noise, SensorFilter, TouchModel
 
 _STEP_STD: Final = 1 / sqrt(12)
 """Standard deviation of a value that is rounded to steps of 1."""
@@ -70,10 +71,11 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
 
     rig = profile.rig
     sensor = rig.sensor
-    stated = {
+    stated: dict[str, Any] = {
         "angle_delay_s": rig.encoder.delay_s,
         "torque_delay_s": sensor.delay_s,
         "tool_inertia_kg_m2": sensor.tool_inertia_kg_m2,
+        "sensor_filter": _sensor_filter(rig),
     }
     path = str(excitation.parameters["file"])
     if path:
@@ -83,6 +85,17 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     beam = watched_beam(model, rig.rate_hz, _noise(profile))
     shear = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(TouchOrder(beam, DetectorSettings(), excitation.approach, shear), model)
+
+
+def _sensor_filter(rig: RigParameters) -> "SensorFilter":
+    """Return the filters between beam and samples that a profile states."""
+    from rigd.touch import SensorFilter
+
+    low_pass = rig.sensor.filter_hz, rig.sensor.filter_order
+    serial = rig.ati_serial
+    if serial is None:
+        return SensorFilter(*low_pass)
+    return SensorFilter(*low_pass, serial.weights(rig.rate_hz), 1 / serial.stream_hz)
 
 
 def _noise(profile: Profile) -> "Noise":

@@ -18,6 +18,7 @@ from ._samples import HISTORY_S as HISTORY_S
 from ._samples import around_touch as around_touch
 from ._samples import base_shear_n as base_shear_n
 from ._samples import touch_record as touch_record
+from ._sensor_filter import SensorFilter as SensorFilter
 from ._signatures import WatchedBeam as WatchedBeam
 from ._signatures import signatures as signatures
 from ._signatures import watched_beam as watched_beam

@@ -5,20 +5,30 @@ kernel. Steps begin at the instant of touch, so that what is predicted depends s
 the force of a step is found implicitly: a stiff obstacle is as stable as a soft one.
 """
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
+_Precision = TypeVar("_Precision", np.float32, np.float64)
+
+_BLOCK, _SHORT_BLOCK = 16, 6
+"""Steps whose earlier forces are summed at once; between them a step costs three operations, on as
+many steps as remain in the block: shorter blocks for many candidates."""
+_MANY = 1000
+_SAMPLES = 16
+"""Samples convolved at once, all with as much of the past as the last of them."""
 
 
 def march(
-    kernel: Real,
-    approach: Real,
-    stiffness_n_per_m: Real,
+    kernel: NDArray[_Precision],
+    approach: NDArray[_Precision],
+    stiffness_n_per_m: NDArray[_Precision],
     step_s: float,
     rate_m_per_s: Real | float = 0.0,
     mobility_m_per_n_s: Real | float = 0.0,
-) -> Real:
+) -> NDArray[_Precision]:
     """Force with which the beam presses, at each step since the touch.
 
     Parameters
@@ -26,10 +36,10 @@ def march(
     kernel
         Displacement in the direction of the force per hat of force, shape (k, n).
     approach
-        How far the beam would be beyond the place of touch without the force, shape (k, n); its
-        first column is 0.
+        How far the beam would be beyond the place of touch without the force, shape (k, n), or
+        (k, g, n) for g candidates of each kernel; the first of the n is 0.
     stiffness_n_per_m
-        Stiffness of the obstacle, shape (k,).
+        Stiffness of the obstacle, shape (k,) or (k, g).
     step_s
         Time between two columns.
     rate_m_per_s
@@ -39,47 +49,129 @@ def march(
 
     Returns
     -------
-    ndarray, shape (k, n)
+    ndarray, shape of `approach`
         Magnitude in N, 0 where they are apart.
     """
-    candidates, steps = approach.shape
-    # Latest force first, so that a dot product of two rows is the convolution.
-    reverse = np.zeros((candidates, steps))
-    fled = np.zeros(candidates)
-    moving = np.any(rate_m_per_s) or np.any(mobility_m_per_n_s)
-    gives = stiffness_n_per_m / (
-        1 + stiffness_n_per_m * (kernel[:, 0] + np.asarray(mobility_m_per_n_s) * step_s)
-    )
-    for i in range(1, steps):
-        bent = np.einsum("kj,kj->k", kernel[:, 1:i], reverse[:, steps - i : steps - 1])
-        inside = approach[:, i] - bent
-        if moving:
-            fled += rate_m_per_s * step_s
-            inside -= fled
-        np.maximum(inside, 0.0, out=inside)
-        inside *= gives
-        if moving:
-            fled += mobility_m_per_n_s * step_s * inside
-        reverse[:, steps - 1 - i] = inside
-    return reverse[:, ::-1]
+    shape = approach.shape
+    kernels, steps = kernel.shape
+    # An obstacle that flees is a shorter approach, one that gives way a softer beam.
+    if np.any(rate_m_per_s):
+        fled = np.multiply.outer(np.asarray(rate_m_per_s) * step_s, np.arange(steps))
+        approach = approach - fled.astype(approach.dtype)
+    if np.any(mobility_m_per_n_s):
+        given = np.asarray(mobility_m_per_n_s, kernel.dtype) * step_s
+        kernel = kernel + given[..., None]
+    stiffness = stiffness_n_per_m.reshape(kernels, -1)
+    # What the force of a step would be without earlier ones: (n, k, g).
+    gives = stiffness / (1 + stiffness * kernel[:, :1])
+    wanted = approach.reshape(kernels, -1, steps).transpose(2, 0, 1) * gives
+    group = stiffness.shape[1]
+    force = np.zeros((kernels, steps, group), wanted.dtype)
+    # The latest lag comes first, so that a product of two rows is the convolution.
+    reverse = np.ascontiguousarray(kernel[:, ::-1])
+    row, column = reverse.strides
+    # Within a block each force is taken from the steps behind it. All views are made once.
+    width = _BLOCK if kernels * group < _MANY else _SHORT_BLOCK
+    inside, bent = np.zeros((2, width, kernels * group), wanted.dtype)
+    within = np.zeros((width - 1, kernels * group), wanted.dtype)
+    lags = kernel[:, 1:width].T[:, :, None] * gives
+    within[: len(lags)] = lags.reshape(len(lags), -1)
+    views = [
+        (inside[i], within[: width - 1 - i], bent[: width - 1 - i], inside[i + 1 :])
+        for i in range(width)
+    ]
+    nothing = np.zeros(kernels * group, wanted.dtype)
+    touched = steps
+    for begin in range(1, steps, width):
+        end = min(begin + width, steps)
+        part = wanted[begin:end]
+        if touched < begin:
+            # Element (k, i, j): what force touched + j does at step begin + i.
+            effect = np.ndarray(
+                (kernels, end - begin, begin - touched),
+                reverse.dtype,
+                buffer=reverse,
+                offset=(steps - 1 - begin + touched) * column,
+                strides=(row, -column, column),
+            )
+            earlier = force[:, touched:begin]
+            if group == 1:
+                before = np.vecdot(effect, earlier.transpose(0, 2, 1))[:, :, None]
+            else:
+                before = np.ascontiguousarray(effect) @ earlier
+            part = part - before.transpose(1, 0, 2) * gives
+        if not part.max() > 0:
+            continue  # nobody is in contact
+        touched = min(touched, begin)
+        inside[: end - begin] = part.reshape(end - begin, -1)
+        for now, lag, product, later in views:
+            np.maximum(now, nothing, out=now)
+            np.multiply(lag, now, out=product)
+            np.subtract(later, product, out=later)
+        block = inside[: end - begin].reshape(-1, kernels, group)
+        force[:, begin:end] = block.transpose(1, 0, 2)
+    return np.ascontiguousarray(force.transpose(0, 2, 1)).reshape(shape)
 
 
-def responses(kernels: tuple[Real, ...], force: Real) -> tuple[Real, ...]:
-    """Convolve a force with kernels, each of the force's shape (k, n).
+def shifted(table: Real, begin: Real, count: int) -> Real:
+    """Values of each row from a place between its columns on (cubic, four points).
+
+    Before the first column they are 0, behind the last one they are held.
+
+    Parameters
+    ----------
+    table
+        Shape (k, n).
+    begin
+        Column at which the first value is taken, shape (k,).
+    count
+        How many values, one column apart.
+    """
+    whole = np.floor(begin).astype(np.intp)
+    u = (begin - whole)[:, None]
+    index = np.clip(whole[:, None] + np.arange(count + 3), 0, table.shape[1])
+    near = np.take_along_axis(np.pad(table, ((0, 0), (1, 0))), index, axis=1)
+    value = near[:, :count] * (-u * (u - 1) * (u - 2) / 6)
+    value += near[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
+    value += near[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)
+    value += near[:, 3:] * ((u + 1) * u * (u - 1) / 6)
+    return value
+
+
+def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) -> Real:
+    """Convolve a force with kernels, every so many steps; shape (k, kernels, samples).
 
     Parameters
     ----------
     kernels
-        Responses to a hat of force, each of shape (k, n) or (1, n).
+        Responses to a hat of force, each of shape (k, n) or (1, n); 0 from column n on.
     force
-        Force at each step, shape (k, n).
+        Force at each step, shape (k, (samples - 1) · every + 1).
+    every
+        Steps between two samples, the first of which is the first step.
+    samples
+        How many.
     """
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    n = force.shape[1]
-    length = next_fast_len(2 * n, real=True)
-    spectrum = rfft(force, length, axis=1)
-    return tuple(
-        irfft(rfft(kernel[:, :n], length, axis=1) * spectrum, length, axis=1)[:, :n]
-        for kernel in kernels
-    )
+    candidates, steps = force.shape
+    tables = np.stack(kernels, axis=1)
+    length = min(tables.shape[2], steps)
+    if len(tables) == 1 and candidates > _SAMPLES:  # one matrix for all
+        lag = every * np.arange(samples) - np.arange(steps)[:, None]
+        table = np.where((lag >= 0) & (lag < length), tables[0][:, np.clip(lag, 0, length - 1)], 0)
+        return (force @ table).transpose(1, 0, 2)
+    # The latest force first, and zeros before the first one: each sample's part in one piece.
+    reverse = np.zeros((candidates, steps + length))
+    reverse[:, :steps] = force[:, ::-1]
+    row, column = reverse.strides
+    told = np.empty((candidates, len(kernels), samples))
+    for first in range(0, samples, _SAMPLES):
+        end = min(first + _SAMPLES, samples)
+        reach = min(length, (end - 1) * every + 1)
+        view = np.ndarray(
+            (candidates, 1, end - first, reach),
+            buffer=reverse,
+            offset=(steps - 1 - first * every) * column,
+            strides=(row, 0, -every * column, column),
+        )
+        told[:, :, first:end] = np.vecdot(tables[:, :, None, :reach], view)
+    return told

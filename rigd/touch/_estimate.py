@@ -7,6 +7,7 @@ noise, the model's uncertainty and every place that is about as likely.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,16 @@ _GRID_S = 0.022
 """After the detection: what the grid of starts is compared with."""
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
 """After the detection: what is explained, the longest only if the point is not well known yet."""
+_COVERED_S = 0.1
+"""After the detection: so far the effects of what is uncertain are taken along at once."""
+_WORTH = 1.2
+"""So many times the samples are worth another stage."""
 _WELL_KNOWN_M = 2e-3
 _NEAR_TIP = 0.8
 """Share of the length beyond which contacts are shorter, and steps finer."""
+_BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+_AT_TIP = 0.95
+"""Beyond this share a longer record tells no more: its many short contacts fit anywhere."""
 
 _SMALLEST = np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])
 """Least standard deviations that samples are drawn with."""
@@ -101,7 +109,7 @@ class TouchEstimator:
         self.model, self._rate_hz = model, rate_hz
         self._tables = _Tables(model, rate_hz)
 
-    def estimate(self, record: TouchRecord) -> TouchEstimate:
+    def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
         """Estimate one touch from what of the record is there.
 
         Parameters
@@ -109,6 +117,8 @@ class TouchEstimator:
         record
             Samples from 0.3 s or more before the touch; the more after the detection, the better
             is the answer, up to 0.2 s.
+        scan
+            Whether the likelihood of all places is wanted; without it, it is empty.
         """
         told = None
         for noticed in _NOTICED_S:
@@ -117,7 +127,7 @@ class TouchEstimator:
             told = _Estimation(self._tables, record, noticed)
             if not told.begins_too_late:
                 break
-        return self._untold(record) if told is None else told.told()
+        return self._untold(record) if told is None else told.told(scan=scan)
 
     def _untold(self, record: TouchRecord) -> TouchEstimate:
         """Too few samples before the touch."""
@@ -151,7 +161,12 @@ class _Tables:
         finer = 4 * max(1, round(4000 / rate_hz))
         steps = round((FINAL_S + _NOTICED_S[-1] + 0.01) * rate_hz * finer)
         self.finest = contact_kernels(
-            model.beam, model.damping, self.x_m, 1 / (finer * rate_hz), steps
+            model.beam,
+            model.damping,
+            self.x_m,
+            1 / (finer * rate_hz),
+            steps,
+            model.sensor_filter,
         )
         self.middle = self.finest.coarser(2, steps // 2)
         self.coarse = self.finest.coarser(finer // 4, steps // (finer // 4))
@@ -160,6 +175,14 @@ class _Tables:
         self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
         self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
         self._starts: dict[int, Starts] = {}
+        self.starts(round(_NOTICED_S[0] * rate_hz) + round(_GRID_S * rate_hz))
+        nowhere = np.empty(0)
+        self.changed = [
+            FreeBeam(model.changed(name, std), nowhere, rate_hz, self.most)
+            for name, std in model.std.items()
+            if std > 0
+        ]
+        """The beam with each uncertain parameter one standard deviation off."""
 
     def starts(self, samples: int) -> Starts:
         """Grid of starts for so many samples."""
@@ -197,7 +220,7 @@ class _Estimation:
         self.quiet = self.detected - round(noticed_s * rate)
         self.motion = tables.free.motion(self.record, self.quiet, self.quiet - 4)
         self.available = self.record.angle_rad.size - self.detected
-        self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]) - 0.001)
+        self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
         self.starts = self._first_starts()
 
@@ -206,35 +229,45 @@ class _Estimation:
         """Whether the touch seems to be before the samples that may hold it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
 
-    def told(self) -> TouchEstimate:
+    def told(self, *, scan: bool) -> TouchEstimate:
         """Return what the touch was."""
-        starts = self.starts
-        for seconds in _STAGES_S:
-            window = self.window(seconds)
-            if self.deviations is None:
+        starts, covered_s = self.starts, 0.0
+        available_s = self.available / self.rate
+        stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
+        for seconds in (*stages, available_s):
+            if covered_s == 0.0:
                 predict = self.predicting(starts, coarser=True)
-                found = descend(predict, window, starts, self.space(3), rounds=7)
-                starts = _distinct(found)
-                self.deviations = self._deviations(starts[:1])
-                window = self.window(seconds)
-            predict = self.predicting(starts)
-            rest = self.explained("rigid", predict, window, starts, self.space(3))
-            known = seconds > FIRST_S and rest.posterior.std(0) < _WELL_KNOWN_M
-            if known or self.available <= round(seconds * self.rate):
+                found = descend(predict, self.window(seconds), starts, self.space(3), rounds=7)
+                starts = self._beside(_distinct(found))
+            if covered_s < seconds:
+                covered_s = min(max(seconds, _COVERED_S), available_s)
+                self.deviations = self._deviations(starts[:1], covered_s)
+            window = self.window(seconds)
+            rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
+            place = rest.posterior.mean(0)
+            known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
+            if seconds > FIRST_S and known:
                 break
-            starts = self._cloud(rest.posterior)
+            starts = np.vstack([rest.parameters, self._cloud(rest.posterior)])
         explanations = [rest]
-        blind = self.tables.blind.scan(self.window(FIRST_S))
-        if not self._fits(rest, window) or self._changes(rest, blind, window):
-            explanations += self._others(blind, window)
-        return self._answer(explanations, blind, window)
+        if not self._fits(rest, window) or self._changes(rest, window):
+            explanations += self._others(window)
+        return self._answer(explanations, window, scan=scan)
+
+    @cached_property
+    def blind(self) -> BlindScan:
+        """Any force in the first samples: it takes as long as the rest of an estimate from them."""
+        return self.tables.blind.scan(self.window(FIRST_S))
 
     # What candidates are compared with
 
     def window(self, seconds: float) -> Window:
         """Return the samples from before the touch to so long after the detection."""
-        end = self.detected + min(self.available, round(seconds * self.rate))
-        return Window.of(self.motion, self.quiet, end, self.deviations)
+        return Window.of(self.motion, self.quiet, self.end(seconds), self.deviations)
+
+    def end(self, seconds: float) -> int:
+        """Return the sample so long after the detection, or the end of the record."""
+        return self.detected + min(self.available, round(seconds * self.rate))
 
     def space(self, width: int) -> Space:
         """Ranges of `PARAMETERS`."""
@@ -270,6 +303,14 @@ class _Estimation:
             lambda rows, window: coarse.predicted(rows, window)[0], self.window(FIRST_S), best
         )
         return best[np.argsort(again)[:12]]
+
+    def _beside(self, starts: Real) -> Real:
+        """Add starts beside the best ones near the tip, where the minima stand close together."""
+        if np.median(starts[:, 0]) <= _NEAR_TIP * self.tables.model.beam.length_m:
+            return starts
+        beside = np.repeat(starts[None, :2], _BESIDE_M.size, axis=0)
+        beside[:, :, 0] = np.clip(beside[:, :, 0] + _BESIDE_M[:, None], *self.edges)
+        return np.vstack([starts, beside.reshape(-1, starts.shape[1])])
 
     def _cloud(self, posterior: Posterior) -> Real:
         """Candidates of a longer window, from what a shorter one leaves likely."""
@@ -323,67 +364,57 @@ class _Estimation:
 
     # How well it is known
 
-    def _deviations(self, best: Real) -> Real:
+    def _deviations(self, best: Real, seconds: float) -> Real:
         """Effect on the innovations of what is uncertain, one standard deviation each.
 
         The model's parameters, and the steps of the march.
         """
-        tables, model, motion = self.tables, self.tables.model, self.motion
-        whole = self.window(FINAL_S)
+        tables, motion = self.tables, self.motion
+        whole = Window.of(motion, self.quiet, self.end(seconds))
         fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
         touching = Touching(tables.middle, tables.x_m, motion)
         middle = touching.predicted(best, whole)[0][0]
         columns = [
             fine - middle,
-            *self._ringing(touching, best, whole, middle),
-            *self._angle_noise(touching, best, whole, middle),
+            *self._ringing(touching, best[0], whole),
+            *self._angle_noise(touching, best[0], whole),
         ]
         span = slice(whole.first, whole.end)
         left = motion.innovations[:, span] - middle
         x = float(best[0, 0])
-        near = x + 1e-3 * np.arange(-1.5, 2.0)
-        for name, std in model.std.items():
-            if not std > 0:
-                continue
-            other = model.changed(name, std)
-            free = FreeBeam(other, near, self.rate, tables.most)
-            changed = free.motion(self.record, self.quiet, self.quiet - 4)
+        near = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
+        for free in tables.changed:
+            changed = free.at(near).motion(self.record, self.quiet, self.quiet - 4)
             kernels = contact_kernels(
-                other.beam,
-                other.damping,
+                free.model.beam,
+                free.model.damping,
                 np.array([x]),
                 tables.middle.step_s,
                 round((motion.t[-1] - best[0, 1]) / tables.middle.step_s) + 4,
+                free.model.sensor_filter,
             )
             effect, _ = Touching(kernels, near, changed).predicted(best, whole, kernels=kernels)
             columns.append(changed.innovations[:, span] - effect[0] - left)
         return np.stack(columns, axis=-1)
 
-    def _ringing(
-        self, touching: Touching, best: Real, whole: Window, predicted: Real
-    ) -> list[Real]:
+    def _ringing(self, touching: Touching, best: Real, whole: Window) -> Real:
         """Effects of what is unknown of the free motion, also by where it lets the beam touch."""
         motion = self.motion
         spread = motion.spread
         count = motion.ringing.poles.size * 2
-        place = np.argmin(np.abs(self.tables.x_m - best[0, 0]))
+        there = best[:1] / self.tables.model.beam.length_m
         columns = motion.displacement_m.shape[1]
         # Times from the record's beginning, as the amplitudes are meant.
         t = motion.first_s + self.tables.model.angle_delay_s + motion.step_s * np.arange(columns)
-        moved = motion.ringing.displacement(t, spread[:count])[place]
-        passed, _ = touching.predicted(
-            np.repeat(best, spread.shape[1], axis=0), whole, more_m=moved.T
-        )
+        moved = motion.ringing.at(there).displacement(t, spread[:count])[0]
         direct = motion.design[:, whole.first : whole.end] @ spread
-        return [direct[:, :, i] + passed[i] - predicted for i in range(spread.shape[1])]
+        return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
 
-    def _angle_noise(
-        self, touching: Touching, best: Real, whole: Window, predicted: Real
-    ) -> list[Real]:
+    def _angle_noise(self, touching: Touching, best: Real, whole: Window) -> Real:
         """Effects of the encoder's steps, by where they let the beam touch."""
         motion = self.motion
         samples = np.arange(whole.first, whole.end)
-        place = int(np.argmin(np.abs(self.tables.x_m - best[0, 0])))
+        place = int(np.argmin(np.abs(self.tables.x_m - best[0])))
         one = self.tables.free.per_sample(place, samples.size + 8)
         # Columns begin four samples before the window.
         late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
@@ -391,10 +422,7 @@ class _Estimation:
         moved = np.where(
             (index >= 0) & (index < one.size), one[np.clip(index, 0, one.size - 1)], 0.0
         )
-        passed, _ = touching.predicted(
-            np.repeat(best, samples.size, axis=0), whole, more_m=motion.angle_noise_rad * moved
-        )
-        return list(passed - predicted)
+        return touching.passed_on(best, whole, motion.angle_noise_rad * moved)
 
     # Other kinds
 
@@ -407,19 +435,26 @@ class _Estimation:
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
         return float(degrees + _WORSE * np.sqrt(2 * degrees + of_noise))
 
-    def _changes(self, rest: _Explanation, blind: BlindScan, window: Window) -> bool:
+    def _changes(self, rest: _Explanation, window: Window) -> bool:
         """Whether the obstacle at rest becomes much likelier if it may move or give way."""
-        for kind, extra in (("moving", (-0.05, 0.05)), ("yielding", (0.02,))):
-            starts = np.array([[*rest.parameters, each] for each in extra])
-            march = self._marching(kind, self.tables.middle, _side(blind))
-            found = descend(march, window, starts, self._moving_space(kind), rounds=5)
-            if found.chi2.min() < rest.chi2 - _CLEAR:
-                return True
-        return False
+        extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
+        starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
+        free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
+        touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
+        side = touching.side(rest.parameters)
+        found = descend(
+            lambda candidates, window: touching.predicted(candidates, window, side)[0],
+            window,
+            starts,
+            self.space(5),
+            rounds=5,
+            free=free,
+        )
+        return bool(found.chi2.min() < rest.chi2 - _CLEAR)
 
-    def _others(self, blind: BlindScan, window: Window) -> list[_Explanation]:
+    def _others(self, window: Window) -> list[_Explanation]:
         """Obstacles that move or give way, and a knock."""
-        side = _side(blind)
+        blind, side = self.blind, self._side()
         likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
         found = []
@@ -439,6 +474,10 @@ class _Estimation:
         space = knocking.space(self.edges, (rest.low[1], rest.high[1]))
         found.append(self.explained("knock", knocking.predicted, window, starts, space))
         return found
+
+    def _side(self) -> float:
+        """Direction in which the beam presses: against the force, whatever that comes from."""
+        return -1.0 if self.blind.force_n.sum() > 0 else 1.0
 
     def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
         """March obstacles whose fourth parameter is their rate or their mobility."""
@@ -464,7 +503,7 @@ class _Estimation:
     # The answer
 
     def _answer(
-        self, explanations: list[_Explanation], blind: BlindScan, window: Window
+        self, explanations: list[_Explanation], window: Window, *, scan: bool
     ) -> TouchEstimate:
         rest = explanations[0]
         best = min(explanations, key=lambda each: each.chi2)
@@ -478,11 +517,11 @@ class _Estimation:
         if self._fits(best, window):
             kind = best.kind if len(rivals) == 1 else "unknown"
             x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
-            history, instants, force_n = self._forces(best, blind, window)
+            history, instants, force_n = self._forces(best, window)
             if kind == "rigid":
                 stiffness = _stiffness(rest.posterior)
-        elif blind.chi2 < self._most(blind.degrees):
-            x_m = self._roughly(blind)
+        elif self.blind.chi2 < self._most(self.blind.degrees):
+            x_m = self._roughly()
         return TouchEstimate(
             x_m=x_m,
             time_s=time_s,
@@ -493,22 +532,22 @@ class _Estimation:
             channels=self.motion.noise.size,
             samples=window.end - self.detected,
             chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-            places_m=blind.x_m,
-            log_likelihood=blind.log_likelihood,
+            places_m=self.blind.x_m if scan else np.zeros(0),
+            log_likelihood=self.blind.log_likelihood if scan else np.zeros(0),
             innovations=self.motion.innovations / self.motion.noise[:, None],
             innovation_times_s=self.motion.t + offset,
             force_history_n=history,
             force_times_s=instants + offset,
         )
 
-    def _roughly(self, blind: BlindScan) -> Estimated:
+    def _roughly(self) -> Estimated:
         """Point of a touch that nothing explains: where any force could do it, early and later.
 
         More than one point may be touched by then, so what the first samples tell alone counts
         too, and both with wide intervals.
         """
         early = self.tables.blind.scan(self.window(_EARLY_S))
-        at, _, low, high = blind.interval(_WIDE)
+        at, _, low, high = self.blind.interval(_WIDE)
         _, _, first_low, first_high = early.interval(_WIDE)
         low, high = min(low, first_low), max(high, first_high)
         return Estimated(at, (high - low) / 4, (low, high))
@@ -529,9 +568,7 @@ class _Estimation:
             (max(float(low), 0.0), min(float(high), length)),
         )
 
-    def _forces(
-        self, best: _Explanation, blind: BlindScan, window: Window
-    ) -> tuple[Real, Real, Estimated]:
+    def _forces(self, best: _Explanation, window: Window) -> tuple[Real, Real, Estimated]:
         """Force in time and its peak, over what is likely."""
         rng = np.random.default_rng(2)
         posterior = best.posterior
@@ -544,7 +581,7 @@ class _Estimation:
             force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
         else:
             touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-            side = None if best.kind == "rigid" else _side(blind)
+            side = None if best.kind == "rigid" else self._side()
             if best.kind == "yielding":
                 rows = np.insert(rows, 3, 0.0, axis=1)
             force = np.abs(touching.predicted(rows, window, side)[1])
@@ -562,11 +599,6 @@ def _distinct(found: Descended) -> Real:
         if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
             kept.append(row)
     return np.array(kept)
-
-
-def _side(blind: BlindScan) -> float:
-    """Direction in which the beam presses: against the force, whatever that comes from."""
-    return -1.0 if blind.force_n.sum() > 0 else 1.0
 
 
 def _known(rivals: list[_Explanation], column: int, shift: float = 0.0) -> Estimated:

@@ -5,7 +5,8 @@ before (it may be vibrating from its slew) adds free vibrations of unknown ampli
 with an offset and a drift of each channel to the samples before the touch.
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,8 @@ class FreeBeam:
 
     __slots__ = (
         "_displacement",
+        "_grid",
+        "_sample",
         "_shear",
         "_torque",
         "line",
@@ -98,13 +101,31 @@ class FreeBeam:
         n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
         self.line = Line(n, 1 / (FINER * rate_hz), _BAND)
         s = self.line.s
-        grid = PointForceGrid(s, model.beam, model.damping)
-        late = np.exp(-s * (model.torque_delay_s - model.angle_delay_s))
+        self._grid = grid = PointForceGrid(s, model.beam, model.damping)
+        late = model.sensor_filter.response(s)
+        late *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
         inertia = model.tool_inertia_kg_m2 * s * s
         self._torque: Complex = late * (grid.torque_per_angle() + inertia)
         self._shear: Complex = late * grid.shear_per_angle()
         self._displacement: Complex = grid.per_angle(x_m).T
         self.modes = Ringing.of(model, x_m)
+        unit = np.zeros(3 * BEFORE)
+        unit[BEFORE] = 1.0
+        self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
+
+    def at(self, x_m: Real) -> "FreeBeam":
+        """Return the same beam with other places.
+
+        Parameters
+        ----------
+        x_m
+            Places where the displacement is wanted, shape (m,).
+        """
+        other = copy(self)
+        other.x_m = x_m
+        other._displacement = self._grid.per_angle(x_m).T
+        other.modes = self.modes.at(x_m / self.model.beam.length_m)
+        return other
 
     def per_sample(self, place: int, samples: int) -> Real:
         """Displacement that one sample of the angle makes, in m/rad.
@@ -121,10 +142,8 @@ class FreeBeam:
         ndarray, shape (FINER · (BEFORE + samples),)
             On the fine steps, from `BEFORE` samples before it on: the spline looks ahead.
         """
-        unit = np.zeros(3 * BEFORE)
-        unit[BEFORE] = 1.0
-        spectrum = self.line.transformed(_finer(unit, self.rate_hz, self.line)[0])
-        return self.line.in_time(self._displacement[place] * spectrum, FINER * (BEFORE + samples))
+        response = self._displacement[place] * self._sample
+        return self.line.in_time(response, FINER * (BEFORE + samples))
 
     def motion(self, record: TouchRecord, quiet: int, first: int) -> "FreeMotion":
         """Free motion of one record.
@@ -146,7 +165,7 @@ class FreeBeam:
         if record.shear_n is not None:
             channels.append((record.shear_n, self._shear))
         t = np.arange(n) / rate
-        late = self.model.torque_delay_s - self.model.angle_delay_s
+        late = self.model.wrench_delay_s - self.model.angle_delay_s
         columns = self.modes.channels(t - late)
         innovations, designs = [], []
         for i, (measured, transfer) in enumerate(channels):
@@ -164,7 +183,7 @@ class FreeBeam:
         amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
         moved += self.modes.displacement(fine, amplitudes)
         return FreeMotion(
-            t=t - self.model.torque_delay_s,
+            t=t - self.model.wrench_delay_s,
             innovations=np.array(fitted.innovations),
             noise=np.array(fitted.noise),
             design=np.array(designs),
@@ -182,7 +201,7 @@ class FreeMotion:
     """Innovations of a record, and where the beam would be without a touch."""
 
     t: Real
-    """Instants that the samples of torque and shear show, shape (n,)."""
+    """Instants that the samples of torque and shear show but for their filters, shape (n,)."""
     innovations: Real
     """Innovations of torque and, if measured, shear, shape (c, n)."""
     noise: Real
@@ -235,6 +254,8 @@ class Ringing:
     """Shape (modes,), in rad/s."""
     root: Complex
     """Torque and shear per amplitude, shape (2, modes)."""
+    scale: Real
+    """Unit of the amplitudes, shape (modes,)."""
     shapes: Real
     """Displacement at the places per amplitude, shape (modes, places)."""
 
@@ -250,10 +271,22 @@ class Ringing:
         stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * found**damping.alpha)
         ratio = root_shear_ratio(count)
         root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
-        shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(count)])
+        root *= model.sensor_filter.response(found)
         # Amplitudes in units that give about the same torque in each mode.
         scale = 1 / np.abs(root[0])
-        return cls(found.astype(np.complex128), root * scale, shapes * scale[:, None])
+        whole = cls(found.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
+        return whole.at(x_m / beam.length_m)
+
+    def at(self, shares: Real) -> "Ringing":
+        """Return the same vibrations at other places.
+
+        Parameters
+        ----------
+        shares
+            Places as shares of the length, shape (places,).
+        """
+        shapes = np.stack([mode_shape(i + 1, shares) for i in range(self.poles.size)])
+        return replace(self, shapes=shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
         """Torque and shear, shape (2, t, 2 · modes).
@@ -268,20 +301,22 @@ class Ringing:
         return np.array([np.hstack([part.real, -part.imag]) for part in parts])
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
-        """At the places, shape (places, t, …).
+        """At the places, shape (places, t, r) or, for r = 1 without its axis, (places, t).
 
         Parameters
         ----------
         t
             Times from the record's beginning.
         amplitudes
-            Amplitudes of cosines and sines, shape (2 · modes, …).
+            Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
         """
         count = self.poles.size
-        swing = np.exp(np.multiply.outer(t, self.poles))
-        moved = np.einsum("tm,mx->xtm", swing, self.shapes)
-        shown: Real = moved.real @ amplitudes[:count] - moved.imag @ amplitudes[count:]
-        return shown
+        swing = np.exp(np.multiply.outer(t, self.poles)).T
+        columns = amplitudes.reshape(2 * count, -1)
+        moved = np.multiply(swing.real[:, :, None], columns[:count, None])
+        moved -= np.multiply(swing.imag[:, :, None], columns[count:, None])
+        shown: Real = self.shapes.T @ moved.reshape(count, -1)
+        return shown.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ from rigd.beam import (
     poles_for_eigenvalues,
     root_shear_ratio,
 )
+from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -96,6 +97,7 @@ def observed_beam(
     *,
     tool_inertia_kg_m2: float = 0.0,
     torque_after_angle_s: float = 0.0,
+    sensor_filter: SensorFilter = NO_FILTER,
 ) -> ObservedBeam:
     """Design filter and observer.
 
@@ -110,13 +112,15 @@ def observed_beam(
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     torque_after_angle_s
-        By how much older the wrench of a tick is than its angle.
+        By how much older the wrench of a tick is than its angle, its filters left aside.
+    sensor_filter
+        Filters of the wrench.
 
     Returns
     -------
     ObservedBeam
     """
-    filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s)
+    filter_ = _fit(beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter)
     both = noise.shear_n is not None
     observer = _observer(beam, damping, rate_hz, noise, filter_.noise_gain)
     f, o = filter_.a.shape[0], observer.a.shape[0]
@@ -265,7 +269,12 @@ class _Filter:
 
 
 def _fit(
-    beam: Beam, damping: Damping, rate_hz: float, tool_inertia_kg_m2: float, later_s: float
+    beam: Beam,
+    damping: Damping,
+    rate_hz: float,
+    tool_inertia_kg_m2: float,
+    later_s: float,
+    sensor_filter: SensorFilter,
 ) -> _Filter:
     """Fit discrete poles, where the exact ones are, and some taps to the exact response."""
     pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
@@ -282,7 +291,7 @@ def _fit(
     exact = PointForceGrid(s, beam, damping)
     response = np.array([exact.torque_per_angle(), exact.shear_per_angle()])
     response[0] += tool_inertia_kg_m2 * s**2
-    response *= np.exp(-later_s * s)
+    response *= sensor_filter.response(s) * np.exp(-later_s * s)
 
     weight = np.minimum(1.0, (_KNEE_HZ / frequency_hz) ** 3)
     weight *= np.minimum(1.0, frequency_hz / _WEIGHTED_FROM_HZ)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid
+from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -25,7 +26,7 @@ _OVERSAMPLED = 2
 """Steps of the inversion in a step of the kernels: above half the step's rate a hat is small."""
 
 _EDGE_M = 0.003
-"""The places begin at this distance from root and tip."""
+"""The places begin at this distance from the root; they end at the tip."""
 
 
 class Line:
@@ -142,7 +143,12 @@ class ContactKernels:
 
 
 def contact_kernels(
-    beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
+    beam: Beam,
+    damping: Damping,
+    x_m: Real,
+    step_s: float,
+    steps: int,
+    sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
     """Kernels of the exact model at the places `x_m`.
 
@@ -156,6 +162,8 @@ def contact_kernels(
         Time between two values of a kernel.
     steps
         Number of values.
+    sensor_filter
+        Filters through which torque and shear are seen.
     """
     from scipy.fft import next_fast_len
 
@@ -166,14 +174,15 @@ def contact_kernels(
     hat = (2 * (np.cosh(line.s * step_s) - 1) / (step_s * line.s) ** 2) * step_s / fine
     late = hat * np.exp(-line.s * step_s)
     grid = PointForceGrid(line.s, beam, damping)
+    seen = sensor_filter.response(line.s)
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * line.s**damping.alpha)
     tables = np.empty((3, x_m.size, steps))
     for i in range(0, x_m.size, _AT_ONCE):
         x = x_m[i : i + _AT_ONCE]
         responses = (
             grid.per_force(x, x).T,
-            -grid.per_angle(x).T,
-            stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+            -seen * grid.per_angle(x).T,
+            seen * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
         )
         for table, response in zip(tables, responses, strict=True):
             values = line.in_time(late * response, _OVERSAMPLED * (steps + 1))
@@ -186,7 +195,7 @@ _AT_ONCE = 8
 
 
 def places(length_m: float, spacing_m: float) -> Real:
-    """Places along the beam, equally spaced but for its ends.
+    """Places along the beam up to its tip, equally spaced.
 
     Parameters
     ----------
@@ -195,8 +204,8 @@ def places(length_m: float, spacing_m: float) -> Real:
     spacing_m
         Greatest distance between two.
     """
-    n = int(np.ceil((length_m - 2 * _EDGE_M) / spacing_m)) + 1
-    return np.linspace(_EDGE_M, length_m - _EDGE_M, n)
+    n = int(np.ceil((length_m - _EDGE_M) / spacing_m)) + 1
+    return np.linspace(_EDGE_M, length_m, n)
 
 
 def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:

@@ -7,6 +7,7 @@ from typing import Final
 
 from rigd.beam import Beam, Damping
 from rigd.identified_beam import read_identified_beam
+from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 UNCERTAIN: Final = (
     "bending_stiffness_n_m2",
@@ -42,12 +43,20 @@ class TouchModel:
     angle_delay_s: float = 0.0
     """Age of the angle at the time of its sample."""
     torque_delay_s: float = 0.0
-    """Age of torque and shear at the time of their sample."""
+    """Age of torque and shear at the time of their sample, that of the averaged records on the
+    whole included, that of the low-pass filter not."""
+    sensor_filter: SensorFilter = NO_FILTER
+    """Filters of torque and shear."""
     source: str = "profile"
     """Where it came from, for people."""
     std: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of those of `UNCERTAIN` that are uncertain, in their units. The density
     goes with both others: its mass per length is their product."""
+
+    @property
+    def wrench_delay_s(self) -> float:
+        """Age of torque and shear behind the response of the filters."""
+        return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
     def changed(self, name: str, by: float) -> "TouchModel":
         """Return it with one parameter of `UNCERTAIN` changed, the others as they are.
@@ -94,6 +103,7 @@ class TouchModel:
         tool_inertia_kg_m2: float = 0.0,
         angle_delay_s: float = 0.0,
         torque_delay_s: float = 0.0,
+        sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
         """Return the model that a profile states: 1 % of stiffness and density, 20 % of damping.
 
@@ -105,6 +115,8 @@ class TouchModel:
             Inertia between sensor and beam.
         angle_delay_s, torque_delay_s
             Ages of the readings.
+        sensor_filter
+            Filters of torque and shear.
         """
         values = {
             "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
@@ -118,6 +130,7 @@ class TouchModel:
             tool_inertia_kg_m2,
             angle_delay_s,
             torque_delay_s,
+            sensor_filter,
             std={name: share * values[name] for name, share in _ASSUMED.items()},
         )
 
@@ -130,6 +143,7 @@ class TouchModel:
         angle_delay_s: float = 0.0,
         torque_delay_s: float = 0.0,
         tool_inertia_kg_m2: float = 0.0,
+        sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
         """Read what ``analyze … --json FILE`` has identified.
 
@@ -141,7 +155,7 @@ class TouchModel:
             The JSON document.
         length_m
             Length of the beam: no session shows it.
-        angle_delay_s, torque_delay_s, tool_inertia_kg_m2
+        angle_delay_s, torque_delay_s, tool_inertia_kg_m2, sensor_filter
             As the profile states them.
 
         Raises
@@ -157,6 +171,7 @@ class TouchModel:
             tool_inertia_kg_m2 if tool is None else tool,
             angle_delay_s,
             torque_delay_s if found.delay_s is None else found.delay_s + angle_delay_s,
+            sensor_filter,
             source=str(path),
             std=found.std,
         )

@@ -13,7 +13,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._contact import march, responses
+from rigd.touch._contact import march, responses, shifted
 from rigd.touch._free_motion import FreeMotion
 from rigd.touch._kernels import ContactKernels, lagrange, mixed
 
@@ -121,7 +121,6 @@ class Touching:
         window: Window,
         side: float | None = None,
         kernels: ContactKernels | None = None,
-        more_m: Real | None = None,
     ) -> tuple[Real, Real]:
         """Effect on the channels in the window, and the force.
 
@@ -135,8 +134,6 @@ class Touching:
             Direction in which the beam presses, 1 or -1; None: the one in which it goes.
         kernels
             Kernels at the only place there is, one row; interpolated if None.
-        more_m
-            What is added to the displacement of the free motion, shape (k, its columns).
 
         Returns
         -------
@@ -147,11 +144,9 @@ class Touching:
         motion = self._motion
         x, instant = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        last = motion.t[window.end - 1]
-        steps = int(np.ceil((last - instant.min()) / step_s)) + 3
-        steps = min(max(steps, 4), self._kernels.steps)
+        steps = self._steps(instant, window)
         local = self._kernels.at(x, steps) if kernels is None else kernels
-        approach, sides = self._approach(x, instant, steps, side, more_m)
+        approach, sides = self._approach(x, instant, steps, side)
         extra = parameters[:, 3:].T
         pressing = march(
             np.broadcast_to(local.displacement[:, :steps], approach.shape),
@@ -164,6 +159,47 @@ class Touching:
         force = -sides[:, None] * pressing
         tables = (local.torque, local.shear)[: motion.innovations.shape[0]]
         return self.effects(tables, force, instant, window), force
+
+    def passed_on(self, parameters: Real, window: Window, moved_m: Real) -> Real:
+        """Effect on the channels of other free motions by way of the contact, (r, c, samples).
+
+        Parameters
+        ----------
+        parameters
+            Place, instant and logarithm of the stiffness of an obstacle at rest.
+        window
+            Which samples.
+        moved_m
+            What is added to the displacement at its place, on the free motion's steps from its
+            first on, shape (r, columns).
+        """
+        x, instant = parameters[:1], parameters[1:2]
+        steps = self._steps(instant, window)
+        local = self._kernels.at(x, steps)
+        approach, side = self._approach(x, instant, steps, None)
+        instants = np.repeat(instant, len(moved_m))
+        further = side * self._on_steps(moved_m, instants, steps)
+        every = np.vstack([approach, approach + further - further[:, :1]])
+        stiffness = np.full((1, len(every)), np.exp(parameters[2]))
+        pressing = march(local.displacement, every[None], stiffness, self._kernels.step_s)[0]
+        tables = (local.torque, local.shear)[: self._motion.innovations.shape[0]]
+        return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
+
+    def _steps(self, instant: Real, window: Window) -> int:
+        """How many steps lead from the earliest instant to the end of the window."""
+        step_s = self._kernels.step_s
+        steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
+        return min(max(steps, 4), self._kernels.steps)
+
+    def side(self, parameters: Real) -> float:
+        """Direction in which the beam goes at a touch, 1 or -1.
+
+        Parameters
+        ----------
+        parameters
+            One row of `PARAMETERS`, at least the first two.
+        """
+        return float(self._approach(parameters[:1], parameters[1:2], 1, None)[1][0])
 
     def effects(self, tables: tuple[Real, ...], force: Real, instant: Real, window: Window) -> Real:
         """Effect of forces on the channels in the window, shape (k, c, samples).
@@ -179,47 +215,40 @@ class Touching:
         window
             Which samples.
         """
-        on_steps = responses(tables, force)
-        t = self._motion.t[window.first : window.end]
-        position = (t[None, :] - instant[:, None]) / self._kernels.step_s
-        return np.stack([_sampled(each, position) for each in on_steps], axis=1)
+        motion = self._motion
+        step_s = self._kernels.step_s
+        every = round((motion.t[1] - motion.t[0]) / step_s)
+        samples = window.end - window.first
+        begin = (motion.t[window.first] - instant) / step_s
+        # Convolutions may be shifted before or after: so all have their steps at the samples.
+        aligned = shifted(force, begin, (samples - 1) * every + 1)
+        return responses(tables, aligned, every, samples)
 
     def _approach(
-        self, x: Real, instant: Real, steps: int, given: float | None, more_m: Real | None
+        self, x: Real, instant: Real, steps: int, given: float | None
     ) -> tuple[Real, Real]:
         """How far the free beam is beyond the point of touch, and to which side it goes."""
         motion = self._motion
         first, weights = lagrange(x, self._x_m)
         moved = mixed(motion.displacement_m, first, weights)
-        if more_m is not None:
-            moved = moved + more_m
-        begins = (instant - motion.first_s) / motion.step_s
-        ratio = self._kernels.step_s / motion.step_s
-        position = begins[:, None] + ratio * np.arange(steps)
-        free = _sampled(moved, np.minimum(position, moved.shape[1] - 2.0))
-        before = _sampled(moved, begins[:, None] - 1.0)
-        side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
-        if given is not None:
-            side[:] = given
+        free = self._on_steps(moved, instant, steps)
+        if given is None:
+            before = shifted(moved, (instant - motion.first_s) / motion.step_s - 1.0, 1)
+            side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
+        else:
+            side = np.full(x.size, given)
         return side[:, None] * (free - free[:, :1]), side
 
-
-def _sampled(table: Real, position: Real) -> Real:
-    """Values between the columns of a table (cubic, four points), 0 before the first."""
-    columns = table.shape[1]
-    whole = np.floor(position).astype(np.intp)
-    u = position - whole
-    padded = np.pad(table, ((0, 0), (1, 2)))
-    index = np.clip(whole, -1, columns - 1)
-    rows = np.arange(table.shape[0])[:, None]
-    a, b, c, d = (padded[rows, np.clip(index + i, 0, columns + 2)] for i in range(4))
-    value = (
-        a * (-u * (u - 1) * (u - 2) / 6)
-        + b * ((u + 1) * (u - 1) * (u - 2) / 2)
-        + c * (-(u + 1) * u * (u - 2) / 2)
-        + d * ((u + 1) * u * (u - 1) / 6)
-    )
-    return np.where(whole >= 0, value, 0.0)
+    def _on_steps(self, moved: Real, instant: Real, steps: int) -> Real:
+        """Return rows of displacements on the kernels' steps from an instant on each."""
+        motion = self._motion
+        begin = (instant - motion.first_s) / motion.step_s
+        between = max(1, round(motion.step_s / self._kernels.step_s))
+        finer = np.empty((begin.size, between * -(-steps // between)))
+        for i in range(between):
+            part = finer[:, i::between]
+            part[:] = shifted(moved, begin + i / between, part.shape[1])
+        return finer[:, :steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +264,12 @@ class Descended:
 
 
 def descend(
-    predict: Prediction, window: Window, starts: Real, space: Space, rounds: int = 12
+    predict: Prediction,
+    window: Window,
+    starts: Real,
+    space: Space,
+    rounds: int = 12,
+    free: NDArray[np.bool_] | None = None,
 ) -> Descended:
     """Minimise the residuals from each start.
 
@@ -251,6 +285,8 @@ def descend(
         Ranges of their parameters.
     rounds
         Most iterations.
+    free
+        Which parameters of each start are to be changed, shape (k, p); None: all.
     """
     at = np.clip(starts, space.low, space.high)
     damping = np.full(len(at), 1e-2)
@@ -261,6 +297,8 @@ def descend(
     for _ in range(rounds):
         rows = np.flatnonzero(active)
         j, r = jacobian[rows], residual[rows]
+        if free is not None:
+            j = j * free[rows, None]
         normal = np.einsum("knp,knq->kpq", j, j)
         gradient = np.einsum("knp,kn->kp", j, r)
         diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + loose
@@ -314,10 +352,13 @@ class Starts:
         self._samples, self._every, self._step_s = samples, every, kernels.step_s
         steps = self._ratio * samples
         self._x_m = kernels.x_m[::every]
-        self._kernel = np.repeat(kernels.displacement[::every, :steps], STIFFNESSES.size, axis=0)
+        # Single precision is enough to choose starts by, and twice as fast.
+        self._kernel = kernels.displacement[::every, :steps].astype(np.float32)
         lag = self._ratio * np.arange(samples)[:, None] - np.arange(steps)
         self._channels = [
-            np.where(lag >= 0, table[::every][:, np.maximum(lag, 0)], 0.0).transpose(0, 2, 1)
+            np.where(lag >= 0, table[::every][:, np.maximum(lag, 0)], 0.0)
+            .transpose(0, 2, 1)
+            .astype(np.float32)
             for table in (kernels.torque, kernels.shear)
         ]  # (places, steps, samples)
 
@@ -333,42 +374,47 @@ class Starts:
         latest
             Last sample at which the touch may be; the window's first is the earliest.
         """
+        samples = np.arange(window.first + 1, latest + 1)
+        batches = np.array_split(samples, -(-samples.size // _INSTANTS))
+        chi2 = [self._chi2(motion, window, batch) for batch in batches]
+        starts = np.meshgrid(self._x_m, motion.t[samples], np.log(STIFFNESSES), indexing="ij")
+        return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
+
+    def _chi2(self, motion: FreeMotion, window: Window, samples: NDArray[np.intp]) -> Real:
+        """Return the sums of squared residuals, shape (places, instants, kinds)."""
         places, kinds = self._x_m.size, STIFFNESSES.size
-        starts, found = [], []
-        for sample in range(window.first + 1, latest + 1):
-            count = window.end - sample
-            steps = self._ratio * count
-            instant = motion.t[sample]
-            begin = round((instant - motion.first_s) / motion.step_s)
-            moved = motion.displacement_m[:: self._every, begin - 1 : begin + steps]
-            side = np.where(moved[:, 1] >= moved[:, 0], 1.0, -1.0)
-            approach = side[:, None] * (moved[:, 1:] - moved[:, 1:2])
-            pressing = march(
-                self._kernel[:, :steps],
-                np.repeat(approach, kinds, axis=0),
-                np.tile(STIFFNESSES, places),
-                self._step_s,
-            ).reshape(places, kinds, steps)
-            force = -side[:, None, None] * pressing
-            predicted = np.zeros((places * kinds, motion.noise.size, window.end - window.first))
-            for i in range(motion.noise.size):
-                effect = force @ self._channels[i][:, :steps, :count]
-                predicted[:, i, sample - window.first :] = effect.reshape(-1, count)
-            residual = window.residuals(predicted)
-            found.append(np.einsum("kn,kn->k", residual, residual))
-            starts.append(
-                np.stack(
-                    [
-                        np.repeat(self._x_m, kinds),
-                        np.full(places * kinds, instant),
-                        np.tile(np.log(STIFFNESSES), places),
-                    ],
-                    axis=1,
-                )
-            )
-        return np.concatenate(starts), np.concatenate(found)
+        length = window.end - int(samples[0])
+        steps = self._ratio * length
+        begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
+        columns = begins[:, None] + np.arange(-1, steps)
+        last = motion.displacement_m.shape[1] - 1
+        moved = motion.displacement_m[:: self._every][:, np.minimum(columns, last)]
+        # Axes: place, instant, step.
+        side = np.where(moved[:, :, 1] >= moved[:, :, 0], 1, -1)[:, :, None].astype(np.float32)
+        approach = (side * (moved[:, :, 1:] - moved[:, :, 1:2])).astype(np.float32)
+        pressing = march(
+            self._kernel[:, :steps],
+            np.repeat(approach, kinds, axis=1),
+            np.tile(STIFFNESSES.astype(np.float32), (places, samples.size)),
+            self._step_s,
+        )
+        force = -np.repeat(side, kinds, axis=1) * pressing
+        predicted = np.zeros(
+            (places, samples.size, kinds, motion.noise.size, window.end - window.first)
+        )
+        for channel in range(motion.noise.size):
+            effect = force @ self._channels[channel][:, :steps, :length]
+            effect = effect.reshape(places, samples.size, kinds, length)
+            for i, sample in enumerate(samples):
+                count = window.end - sample
+                predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
+        residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
+        chi2: Real = np.einsum("kn,kn->k", residual, residual)
+        return chi2.reshape(places, samples.size, kinds)
 
 
+_INSTANTS = 16
+"""Instants of the starts that are marched at once."""
 STIFFNESSES = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
 """Stiffnesses of the starts, in N/m."""
 

@@ -48,7 +48,7 @@ class TouchEstimate:
     chi2_per_degree: float
     """Sum of squared residuals by what noise would leave: about 1 if explained."""
     places_m: Real
-    """Places of the likelihood, shape (m,)."""
+    """Places of the likelihood, shape (m,); none if it was not asked for."""
     log_likelihood: Real
     """Value at each place whatever the force, shape (m,)."""
     innovations: Real

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid
 from rigd.touch._innovations import InnovationFilter, Noise, ObservedBeam, observed_beam
+from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 if TYPE_CHECKING:  # a loop that watches does not read models
     from rigd.touch._model import TouchModel
@@ -62,12 +63,20 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBe
         rate_hz,
         noise,
         tool_inertia_kg_m2=model.tool_inertia_kg_m2,
-        torque_after_angle_s=model.torque_delay_s - model.angle_delay_s,
+        torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
+        sensor_filter=model.sensor_filter,
     )
-    return WatchedBeam(observed, signatures(model.beam, model.damping, rate_hz, observed))
+    looks = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
+    return WatchedBeam(observed, looks)
 
 
-def signatures(beam: Beam, damping: Damping, rate_hz: float, model: ObservedBeam) -> Real:
+def signatures(
+    beam: Beam,
+    damping: Damping,
+    rate_hz: float,
+    model: ObservedBeam,
+    sensor_filter: SensorFilter = NO_FILTER,
+) -> Real:
     """Return unit vectors of the last innovations, one for each place, shape of force and age.
 
     Parameters
@@ -78,6 +87,8 @@ def signatures(beam: Beam, damping: Damping, rate_hz: float, model: ObservedBeam
         Ticks a second.
     model
         Filter of the innovations.
+    sensor_filter
+        Filters of the wrench.
 
     Returns
     -------
@@ -91,9 +102,11 @@ def signatures(beam: Beam, damping: Damping, rate_hz: float, model: ObservedBeam
     t = np.arange(steps) * step_s
     shift = _WRAPPED / (steps * step_s)
     grown = np.exp(shift * t)
-    grid = PointForceGrid(shift + 2j * pi * np.fft.rfftfreq(steps, step_s), beam, damping)
+    s = shift + 2j * pi * np.fft.rfftfreq(steps, step_s)
+    grid = PointForceGrid(s, beam, damping)
     places = beam.length_m * _PLACES
     per_force = np.stack([grid.torque_per_force(places), grid.shear_per_force(places)])
+    per_force *= sensor_filter.response(s)[:, None]
     forces = [np.where(t < pulse, np.sin(pi * t / pulse), 0.0) for pulse in _PULSES_S]
     forces.append(np.minimum(t / _RISE_S, 1.0))
 

@@ -1,5 +1,6 @@
 """Touches of recorded sessions, against the truth of an independent simulation."""
 
+from dataclasses import replace
 from math import atan2
 
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 
 from analysis.record import RecordError
 from analysis.touch import TouchAnalysis, _detections, _model
+from analysis.touch import _sensor_filter as sensor_filter_of
 from rigd.identified_beam import IdentifiedBeamError
+from rigd.profile import load_profile
+from rigd.runner._touch_search import _sensor_filter
 from rigd.session import SessionError, read_session
 
 
@@ -79,6 +83,35 @@ def test_without_shear_it_says_so(touch_file, touch_analysis, tmp_path):
 def test_a_wrong_projection_is_named(touch_file, touch_analysis, tmp_path, text):
     path = touch_file.write(tmp_path / "a.mcap", metadata={"shear_projection": text})
     with pytest.raises(RecordError, match=r"a\.mcap: shear_projection is .*must be six numbers"):
+        touch_analysis.session(path)
+
+
+@pytest.mark.parametrize("profile", ["antenna_serial", "sim"])
+@pytest.mark.parametrize("kind", ["mean", "triangle"])
+def test_filters_of_the_sensor_are_those_of_its_profile(profile, kind, touch_file, tmp_path):
+    rig = load_profile(profile).rig
+    sensor = replace(rig.sensor, filter_hz=200.0, filter_order=2)
+    serial, metadata = rig.ati_serial, {"torque_filter_hz": "200.0", "torque_filter_order": "2"}
+    if serial is not None:
+        serial = replace(serial, filter=kind)
+        metadata |= {
+            "sensor_filter": kind,
+            "sensor_filter_delay_s": repr(serial.filter_delay_s(rig.rate_hz)),
+        }
+    stated = _sensor_filter(replace(rig, sensor=sensor, ati_serial=serial))
+    path = touch_file.write(tmp_path / "a.mcap", length=20, metadata=metadata)
+    read = sensor_filter_of(read_session(path), rig.rate_hz)
+    s = 2j * np.pi * np.array([1.0, 100.0, 400.0])
+    assert read.response(s) == pytest.approx(stated.response(s), rel=1e-9)
+    assert read.weights_delay_s == pytest.approx(stated.weights_delay_s)
+    assert (read.corner_hz, read.order) == (pytest.approx(200.0), 2)
+
+
+@pytest.mark.parametrize(("kind", "delay_s"), [("mean", "6e-4"), ("boxcar", "1e-4")])
+def test_an_unknown_filter_is_named(touch_file, touch_analysis, tmp_path, kind, delay_s):
+    metadata = {"sensor_filter": kind, "sensor_filter_delay_s": delay_s}
+    path = touch_file.write(tmp_path / "a.mcap", metadata=metadata)
+    with pytest.raises(RecordError, match=r"a\.mcap: sensor_filter is .*must be a mean"):
         touch_analysis.session(path)
 
 

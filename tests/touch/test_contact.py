@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigd.touch._contact import march, responses
+from rigd.touch._contact import march, responses, shifted
 
 STEP_S = 1e-4
 
@@ -42,9 +42,43 @@ def test_force_never_pulls_and_obstacles_that_flee_press_less():
     assert 0 < giving.max() < still.max()
 
 
+def test_a_march_is_the_same_step_by_step():
+    """Obstacles that stay, flee and give way, over blocks of steps with and without contact."""
+    rng = np.random.default_rng(2)
+    k, n = 5, 83
+    kernel = np.abs(rng.normal(1e-3, 2e-4, (k, n)))
+    approach = 2e-2 * np.sin(np.arange(n) * np.linspace(0.1, 0.4, k)[:, None])
+    stiffness, rate, mobility = np.geomspace(30, 3e4, k), 2.0 * (np.arange(k) % 2), [0, 0, 0, 1, 2]
+    told = march(kernel, approach, stiffness, STEP_S, rate, np.array(mobility))
+    for row in range(k):
+        force, fled = np.zeros(n), 0.0
+        gives = stiffness[row] / (1 + stiffness[row] * (kernel[row, 0] + mobility[row] * STEP_S))
+        for i in range(1, n):
+            fled += rate[row] * STEP_S
+            bent = sum(kernel[row, i - j] * force[j] for j in range(i))
+            force[i] = gives * max(approach[row, i] - bent - fled, 0.0)
+            fled += mobility[row] * STEP_S * force[i]
+        assert told[row] == pytest.approx(force, abs=1e-12)
+        assert np.any(force[1:] == 0)
+        assert np.any(force > 0)
+
+
 def test_responses_are_convolutions():
     rng = np.random.default_rng(1)
-    kernel, force = rng.normal(size=(2, 3, 50))
-    (told,) = responses((kernel,), force)
-    for row in range(3):
-        assert told[row] == pytest.approx(np.convolve(kernel[row], force[row])[:50])
+    kernels, force = rng.normal(size=(2, 3, 100)), rng.normal(size=(3, 121))
+    told = responses(tuple(kernels), force, every=4, samples=31)
+    for channel in range(2):
+        for row in range(3):
+            whole = np.convolve(kernels[channel, row], force[row])[:121]
+            assert told[row, channel] == pytest.approx(whole[::4])
+
+
+def test_shifted_values_lie_on_the_curve():
+    steps = np.arange(40.0)
+    table = np.stack([steps**3, steps**2])
+    told = shifted(table, np.array([7.25, -3.5]), 20)
+    assert told[0] == pytest.approx((7.25 + np.arange(20)) ** 3)
+    # It is 0 before its first column.
+    assert told[1, :2] == pytest.approx([0.0, 0.0])
+    assert told[1, 5:] == pytest.approx((np.arange(5, 20) - 3.5) ** 2)
+    assert shifted(table, np.array([37.5, 50.0]), 9)[1] == pytest.approx(39.0**2)

@@ -11,6 +11,7 @@ from rigd.touch import (
     DetectorSettings,
     InnovationFilter,
     Noise,
+    SensorFilter,
     TouchDetector,
     WatchedBeam,
     observed_beam,
@@ -100,15 +101,24 @@ def detection(model, readings):
     return None, detector
 
 
-def test_the_filter_follows_the_exact_response():
-    fitted = _fit(BEAM, DAMPING, RATE_HZ, 1e-5, 4e-4)
+@pytest.mark.parametrize(
+    "sensor_filter",
+    [
+        SensorFilter(),
+        SensorFilter(corner_hz=120.0, order=2),
+        SensorFilter(weights=(1 / 7,) * 7, spacing_s=1 / 7000),
+    ],
+)
+def test_the_filter_follows_the_exact_response(sensor_filter):
+    fitted = _fit(BEAM, DAMPING, RATE_HZ, 1e-5, 4e-4, sensor_filter)
     for frequency_hz in (0.5, 2.0, 8.0, 30.0, 50.0):
         s = 2j * pi * frequency_hz
         z = np.exp(s / RATE_HZ)
         told = fitted.c @ np.linalg.solve(z * np.eye(len(fitted.b)) - fitted.a, fitted.b) + fitted.d
         exact = (transfer(s, BEAM, DAMPING) + 1e-5 * s**2) * np.exp(-4e-4 * s)
         shear = PointForceGrid(s, BEAM, DAMPING).shear_per_angle() * np.exp(-4e-4 * s)
-        assert told == pytest.approx(np.array([exact, shear]), rel=3e-3)
+        seen = np.array([exact, shear]) * sensor_filter.response(s)
+        assert told == pytest.approx(seen, rel=3e-3)
 
 
 @pytest.mark.parametrize("speed_rad_s", [0.3, 2.0])

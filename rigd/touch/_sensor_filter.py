@@ -1,0 +1,59 @@
+"""Filters between the beam and the samples of its torque and shear: what they do to a touch."""
+
+from dataclasses import dataclass
+from math import pi, sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFilter:
+    """Filters of torque and shear between the beam and the samples of a session.
+
+    Examples
+    --------
+    >>> from rigd.touch import SensorFilter
+    >>> mean = SensorFilter(weights=(1 / 7,) * 7, spacing_s=1 / 7000)
+    >>> round(1e6 * mean.weights_delay_s)  # µs
+    429
+    >>> float(round(abs(mean.response(2j * 3.14159 * 300.0)), 3))
+    0.861
+    """
+
+    corner_hz: float = 0.0
+    """Corner of the sensor's low-pass filter; 0: it has none."""
+    order: int = 1
+    """Order of that filter: 1, or 2 (Butterworth)."""
+    weights: tuple[float, ...] = (1.0,)
+    """What of each of its records is in a sample, oldest first, adding up to 1."""
+    spacing_s: float = 0.0
+    """Time between two records."""
+
+    @property
+    def weights_delay_s(self) -> float:
+        """Group delay of the weights, which is part of the stated age of a sample."""
+        return 0.5 * (len(self.weights) - 1) * self.spacing_s
+
+    def response(self, s: ArrayLike) -> Complex:
+        """Return its response, delays included.
+
+        Parameters
+        ----------
+        s
+            Laplace variable in rad/s, any shape.
+        """
+        points = np.asarray(s, dtype=np.complex128)
+        ages = self.spacing_s * np.arange(len(self.weights))[::-1]
+        told: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
+        if self.corner_hz > 0:
+            u = points / (2 * pi * self.corner_hz)
+            told /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
+        return told
+
+
+NO_FILTER: Final = SensorFilter()
+"""A sensor that shows what there is."""
