@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
-from rigd.beam import LoadedBeam, poles_for_eigenvalues
+from rigd.beam import LoadedBeam, pole_gradient, poles_for_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -115,30 +115,14 @@ def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, .
 def _pole_derivative(
     s: complex, stiffness: float, mode: int, plant: Plant, wrt: Sequence[str]
 ) -> NDArray[np.complex128]:
-    """Differentiate a root of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``.
-
-    By implicit differentiation, `stiffness` being k⁴. Shape (len(wrt),).
-    """
-    damping, ratio = plant.damping, plant.beam.density_over_stiffness
-    log_s = np.log(complex(s))
-    internal = stiffness * np.exp(damping.alpha * log_s)
-    external = np.exp(damping.lambda_ * log_s)
-    slope = (
-        2 * ratio * s
-        + damping.gamma * damping.lambda_ * external / s
-        + damping.zeta * damping.alpha * internal / s
-    )
-    by: dict[str, complex] = {
-        "zeta": internal,
-        "alpha": damping.zeta * log_s * internal,
-        "gamma": external,
-        "lambda": damping.gamma * log_s * external,
-        "ln_density_over_stiffness": ratio * s * s,
-    }
-    if FIRST_OFFSET <= mode < FIRST_OFFSET + len(plant.stiffness_offsets):
-        elastic = stiffness + damping.zeta * internal
-        by[offset_name(mode)] = elastic / (1 + plant.stiffness_offsets[mode - FIRST_OFFSET])
-    return np.array([-by.get(name, 0.0) / slope for name in wrt], dtype=np.complex128)
+    """Differentiate a pole of a beam whose modes may have stiffnesses of their own, k⁴ here."""
+    offset = mode - FIRST_OFFSET
+    own = offset_name(mode) if 0 <= offset < len(plant.stiffness_offsets) else None
+    names = ["ln_k4" if name == own else name for name in wrt]
+    moved = pole_gradient(s, stiffness, plant.beam, plant.damping, names)
+    if own in wrt:
+        moved[names.index("ln_k4")] /= 1 + plant.stiffness_offsets[offset]
+    return moved.astype(np.complex128, copy=False)
 
 
 class DecaySpectra:

@@ -9,6 +9,7 @@ with ``k_i = z_i / L``, ``1 + cos z_i cosh z_i = 0`` and ``a_i² = 4 L³ / z_i�
 are the zeros of ``Q k_i⁴ + P`` on the principal sheet of the powers.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -253,6 +254,53 @@ def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
     else:
         upper[lost] = _searched_poles(omega_squared[lost], damper, damping)
     return np.stack([upper, upper.conj()], axis=1)
+
+
+def pole_gradient(
+    pole_rad_s: complex, k4_per_m4: float, beam: Beam, damping: Damping, wrt: Sequence[str]
+) -> Complex:
+    """Differentiate a mode's pole with respect to parameters; shape (len(wrt),).
+
+    By implicit differentiation of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``.
+
+    Parameters
+    ----------
+    pole_rad_s
+        The pole, as of `poles`.
+    k4_per_m4
+        Fourth power of the mode's wave number, ``(z / L)⁴``.
+    beam, damping
+        Parameters of the exact model.
+    wrt
+        Names of `rigd.beam.PARAMETERS`, and ``ln_k4``; what does not move a pole gives 0.
+
+    Examples
+    --------
+    >>> from rigd.beam import Beam, Damping, clamped_free_eigenvalues, pole_gradient, poles
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> damping = Damping(zeta=1e-4)
+    >>> pole, k4 = poles(beam, damping, 1)[0, 0], (clamped_free_eigenvalues(1)[0] / 0.98) ** 4
+    >>> print(pole_gradient(pole, k4, beam, damping, ["ln_density_over_stiffness"]).round(3))
+    [0.013-8.023j]
+    """
+    s, ratio = complex(pole_rad_s), beam.density_over_stiffness
+    log_s = np.log(s)
+    internal = k4_per_m4 * np.exp(damping.alpha * log_s)
+    external = np.exp(damping.lambda_ * log_s)
+    slope = (
+        2 * ratio * s
+        + damping.gamma * damping.lambda_ * external / s
+        + damping.zeta * damping.alpha * internal / s
+    )
+    by: dict[str, complex] = {
+        "zeta": internal,
+        "alpha": damping.zeta * log_s * internal,
+        "gamma": external,
+        "lambda": damping.gamma * log_s * external,
+        "ln_density_over_stiffness": ratio * s * s,
+        "ln_k4": k4_per_m4 + damping.zeta * internal,
+    }
+    return np.array([-by.get(name, 0.0) / slope for name in wrt], dtype=np.complex128)
 
 
 def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:

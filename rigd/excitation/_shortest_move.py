@@ -82,7 +82,7 @@ class Response(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MovePlant:
-    """What planning a move needs to know of a rig."""
+    """What planning a motion needs to know of a rig."""
 
     rate_hz: float
     """Ticks a second."""

@@ -1,0 +1,261 @@
+"""Designed excitation against the paper's chirp: precision against time.
+
+By the Fisher information: the standard deviations of a whole-record fit for the paper's chirp while
+it runs, for a scan of 5 s followed by designed pieces, and for the best steady sines, which nobody
+can play since a mode has to ring up (``--picture FILE`` draws them). The beam is that of the
+profile ``sim`` (type VI), the noise of the torque 5e-3 N·m a sample. The chirp swings the tip to a
+slope of 0.5 rad, beyond the range of small slopes; the pieces keep to it, or to ``--tip-slope``.
+
+With ``--check``: records of scan and pieces by exact synthesis, with noise, fitted by `analysis`:
+the deviation that a fit states over the one predicted, and the scatter over the one stated.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from bench_modes import response
+from bench_record_fit import LINK, PLANTS, RATE_HZ
+from numpy.typing import NDArray
+
+from analysis.identify import Measurement, Plant, fit_record
+from analysis.models import STRUCTURES
+from rigd.beam import tip_motion
+from rigd.excitation import (
+    BeamEstimate,
+    Piece,
+    Precision,
+    Target,
+    chirp,
+    information,
+    modes,
+    next_piece,
+    parse_target,
+)
+from rigd.excitation._fisher_information import PARAMETERS, RecordSoFar, covariance_of
+from rigd.excitation._piece_search import PieceSearch
+from rigd.excitation._targets import Quantities
+from rigd.profile import load_profile
+from rigd.runner import LoopPreview
+
+NOISE_NM = 5e-3
+DAMPING = PLANTS["VI"]
+ESTIMATE = BeamEstimate(
+    LINK, DAMPING, PARAMETERS, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
+)
+SCAN = chirp(rate_hz=RATE_HZ, start_hz=0.5, stop_hz=50.0, duration_s=5.0, rest_s=1.0, ring_down_s=0)
+
+Real = NDArray[np.float64]
+
+
+def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
+    """Return what is expected after a record."""
+    covariance = covariance_of(information(angle_rad, ESTIMATE, RATE_HZ), ESTIMATE)
+    return Quantities.of(targets, ESTIMATE).precisions(covariance)
+
+
+def designed(
+    rig: LoopPreview, targets: list[Target], longest_s: float, tip_slope_rad: float
+) -> tuple[Real, Real, list[Piece], float]:
+    """Scan and pieces until everything is reached: reference, angle, pieces, slowest decision."""
+    reference_rad = SCAN.reference_rad
+    angle_rad = rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
+    pieces: list[Piece] = []
+    slowest_s, left_s = 0.0, longest_s
+    while left_s > 1.0:
+        started_s = time.process_time()
+        piece = next_piece(ESTIMATE, angle_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
+        slowest_s = max(slowest_s, time.process_time() - started_s)
+        pieces.append(piece)
+        reference_rad = np.concatenate([reference_rad, piece.reference_rad])
+        angle_rad = np.concatenate([angle_rad, piece.angle_rad])
+        left_s -= piece.reference_rad.size / RATE_HZ
+        if all(each.reached for each in piece.expected):
+            break
+    return reference_rad, angle_rad, pieces, slowest_s
+
+
+def steady_s(rig: LoopPreview, targets: list[Target], tip_slope_rad: float) -> float:
+    """Time of the best steady sines from nothing: below it no session can be."""
+    record = RecordSoFar.of(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
+    plant = rig.plant_with(LINK, DAMPING)
+    quantities = Quantities.of(targets, ESTIMATE)
+    return float(
+        PieceSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
+    )
+
+
+def table(rig: LoopPreview, slopes_rad: list[float]) -> None:
+    """Print times to what is asked."""
+    asked = {
+        "damping 1 %": [parse_target("damping", "1%")],
+        "damping 0.5 %": [parse_target("damping", "0.5%")],
+        "damping 0.2 %": [parse_target("damping", "0.2%")],
+        "scatter of the paper": [
+            parse_target(*each)
+            for each in (("zeta", "28%"), ("gamma", "7%"), ("lambda", "0.028"), ("alpha", "0.057"))
+        ],
+    }
+    print(
+        "asked                  slope/rad  rig time/s  pieces  steady sines/s  slowest decision/s"
+    )
+    for name, targets in asked.items():
+        for slope_rad in slopes_rad:
+            reference, angle, pieces, slowest_s = designed(rig, targets, 120.0, slope_rad)
+            motion = tip_motion(LINK, DAMPING, angle, RATE_HZ)
+            done = all(each.reached for each in pieces[-1].expected)
+            print(
+                f"{name:22} {motion.slope_rad:9.3f} {'' if done else '>'}"
+                f"{reference.size / RATE_HZ:10.1f} {len(pieces):7} "
+                f"{steady_s(rig, targets, slope_rad):15.1f} {slowest_s:19.2f}",
+                flush=True,
+            )
+
+
+def worst_percent(angle_rad: Real) -> float:
+    """Largest relative deviation of a mode's damping after a record, in %."""
+    targets = [parse_target("damping", "1%")]
+    return max(100 * each.std / each.value for each in precisions(angle_rad, targets))
+
+
+def curves(rig: LoopPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
+    """Largest relative deviation of a mode's damping in %, against the time of the record."""
+    chirped = rig.plant_with(LINK, DAMPING).respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
+    ends_s = np.array([41.0, 45.0, 60.0, 90.0, 100.0, 105.0, 108.0, 110.0, 115.0, 136.0])
+    percent = [worst_percent(chirped[: round(end * RATE_HZ)]) for end in ends_s]
+    found = {"paper's chirp, while it runs (slope 0.5 rad)": (ends_s, np.array(percent))}
+    times_s = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 120.0])
+    swept = [swept_rad(rig, time_s) for time_s in times_s]
+    slope = tip_motion(LINK, DAMPING, swept[-1], RATE_HZ).slope_rad
+    found[f"scan and narrow sweeps, rigd run modes (slope {slope:.1f} rad)"] = (
+        np.array([angle.size / RATE_HZ for angle in swept]),
+        np.array([worst_percent(angle) for angle in swept]),
+    )
+    # More is asked than any of them reaches: each does the best with its time.
+    targets = [parse_target("damping", "0.01%")]
+    for limit_rad in (slope_rad, 0.5):
+        angles = [designed(rig, targets, time_s, limit_rad)[1] for time_s in (2, 5, 10, 20, 40, 80)]
+        found[f"scan and designed pieces, slope to {limit_rad:g} rad"] = (
+            np.array([angle.size / RATE_HZ for angle in angles]),
+            np.array([worst_percent(angle) for angle in angles]),
+        )
+    asked = [parse_target("damping", "0.1%")]
+    for limit_rad in (slope_rad, 0.5):
+        best_s = steady_s(rig, asked, limit_rad)
+        times_s = np.geomspace(5.0, 136.0, 24)
+        found[f"steady sines, slope to {limit_rad:g} rad (bound)"] = (
+            times_s,
+            0.1 * np.sqrt(best_s / times_s),
+        )
+    return found
+
+
+def swept_rad(rig: LoopPreview, duration_s: float) -> Real:
+    """Angle of the scan, followed by narrow sweeps over the modes as it has found them."""
+    found = [
+        {"frequency_hz": mode.frequency_hz, "damping_ratio": mode.damping_ratio}
+        for mode in ESTIMATE.modes()
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "modes.json"
+        path.write_text(json.dumps({"modes": found}), "utf-8")
+        taper_s = min(1.0, duration_s / 20)
+        sweeps = modes(
+            rate_hz=RATE_HZ, path=path, duration_s=duration_s, rest_s=0.0, ring_down_s=1.0,
+            taper_s=taper_s, rig=rig,
+        )  # fmt: skip
+    reference_rad = np.concatenate([SCAN.reference_rad, sweeps.reference_rad])
+    return rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
+
+
+def draw(rig: LoopPreview, path: Path, slope_rad: float) -> None:
+    """Draw them."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
+    styles = ["C7.-", "C2s-", "C0o-", "C1o-", "C0:", "C1:"]
+    for (name, (time_s, percent)), style in zip(
+        curves(rig, slope_rad).items(), styles, strict=True
+    ):
+        axes.loglog(time_s, percent, style, label=name)
+    axes.set_xlabel("time of the record (s)")
+    axes.set_ylabel("largest relative std of a mode's damping (%)")
+    axes.set_ylim(0.004, 20.0)
+    for axis, ticks in (
+        (axes.xaxis, [5, 10, 20, 50, 100]),
+        (axes.yaxis, [0.01, 0.03, 0.1, 0.3, 1, 3, 10]),
+    ):
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="lower left")
+    figure.savefig(path, dpi=130)
+
+
+def check(rig: LoopPreview, sessions: int, slope_rad: float) -> None:
+    """Print what fits state over what was predicted, and their scatter."""
+    targets = [parse_target("damping", "1%")]
+    reference, angle, _, _ = designed(rig, targets, 30.0, slope_rad)
+    names = ("zeta", "alpha", "gamma", "lambda")
+    asked = [*(Target(name, 1.0, relative=False) for name in names), *targets]
+    predicted = [each.std for each in precisions(angle, asked)]
+    made = response(Plant(LINK, DAMPING), reference)
+    everywhere = np.ones(made.angle_rad.size, dtype=bool)
+    found, stated = [], []
+    for seed in range(sessions):
+        noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=made.torque_nm.size)
+        measurement = Measurement(
+            "session",
+            np.round(made.angle_rad / 7e-5) * 7e-5,
+            np.round((made.torque_nm + noise) / 1.25e-4) * 1.25e-4,
+            RATE_HZ,
+            LINK,
+            everywhere,
+            everywhere,
+            rest_angle_rad=0.0,
+        )
+        fit = fit_record(measurement, [STRUCTURES["VI"]]).fits[0]
+        found.append([fit.parameters[n] for n in names] + [m.damping_ratio for m in fit.modes])
+        stated.append(
+            [fit.std[n] or np.nan for n in names] + [m.damping_ratio_std for m in fit.modes]
+        )
+    truth = [DAMPING.zeta, DAMPING.alpha, DAMPING.gamma, DAMPING.lambda_]
+    truth += [mode.damping_ratio for mode in ESTIMATE.modes()]
+    labels = [*names, *(f"damping {mode.number}" for mode in ESTIMATE.modes())]
+    print(f"\n{sessions} sessions of {reference.size / RATE_HZ:g} s")
+    print("quantity    predicted std   stated/predicted  scatter/stated  bias/stated")
+    for i, label in enumerate(labels):
+        std = float(np.nanmedian([row[i] for row in stated]))
+        values = np.array([row[i] for row in found])
+        print(
+            f"{label:10} {predicted[i]:14.2e} {std / predicted[i]:18.2f} "
+            f"{values.std(ddof=1) / std:15.2f} {(values.mean() - truth[i]) / std:12.2f}"
+        )
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tip-slope", type=float, action="append", help="rad (0.14 and 0.5)")
+    parser.add_argument("--check", type=int, metavar="N", help="fit so many records")
+    parser.add_argument("--picture", type=Path, help="draw precision against time")
+    given = parser.parse_args()
+    rig = LoopPreview(replace(load_profile("sim")))
+    slopes_rad = given.tip_slope or [0.14, 0.5]
+    if given.check:
+        check(rig, given.check, slopes_rad[0])
+    elif given.picture:
+        draw(rig, given.picture, slopes_rad[0])
+    else:
+        table(rig, slopes_rad)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""Design of excitation while a session runs: the piece that tells most of what is asked.
+
+A piece of a few seconds drives one mode or several at once, each by a narrow linear sweep with a
+phase that suits what still rings. Of all pieces tried, at the largest amplitude that the rig and
+the linear model allow, that one is taken which lowers the deviations asked for most per second, by
+the Fisher information of the whole record with it (`rigd.excitation._fisher_information`). The
+ringing that a piece leaves counts for it, since it goes on weighted while other modes are driven.
+
+References
+----------
+G. C. Goodwin and R. L. Payne, Dynamic system identification: experiment design and data analysis,
+Academic Press (1977).
+X. Bombois, M. Gevers, R. Hildebrand and G. Solari, Optimal experiment design for open and
+closed-loop system identification, Communications in Information and Systems 11 (2011) 197-224.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping
+from rigd.excitation._fisher_information import BeamEstimate, RecordSoFar
+from rigd.excitation._piece_search import LOOK_AHEAD_S, SHORTEST_S, Piece, PieceSearch
+from rigd.excitation._shortest_move import MovePlant
+from rigd.excitation._signals import ExcitationError
+from rigd.excitation._targets import Precision, Quantities, Target
+
+Real = NDArray[np.float64]
+
+
+class DesignRig(Protocol):
+    """Rig that pieces are designed for."""
+
+    @property
+    def start_rad(self) -> float:
+        """Where the motor stands, from the rig's zero."""
+
+    def plant_with(self, beam: Beam, damping: Damping) -> MovePlant:
+        """Return closed loop and limits with a beam in place of the profile's.
+
+        Parameters
+        ----------
+        beam, damping
+            The beam as estimated.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """A session of designed pieces, one after the other."""
+
+    pieces: tuple[Piece, ...]
+    """In the order in which they are played."""
+    reference_rad: Real
+    """Shape (n,): all of them."""
+    angle_rad: Real
+    """Shape (n,): the angle predicted."""
+    names: tuple[str, ...]
+    """Free parameters, in the order of the covariance."""
+    covariance: Real
+    """Shape (k, k): expected at the end."""
+    expected: tuple[Precision, ...]
+    """Everything asked, as precise as it is expected to be at the end."""
+
+
+def next_piece(
+    estimate: BeamEstimate,
+    angle_rad_so_far: Real,
+    targets: Iterable[Target],
+    rig: DesignRig,
+    time_left_s: float,
+    *,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
+    through: Collection[int] = (),
+) -> Piece:
+    """Design the piece that lowers the deviations asked for most per second.
+
+    Parameters
+    ----------
+    estimate
+        Beam, damping and noise as they are known.
+    angle_rad_so_far
+        Shape (n,): angle from the beginning of the record to that of the piece, at the rig's rate:
+        as measured, and as predicted (`Piece.angle_rad`) where a piece is still to be played. The
+        beam rested at the first.
+    targets
+        What is asked.
+    rig
+        Closed loop and limits.
+    time_left_s
+        Time in which the session has to end; a piece takes no more.
+    tip_slope_rad
+        Slope of the tip up to which the linear model is trusted.
+    through
+        Modes one of which has to be driven; empty: whatever tells most.
+
+    Raises
+    ------
+    ExcitationError
+        If nothing is asked, or no piece fits into the time or drives a mode.
+    """
+    driven = [mode.number for mode in estimate.modes() if mode.number in through]
+    quantities = Quantities.of(targets, estimate)
+    if not quantities.items:
+        raise ExcitationError("No precision is asked for; give for example --damping 1%.")
+    plant = rig.plant_with(estimate.beam, estimate.damping)
+    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, LOOK_AHEAD_S)
+    decision = PieceSearch(
+        estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
+    )
+    return decision.piece(decision.best(time_left_s, driven), time_left_s)
+
+
+def design_excitation(
+    estimate: BeamEstimate,
+    rig: DesignRig,
+    targets: Sequence[Target],
+    duration_s: float,
+    *,
+    angle_rad_so_far: Real | None = None,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
+) -> Design:
+    """Design a session: pieces until everything asked is reached, or the time is over.
+
+    Parameters
+    ----------
+    estimate
+        Beam, damping and noise as they are known beforehand.
+    rig
+        Closed loop and limits: `rigd.runner.LoopPreview`.
+    targets
+        What is asked.
+    duration_s
+        Time of all pieces together.
+    angle_rad_so_far
+        Shape (n,): angle of the record that the pieces continue; None: they begin with the beam
+        at rest.
+    tip_slope_rad
+        Slope of the tip up to which the linear model is trusted.
+
+    Raises
+    ------
+    ExcitationError
+        If nothing is asked, or no piece fits into the time or drives a mode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.excitation import BeamEstimate, design_excitation, parse_target
+    >>> from rigd.profile import load_profile
+    >>> from rigd.runner import LoopPreview
+    >>> estimate = BeamEstimate(
+    ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
+    ...     damping=Damping(zeta=7e-5, gamma=0.02),
+    ...     names=("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"),
+    ...     noise_frequency_hz=np.array([1.0]),
+    ...     noise_nm2_per_hz=np.array([5e-8]),
+    ... )
+    >>> rig = LoopPreview(load_profile("sim"))
+    >>> design = design_excitation(estimate, rig, [parse_target("zeta", "2%")], 20.0)
+    >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
+    (True, True)
+    """
+    plant = rig.plant_with(estimate.beam, estimate.damping)
+    before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
+    reference_rad = angle_rad = np.zeros(0)
+    left_s = duration_s
+    pieces: list[Piece] = []
+    while not pieces or (
+        left_s >= SHORTEST_S and not all(each.reached for each in pieces[-1].expected)
+    ):
+        so_far_rad = np.concatenate([before_rad, angle_rad])
+        piece = next_piece(estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
+        pieces.append(piece)
+        reference_rad = np.concatenate([reference_rad, piece.reference_rad])
+        # What one leaves in the loop is part of the next.
+        angle_rad = plant.respond(reference_rad).angle_rad
+        left_s -= piece.reference_rad.size / plant.rate_hz
+    return Design(
+        pieces=tuple(pieces),
+        reference_rad=reference_rad,
+        angle_rad=angle_rad,
+        names=estimate.names,
+        covariance=pieces[-1].covariance,
+        expected=pieces[-1].expected,
+    )

@@ -1,0 +1,627 @@
+"""Search for the next piece of excitation: sweeps, what they tell, and the limits they keep.
+
+See `rigd.excitation._experiment_design`, which it serves.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf, pi
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._fisher_information import (
+    BAND_HZ,
+    BeamEstimate,
+    RecordSoFar,
+    TorqueModel,
+    covariance_of,
+    responses,
+    whitened_kernels,
+)
+from rigd.excitation._moves import quintic
+from rigd.excitation._shortest_move import MovePlant
+from rigd.excitation._signals import ExcitationError
+from rigd.excitation._targets import Precision, Quantities
+
+Real = NDArray[np.float64]
+
+SHARE_OF_LIMITS: Final = 0.9
+"""Share of every limit, and of the range of small slopes, that a session is predicted to take."""
+
+DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
+"""Durations of pieces."""
+SHORTEST_S: Final = DURATIONS_S[0]
+"""Duration of the shortest piece."""
+
+_FADE_S: Final = 0.25
+_SETTLING_S: Final = 0.25
+_TAIL_S: Final = 1.0
+"""Ringing after a piece by which modes that it is not for are brought to rest."""
+LOOK_AHEAD_S: Final = 8.0
+"""How far a plan looks ahead: a mode tells of its damping only after it has swung for a while."""
+_HALF_WIDTH_HZ: Final = 0.5
+_BESIDE: Final = 0.06
+"""Distance of the sweeps beside a mode, relative to its frequency: they tell of stiffness and tool
+inertia, without which the height of a resonance does not tell its damping."""
+_LINES: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
+"""Steady sines of the forecast, in half-power half-widths from a mode."""
+_PHASES: Final = 8
+_SHARES: Final = (1.0, 0.8, 0.5)
+"""Shares of a piece that others are tried with in addition."""
+_ROUNDS: Final = 60
+_EFFICIENCY: Final = 0.7
+"""Time of a mixture of steady sines over that of pieces, which have to ring up (measured)."""
+_NEVER_S: Final = 1e5
+_TIGHTENINGS: Final = 3
+_THINNED: Final = 4
+"""Limits are looked at in one tick of so many while pieces are compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What the rest of a session is expected to take."""
+
+    seconds: float
+    """Time until everything asked is reached, if pieces go on to tell as much; infinite: never."""
+    reason: str
+    """Why it will not be reached in the time that is left; empty if it will."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """A piece of excitation; begins and ends at angle, speed and acceleration zero."""
+
+    name: str
+    """Modes, frequencies, duration and amplitudes, for people."""
+    reference_rad: Real
+    """Shape (n,): one value per tick, relative to the start angle."""
+    angle_rad: Real
+    """Shape (n,): the angle that is predicted for it."""
+    names: tuple[str, ...]
+    """Free parameters, in the order of the covariance."""
+    covariance: Real
+    """Shape (k, k): expected at the end of the piece; see `information`."""
+    now: tuple[Precision, ...]
+    """Everything asked, as precise as it is expected to be when the piece begins."""
+    expected: tuple[Precision, ...]
+    """The same at its end."""
+    forecast: Forecast
+    """When everything is expected to be reached, from the beginning of the piece on."""
+    share_of_limits: float
+    """Largest share of a limit, or of the range of small slopes, that is predicted; with what still
+    rings."""
+
+
+# Sweeps that pieces are made of
+
+
+@dataclass(frozen=True, slots=True)
+class _Band:
+    """What a sweep goes through, and which mode it is for."""
+
+    number: int
+    middle_hz: float
+    half_width_hz: float
+    fade_s: float
+    at_mode: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sweep:
+    """Response to a sweep of amplitude 1, of one phase."""
+
+    reference_rad: Real
+    """(n,)."""
+    angle_rad: Real
+    """(n,)."""
+    rows: Real
+    """(k, samples): whitened derivatives of the torque from the beginning of the piece on."""
+    weighted: Real
+    """(q, samples): the combinations of them that count."""
+    channels: Real
+    """(6, ticks): what limits are for, as shares of them."""
+    slope: Real
+    """(samples,): slope of the tip as far as one looks ahead, as a share of its limit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A piece that could be played, at its amplitude."""
+
+    duration_s: float
+    parts: tuple[tuple[_Band, float], ...]
+    """Bands and amplitudes in rad."""
+    terms: tuple[tuple[float, _Sweep], ...]
+    """What it is the sum of."""
+    channels: Real
+    """(6, ticks): thinned out."""
+    weighted: Real
+    """(q, samples)."""
+    swing: Real
+    """(samples,): slope of the tip as a share of its limit."""
+    value: float
+    """What it tells as far as one looks ahead, if its first band is driven on after it; in seconds
+    of the best mixture."""
+
+    def total(self, name: str) -> Real:
+        """Sum one of the arrays of `_Sweep` over the terms."""
+        values: Real = sum(factor * getattr(sweep, name) for factor, sweep in self.terms)
+        return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _GoingOn:
+    """A band that is driven on after a piece, in two phases."""
+
+    weighted: Real
+    """(2, q, samples): for amplitude 1."""
+    factors: Real
+    """(2,): as far as the limits allow."""
+    per_amplitude: Real | None
+    """(2, 2): what keeps a mode at its amplitude, real and imaginary; None beside a mode."""
+
+
+class PieceSearch:
+    """Everything that the pieces of one decision have in common."""
+
+    def __init__(
+        self,
+        estimate: BeamEstimate,
+        quantities: Quantities,
+        plant: MovePlant,
+        start_rad: float,
+        record: RecordSoFar,
+        tip_slope_rad: float,
+        time_left_s: float = inf,
+    ) -> None:
+        self.estimate, self.quantities, self.plant = estimate, quantities, plant
+        self.record = record
+        self.modes = estimate.modes()
+        if not self.modes:
+            raise ExcitationError(
+                f"The estimated beam has no mode below {BAND_HZ:g} Hz that could be driven."
+            )
+        self.model = TorqueModel.of(estimate, plant.rate_hz, record.ringing.shape[1])
+        self.samples = record.ahead.shape[1]
+        self.limits = SHARE_OF_LIMITS * np.array(
+            [
+                max(plant.angle_rad - abs(start_rad), 1e-6),
+                plant.velocity_rad_s,
+                plant.tracking_error_rad,
+                plant.peak_torque_nm - plant.friction_nm,
+                plant.coupling_torque_nm,
+                tip_slope_rad,
+            ]
+        )
+        # The motor is held by the torque of what rings, and the sensor feels it.
+        torque_nm, slope_rad = record.ringing
+        none = np.zeros_like(torque_nm)
+        rings = np.stack([none, none, none, torque_nm, torque_nm, slope_rad])
+        self.ringing = rings / self.limits[:, None]
+        self.line_hz, line_rad = self.lines()
+        known = record.after(None, 0)
+        self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad)
+        self.needed_s = self.with_ring_up() / _EFFICIENCY
+        # With too little time everything asked is missed by one factor, not the last mode alone.
+        missed, needed_s = 1.0, self.needed_s
+        for _ in range(_TIGHTENINGS):
+            if not time_left_s < needed_s < _NEVER_S:
+                break
+            missed *= (needed_s / time_left_s) ** 0.5
+            self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad, missed)
+            needed_s = self.with_ring_up() / _EFFICIENCY
+        self.held = self.mixture.weights @ record.through @ record.ahead
+        self._going_on: dict[float, _GoingOn] = {}
+        self.swing = self.ringing[-1, :: self.model.factor][: self.samples]
+
+    def bands(self) -> list[_Band]:
+        """Bands that are tried: through every mode, and beside it."""
+        found = []
+        for mode in self.modes:
+            hz = mode.frequency_hz
+            found += [
+                _Band(mode.number, hz, half_hz, _FADE_S)
+                for half_hz in (0.0, min(_HALF_WIDTH_HZ, 0.2 * hz))
+            ]
+            # Fades as long as the beat with the mode: a shorter one makes it swing as well.
+            found += [
+                _Band(
+                    mode.number, (1.0 + step) * hz, 0.0, max(_FADE_S, 1.0 / (_BESIDE * hz)), False
+                )
+                for step in (-_BESIDE, _BESIDE)
+                if (1.0 + step) * hz < BAND_HZ
+            ]
+        return found
+
+    def lines(self) -> tuple[Real, Real]:
+        """Steady sines: frequencies (m,) in Hz, and the amplitudes (m,) of the angle in rad."""
+        steps = [
+            (*(mode.damping_ratio * np.array(_LINES)), -_BESIDE, _BESIDE) for mode in self.modes
+        ]
+        frequency_hz = np.array(
+            [
+                mode.frequency_hz * (1.0 + step)
+                for mode, of_mode in zip(self.modes, steps, strict=True)
+                for step in of_mode
+            ]
+        )
+        frequency_hz = frequency_hz[(frequency_hz > 0.0) & (frequency_hz < BAND_HZ)]
+        s = 2j * pi * frequency_hz
+        _, response, slope = responses(self.estimate, s)
+        # A short pulse tells what the motor needs for its own inertia, and by how much it lags.
+        pulse = np.zeros(round(self.plant.rate_hz))
+        rise = quintic(0.01, self.plant.rate_hz)
+        pulse[: 2 * rise.size] = 1e-3 * np.concatenate([rise, rise[::-1]])
+        answer = self.plant.respond(pulse)
+        turn = np.exp(-np.outer(s, np.arange(pulse.size) / self.plant.rate_hz))
+        angle = turn @ answer.angle_rad
+        lag = turn @ (pulse - answer.angle_rad) / angle
+        own = turn @ (answer.torque_nm - answer.coupling_torque_nm) / angle
+        shares = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
+        return frequency_hz, 1.0 / (shares / self.limits[:, None]).max(axis=0)
+
+    def best(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
+        """Return the best piece that fits into the time, of those that drive one of some modes."""
+        durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
+        if not durations_s:
+            raise ExcitationError(
+                f"No piece of excitation fits into {time_left_s:g} s: the shortest takes "
+                f"{DURATIONS_S[0]:g} s."
+            )
+        return max((self.best_of(d, through) for d in durations_s), key=lambda each: each.value)
+
+    def best_of(self, duration_s: float, through: Collection[int]) -> _Candidate:
+        """Return the best piece of a duration: of one band, then with others in addition."""
+        bases = [(band, self.basis(band, duration_s)) for band in self.bands()]
+        nothing = _Candidate(
+            duration_s,
+            (),
+            (),
+            self.ringing[:, : self.ticks(duration_s + _SETTLING_S) : _THINNED],
+            self.held,
+            self.swing,
+            0.0,
+        )
+        through = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
+        quiet = {number: self.quieted(nothing, number, through) for number in through}
+        found = max(
+            (
+                self.added(start, 1.0, band, basis, turn)
+                for band, basis in bases
+                if not through or (band.at_mode and band.number in through)
+                for start in (nothing, quiet[band.number])
+                for turn in range(_PHASES)
+            ),
+            key=lambda each: each.value,
+        )
+        for _ in range(2):
+            driven = {band.number for band, _ in found.parts}
+            more = [
+                self.added(found, share, band, basis, turn)
+                for band, basis in bases
+                if band.number not in driven
+                for share in _SHARES
+                for turn in range(0, _PHASES, 2)
+            ]
+            better = max(more, key=lambda each: each.value, default=found)
+            if better.value <= found.value:
+                break
+            found = better
+        return found
+
+    def ticks(self, time_s: float) -> int:
+        return round(time_s * self.plant.rate_hz)
+
+    def model_samples(self, time_s: float) -> int:
+        return round(time_s * self.model.sample_hz)
+
+    def quieted(
+        self, start: _Candidate, number: int, through: dict[int, tuple[_Sweep, _Sweep]]
+    ) -> _Candidate:
+        """Bring all modes but one to rest by the end of the piece, as far as the limits allow."""
+        sweeps = [sweep for other, basis in through.items() if other != number for sweep in basis]
+        if not sweeps:
+            return start
+        first = self.model_samples(start.duration_s)
+        tail = slice(first, first + self.model_samples(_TAIL_S))
+        # The tip's slope a second long tells the modes apart.
+        swings = np.stack([sweep.slope[tail] for sweep in sweeps], axis=1)
+        rings = self.swing[tail]
+        factors = -np.linalg.lstsq(swings, rings)[0]
+        unit = sum(
+            f * sweep.channels[:, ::_THINNED] for f, sweep in zip(factors, sweeps, strict=True)
+        )
+        share = min(1.0, largest_factor(start.channels, unit))
+        weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
+        return _Candidate(
+            start.duration_s,
+            (),
+            tuple((share * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
+            start.channels + share * unit,
+            start.weighted + share * weighted,
+            start.swing
+            + share * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
+            0.0,
+        )
+
+    def basis(self, band: _Band, duration_s: float) -> tuple[_Sweep, _Sweep]:
+        """Sweep through a band in two phases, a quarter of a period apart."""
+        rate_hz = self.plant.rate_hz
+        n = self.ticks(duration_s)
+        from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
+        phase = 2 * pi * band.middle_hz * from_middle_s
+        phase += 2 * pi * band.half_width_hz * from_middle_s**2 / duration_s
+        fade = quintic(min(band.fade_s, 0.4 * duration_s), rate_hz)
+        # The motor comes to rest as well before the piece ends.
+        last = n - self.ticks(self.plant.settling_s)
+        window = np.zeros(n)
+        window[:last] = 1.0
+        window[: fade.size] = fade
+        window[last - fade.size : last] = np.minimum(window[last - fade.size : last], 1.0 - fade)
+        return self.sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
+
+    def sweep(self, reference_rad: Real) -> _Sweep:
+        """Compute the response to a reference from rest."""
+        n = reference_rad.size
+        longer = np.concatenate([reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))])
+        response = self.plant.respond(longer)
+        spectrum = self.model.spectrum(response.angle_rad)
+        rows = self.model.rows(spectrum)[:, : self.samples]
+        slope_rad = self.model.motion(spectrum)[1]
+        channels = np.stack(
+            [
+                response.angle_rad,
+                response.velocity_rad_s,
+                longer - response.angle_rad,
+                response.torque_nm,
+                response.coupling_torque_nm,
+                slope_rad[: longer.size],
+            ]
+        )
+        return _Sweep(
+            reference_rad=reference_rad,
+            angle_rad=response.angle_rad[:n],
+            rows=rows,
+            weighted=self.mixture.weights @ rows,
+            slope=slope_rad[:: self.model.factor][: self.samples] / self.limits[-1],
+            channels=channels / self.limits[:, None],
+        )
+
+    def added(
+        self,
+        beside: _Candidate,
+        share: float,
+        band: _Band,
+        basis: tuple[_Sweep, _Sweep],
+        turn: int,
+    ) -> _Candidate:
+        """Drive a band as far as the limits allow, beside a share of another piece."""
+        angle = 2 * pi * turn / _PHASES
+        sine, cosine = float(np.cos(angle)), float(np.sin(angle))
+        first, second = basis
+        rings = self.ringing[:, : first.channels.shape[1] : _THINNED]
+        unit = sine * first.channels[:, ::_THINNED] + cosine * second.channels[:, ::_THINNED]
+        before = rings + share * (beside.channels - rings)
+        amplitude_rad = largest_factor(before, unit)
+        swing = self.swing + share * (beside.swing - self.swing)
+        swing += amplitude_rad * (sine * first.slope + cosine * second.slope)
+        weighted = self.held + share * (beside.weighted - self.held)
+        weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
+        leading = beside.parts[0][0] if beside.parts else band
+        value = self.value(leading, weighted, swing, beside.duration_s)
+        return _Candidate(
+            beside.duration_s,
+            (*((other, share * size) for other, size in beside.parts), (band, amplitude_rad)),
+            (
+                *((share * factor, sweep) for factor, sweep in beside.terms),
+                (amplitude_rad * sine, first),
+                (amplitude_rad * cosine, second),
+            ),
+            before + amplitude_rad * unit,
+            weighted,
+            swing,
+            value,
+        )
+
+    def value(self, band: _Band, weighted: Real, swing: Real, duration_s: float) -> float:
+        """Compute what is told as far as one looks ahead if a band is driven on after a piece.
+
+        A mode is driven so that it keeps the amplitude that it has at the end of the piece, and
+        beside a mode as far as the limits allow.
+        """
+        first = self.model_samples(duration_s)
+        rest = self.samples - first
+        going_on = self.going_on(band)
+        factors = going_on.factors
+        if going_on.per_amplitude is not None:
+            amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
+            place = 2 * [mode.number for mode in self.modes].index(band.number)
+            factors = going_on.per_amplitude @ amplitudes[place : place + 2]
+        before = weighted[:, :first]
+        after = weighted[:, first:] + np.tensordot(factors, going_on.weighted[:, :, :rest], axes=1)
+        return float(np.vdot(before, before) + np.vdot(after, after))
+
+    @cached_property
+    def decays(self) -> Real:
+        """Amplitudes of the modes, real and imaginary, of what swings for a second: (2 m, n)."""
+        time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
+        free = np.exp(np.outer([mode.pole_rad_s for mode in self.modes], time_s))
+        columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
+        return np.linalg.pinv(columns.T)
+
+    def going_on(self, band: _Band) -> _GoingOn:
+        """Drive a band as long as one looks ahead."""
+        if band.middle_hz not in self._going_on:
+            duration_s = LOOK_AHEAD_S - DURATIONS_S[0]
+            sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
+            weighted = np.stack([sweep.weighted for sweep in sweeps])
+            factors = np.array([largest_factor(np.zeros((1, 1)), sweeps[0].channels), 0.0])
+            per_amplitude = None
+            if band.at_mode:
+                mode = next(each for each in self.modes if each.number == band.number)
+                last = self.model_samples(duration_s - _FADE_S)
+                here = slice(last - self.model_samples(_TAIL_S), last)
+                time_s = np.arange(here.start, here.stop) / self.model.sample_hz
+                # What it has reached by then of its steady amplitude.
+                rising = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
+                turn = np.exp(1j * mode.pole_rad_s.imag * time_s)
+                columns = np.stack([turn.real, -turn.imag], axis=1) * rising[:, None]
+                slopes = np.stack([sweep.slope[here] for sweep in sweeps], axis=1)
+                per_amplitude = np.linalg.inv(np.linalg.lstsq(columns, slopes)[0])
+            self._going_on[band.middle_hz] = _GoingOn(weighted, factors, per_amplitude)
+        return self._going_on[band.middle_hz]
+
+    def piece(self, chosen: _Candidate, time_left_s: float) -> Piece:
+        """Describe a piece, with what is expected of it."""
+        estimate, quantities = self.estimate, self.quantities
+        samples = self.model_samples(chosen.duration_s)
+        channels = chosen.total("channels")
+        ringing = self.ringing[:, : channels.shape[1]]
+        # Between the ticks that were looked at a peak is a little higher.
+        share = min(1.0, largest_factor(ringing, channels))
+        now = covariance_of(self.record.after(None, 0), estimate)
+        after = covariance_of(self.record.after(share * chosen.total("rows"), samples), estimate)
+        return Piece(
+            name=_in_words(chosen),
+            reference_rad=share * chosen.total("reference_rad"),
+            angle_rad=share * chosen.total("angle_rad"),
+            names=estimate.names,
+            covariance=after,
+            now=quantities.precisions(now),
+            expected=quantities.precisions(after),
+            forecast=self.forecast(time_left_s),
+            share_of_limits=SHARE_OF_LIMITS * float(np.abs(ringing + share * channels).max()),
+        )
+
+    def with_ring_up(self) -> float:
+        """Compute the time of the best mixture with what its modes take to ring up.
+
+        What a mode tells of its damping grows as ``1 - exp(-t / tau)`` when its amplitude is held.
+        """
+        times_s = self.mixture.times_s
+        needed_s = float(times_s.sum())
+        grid = np.geomspace(1e-3, 1e3, 400)
+        told = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
+        for mode in self.modes:
+            reach_hz = 1.5 * _LINES[-1] * mode.damping_ratio * mode.frequency_hz
+            at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < reach_hz].sum())
+            decay_s = -1.0 / mode.pole_rad_s.real
+            if at_mode_s > 0.01 * needed_s:
+                needed_s += decay_s * float(np.interp(at_mode_s / decay_s, told, grid)) - at_mode_s
+        return needed_s
+
+    def forecast(self, time_left_s: float) -> Forecast:
+        """Tell how long it will take until everything asked is reached."""
+        impossible = [each.impossible for each in self.quantities.items if each.impossible]
+        if impossible:
+            return Forecast(inf, impossible[0])
+        seconds = self.needed_s
+        if not seconds < _NEVER_S:
+            return Forecast(inf, "the motor cannot drive what would tell it")
+        if seconds <= time_left_s:
+            return Forecast(seconds, "")
+        return Forecast(
+            seconds, f"about {seconds:.0f} s are needed, and {time_left_s:.0f} s are left"
+        )
+
+
+# Best mixture of steady sines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixture:
+    """Steady sines that lead to everything asked in the shortest time, none ringing up."""
+
+    times_s: Real
+    """Shape (m,): time of each."""
+    weights: Real
+    """Shape (q, k): the squares of these combinations of the derivatives of the torque, summed, are
+    what is worth telling on the way there."""
+
+
+def best_mixture(
+    information: Real,
+    estimate: BeamEstimate,
+    quantities: Quantities,
+    frequency_hz: Real,
+    angle_rad: Real,
+    missed: float = 1.0,
+) -> Mixture:
+    """Find the times of steady sines that reach everything asked soonest.
+
+    By multiplicative steps, as `shares_of_time`, with the multipliers of the quantities: by the
+    equivalence theorem all sines of the best mixture tell as much per second of the combinations
+    that are returned, and no other tells more (V. V. Fedorov, Theory of optimal experiments, 1972).
+
+    Parameters
+    ----------
+    information
+        Shape (k, k): what is known already.
+    estimate
+        Beam, damping and noise.
+    quantities
+        What is asked, q quantities.
+    frequency_hz, angle_rad
+        Shape (m,): frequencies of the sines and amplitudes of the angle.
+    missed
+        Factor by which all deviations may be larger than asked.
+    """
+    kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0)
+    kernels = kernels * (angle_rad / 2.0**0.5)
+    rates = np.einsum("if,jf->fij", kernels, kernels.conj()).real
+    asked = np.array([inf if each.impossible else each.asked_std for each in quantities.items])
+    wanted = quantities.gradients / (missed * asked[:, None])
+    if not wanted.any():
+        return Mixture(np.zeros(frequency_hz.size), wanted)
+    multipliers = np.ones(len(wanted))
+    times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
+    for _ in range(_ROUNDS):
+        covariance = covariance_of(information + np.tensordot(times_s, rates, axes=1), estimate)
+        lines = wanted @ covariance
+        variances = np.einsum("qi,qi->q", lines, wanted)
+        multipliers = multipliers * np.maximum(variances, 1e-12) ** 0.5
+        multipliers /= max(float(multipliers.sum()), 1e-300)
+        telling = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
+        times_s = times_s * np.sqrt(telling / max(float(times_s @ telling / times_s.sum()), 1e-300))
+        # As long as it takes, or as is too long.
+        times_s *= float(np.clip(np.sqrt(variances.max()), 0.5, 2.0))
+        if times_s.sum() > _NEVER_S:
+            break
+    worth = np.sqrt(multipliers / max(float(times_s @ telling / times_s.sum()), 1e-300))
+    return Mixture(times_s, worth[:, None] * lines)
+
+
+def largest_factor(before: Real, unit: Real) -> float:
+    """Largest factor of a motion that keeps the sum with another within -1 and 1.
+
+    Where the other one is beyond by itself, the sum may be as large, but no larger.
+
+    Parameters
+    ----------
+    before, unit
+        Shape (c, n): channels of the motion that there is, and of the one that is added.
+    """
+    size = np.abs(unit)
+    room = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(size > 1e-9 * size.max(), room / size, inf)
+    return max(float(factor.min()), 0.0)
+
+
+def _in_words(chosen: _Candidate) -> str:
+    """Say which modes a piece drives, and how."""
+    parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
+    bands = [
+        f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
+        if band.half_width_hz
+        else f"{band.middle_hz:.4g}"
+        for band, _ in parts
+    ]
+    return (
+        f"mode{'s' if len(parts) > 1 else ''} {' + '.join(str(band.number) for band, _ in parts)}, "
+        f"{' + '.join(bands)} Hz, {chosen.duration_s:g} s, "
+        f"{' + '.join(f'{size:.2g}' for _, size in parts)} rad"
+    )

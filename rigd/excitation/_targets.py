@@ -1,0 +1,227 @@
+"""Precision that is asked of a session: which quantity, and with which standard deviation."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from math import inf, isfinite, sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._fisher_information import (
+    BAND_HZ,
+    LOGARITHMIC,
+    BeamEstimate,
+    EstimatedMode,
+)
+from rigd.excitation._signals import ExcitationError
+
+Real = NDArray[np.float64]
+
+OF_MODES: Final = ("damping", "frequency")
+QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
+"""What a precision can be asked of: damping ratio and frequency of modes, or a parameter."""
+
+_UNITS: Final = {"frequency": "Hz"}
+_MOST_MODES: Final = 20
+_OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
+_KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A standard deviation that a quantity is to have, as it was asked for."""
+
+    quantity: str
+    """One of `QUANTITIES`."""
+    std: float
+    """Standard deviation: a share of the value if `relative`, else in the unit of the quantity (a
+    ratio, Hz, s^alpha, s^lambda/m⁴)."""
+    relative: bool
+    """Whether it is a share of the value."""
+    mode: int | None = None
+    """Which mode, from 1 on; None: every mode in the band, or no mode at all."""
+
+    @property
+    def name(self) -> str:
+        """The quantity for people."""
+        return self.quantity if self.mode is None else f"{self.quantity} of mode {self.mode}"
+
+    def __str__(self) -> str:
+        """Return quantity and deviation for people."""
+        unit = _UNITS.get(self.quantity, "")
+        size = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
+        return f"{self.name} to {size}"
+
+
+def parse_target(quantity: str, text: str) -> Target:
+    """Read the precision that an option asks for.
+
+    Parameters
+    ----------
+    quantity
+        One of damping, frequency, zeta, alpha, gamma and lambda.
+    text
+        ``1%``: standard deviation as a share of the value, of every mode in the band; ``2:0.5%``:
+        of mode 2; ``0.01``: in the unit of the quantity, which may be written: ``1:0.002Hz``.
+
+    Raises
+    ------
+    ExcitationError
+        If it is not such a text.
+
+    Examples
+    --------
+    >>> from rigd.excitation import parse_target
+    >>> print(parse_target("damping", "2:0.5%"), "/", parse_target("alpha", "0.01"))
+    damping of mode 2 to 0.5 % / alpha to 0.01
+    """
+    if quantity not in QUANTITIES:
+        raise ExcitationError(
+            f"The precision of {quantity!r} cannot be asked for; choose from "
+            f"{', '.join(QUANTITIES)}."
+        )
+    option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
+    example = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
+        quantity, "5% or 0.01"
+    )
+    before, colon, size = text.strip().rpartition(":")
+    mode = None
+    if colon:
+        if quantity not in OF_MODES:
+            raise ExcitationError(
+                f"{option}: {quantity} is no quantity of a mode; give for example {example}."
+            )
+        if not before.strip().isdecimal() or not 1 <= int(before) <= _MOST_MODES:
+            raise ExcitationError(
+                f"{option}: {before.strip()!r} is no number of a mode, 1 to {_MOST_MODES}; give "
+                f"for example {example}."
+            )
+        mode = int(before)
+    size = size.strip()
+    relative = size.endswith("%")
+    number = size.removesuffix("%") if relative else size.removesuffix(unit)
+    try:
+        std = float(number)
+    except ValueError:
+        raise ExcitationError(
+            f"{option}: {size!r} is no standard deviation; give a share of the value in % or a "
+            f"number{f' in {unit}' if unit else ''}, for example {example}."
+        ) from None
+    std = std / 100 if relative else std
+    if not (isfinite(std) and std > 0.0):
+        raise ExcitationError(
+            f"{option}: the standard deviation must be finite and more than 0; give for example "
+            f"{example}."
+        )
+    return Target(quantity, std, relative, mode)
+
+
+@dataclass(frozen=True, slots=True)
+class Precision:
+    """What is known of one quantity, and what is asked."""
+
+    target: Target
+    """As asked, of one mode where it is of modes."""
+    value: float
+    """Estimated value."""
+    std: float
+    """Its standard deviation."""
+    asked_std: float
+    """Standard deviation that is asked, in the same unit; 0 for a share of a value of 0."""
+    impossible: str = ""
+    """Why no record will tell it; empty if one may."""
+
+    @property
+    def ratio(self) -> float:
+        """Standard deviation over the one asked: reached at 1 and below."""
+        if self.impossible:
+            return inf
+        return self.std / self.asked_std if self.asked_std > 0.0 else inf
+
+    @property
+    def reached(self) -> bool:
+        """Whether it is as precise as asked."""
+        return self.ratio <= 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quantities:
+    """Everything asked, linearised at an estimate."""
+
+    items: tuple[Precision, ...]
+    """One for each quantity; the deviation is not known yet."""
+    gradients: Real
+    """Shape (q, k): derivatives by the free parameters."""
+
+    @classmethod
+    def of(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
+        """Linearise what is asked.
+
+        Parameters
+        ----------
+        targets
+            What is asked; of modes without a number it is asked of every one in the band.
+        estimate
+            Where it is linearised.
+        """
+        modes = estimate.modes()
+        items, gradients = [], []
+        for target in targets:
+            for one in _of_single_modes(target, modes):
+                value, gradient, impossible = _linearised(one, estimate, modes)
+                asked = one.std * abs(value) if one.relative else one.std
+                if asked == 0.0 and not impossible:
+                    impossible = f"{one.name} is 0: a share of it is nothing"
+                items.append(Precision(one, value, inf, asked, impossible))
+                gradients.append(gradient)
+        return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
+
+    def ratios(self, covariance: Real) -> Real:
+        """Deviations over those asked, shape (q,), of what can be told; 0 for the others.
+
+        Parameters
+        ----------
+        covariance
+            Shape (k, k), of the free parameters.
+        """
+        variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
+        asked = np.array([inf if each.impossible else each.asked_std for each in self.items])
+        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / asked
+        return ratios
+
+    def precisions(self, covariance: Real) -> tuple[Precision, ...]:
+        """Everything asked with the deviation for a covariance (k, k)."""
+        return tuple(
+            replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
+            for each, slope in zip(self.items, self.gradients, strict=True)
+        )
+
+
+def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+    if target.quantity not in OF_MODES or target.mode is not None:
+        return [target]
+    return [replace(target, mode=mode.number) for mode in modes]
+
+
+def _linearised(
+    target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
+) -> tuple[float, Real, str]:
+    """Value, derivatives (k,) and, where it cannot be told, the reason."""
+    gradient = np.zeros(len(estimate.names))
+    name = target.quantity
+    if name in OF_MODES:
+        mode = next((each for each in modes if each.number == target.mode), None)
+        if mode is None:
+            seen = ", ".join(str(each.number) for each in modes) or "none"
+            return 0.0, gradient, f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {seen})"
+        if name == "damping":
+            return mode.damping_ratio, mode.damping_gradient, ""
+        return mode.frequency_hz, mode.frequency_gradient_hz, ""
+    value = estimate.values[name]
+    coefficient = _OF_COEFFICIENT.get(name, name)
+    if estimate.values[coefficient] == 0.0 or name not in estimate.names:
+        free = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
+        return value, gradient, f"{_KIND[name]} damping {free} in what was found so far"
+    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC else 1.0
+    return value, gradient, ""

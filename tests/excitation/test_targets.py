@@ -1,0 +1,109 @@
+"""What is asked: texts of options, and their standard deviations by the delta method."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.beam import Beam, Damping, modes
+from rigd.excitation import BeamEstimate, ExcitationError, Target, parse_target
+from rigd.excitation._fisher_information import PARAMETERS
+from rigd.excitation._targets import Quantities
+
+ESTIMATE = BeamEstimate(
+    beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),
+    damping=Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
+    names=PARAMETERS,
+    noise_frequency_hz=np.array([1.0]),
+    noise_nm2_per_hz=np.array([5e-8]),
+)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "text", "target", "told"),
+    [
+        ("damping", "1%", Target("damping", 0.01, True), "damping to 1 %"),
+        ("damping", "2:0.5%", Target("damping", 0.005, True, 2), "damping of mode 2 to 0.5 %"),
+        ("damping", "2e-5", Target("damping", 2e-5, False), "damping to 2e-05"),
+        ("frequency", "1:0.002Hz", Target("frequency", 0.002, False, 1), None),
+        ("frequency", "1 : 0.002 Hz", Target("frequency", 0.002, False, 1), None),
+        ("zeta", "5 %", Target("zeta", 0.05, True), "zeta to 5 %"),
+        ("alpha", "0.01", Target("alpha", 0.01, False), "alpha to 0.01"),
+    ],
+)
+def test_an_option_is_read(quantity, text, target, told):
+    assert parse_target(quantity, text) == target
+    assert told is None or str(target) == told
+
+
+@pytest.mark.parametrize(
+    ("quantity", "text", "message"),
+    [
+        ("mass", "1%", "choose from damping, frequency"),
+        ("damping", "", "no standard deviation"),
+        ("damping", "1Hz", "no standard deviation"),
+        ("damping", "0%", "more than 0"),
+        ("damping", "-1%", "more than 0"),
+        ("alpha", "nan", "finite"),
+        ("zeta", "2:5%", "no quantity of a mode"),
+        ("damping", "two:5%", "no number of a mode"),
+        ("damping", "0:5%", "no number of a mode"),
+        ("frequency", "1:0.1mHz", "a number in Hz"),
+    ],
+)
+def test_another_text_is_refused_with_a_remedy(quantity, text, message):
+    with pytest.raises(ExcitationError, match=message) as refused:
+        parse_target(quantity, text)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "grown"),
+    [
+        ("zeta", 1e-5, lambda e, x: replace(e, damping=replace(e.damping, zeta=7.1e-5 * (1 + x)))),
+        ("alpha", 1e-6, lambda e, x: replace(e, damping=replace(e.damping, alpha=0.996 + x))),
+        (
+            "gamma",
+            1e-5,
+            lambda e, x: replace(e, damping=replace(e.damping, gamma=5.5e-2 * (1 + x))),
+        ),
+        ("lambda", 1e-6, lambda e, x: replace(e, damping=replace(e.damping, lambda_=0.594 + x))),
+        (
+            "density_over_stiffness",
+            1e-6,
+            lambda e, x: replace(e, beam=replace(e.beam, density_kg_per_m=4.7e-3 * (1 + x))),
+        ),
+    ],
+)
+def test_a_mode_moves_as_the_model_says(name, step, grown):
+    """Derivatives of damping ratio and frequency, against differences of the model's own modes."""
+    place = PARAMETERS.index(name)
+    up, down = (
+        modes(e.beam, e.damping, 3) for e in (grown(ESTIMATE, step), grown(ESTIMATE, -step))
+    )
+    for mode, after, before in zip(ESTIMATE.modes(), up, down, strict=True):
+        ratio = (after.damping_ratio - before.damping_ratio) / (2 * step)
+        hz = (after.frequency_hz - before.frequency_hz) / (2 * step)
+        assert mode.damping_gradient[place] == pytest.approx(ratio, rel=1e-4, abs=1e-7)
+        assert mode.frequency_gradient_hz[place] == pytest.approx(hz, rel=1e-4, abs=1e-6)
+
+
+def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
+    asked = [parse_target("damping", "1%"), parse_target("frequency", "2:0.1%")]
+    quantities = Quantities.of([*asked, parse_target("zeta", "5%")], ESTIMATE)
+    names = [each.target.name for each in quantities.items]
+    assert names == [*(f"damping of mode {n}" for n in (1, 2, 3)), "frequency of mode 2", "zeta"]
+    covariance = np.diag(np.full(len(PARAMETERS), 1e-4))
+    found = quantities.precisions(covariance)
+    assert found[-1].std == pytest.approx(7.1e-5 * 0.01)
+    assert found[-1].reached
+    np.testing.assert_allclose(quantities.ratios(covariance), [each.ratio for each in found])
+
+
+def test_a_share_of_nothing_is_impossible():
+    none = replace(ESTIMATE, damping=Damping(), names=("density_over_stiffness",))
+    found = Quantities.of([parse_target("damping", "1%"), parse_target("alpha", "0.1")], none)
+    precisions = found.precisions(np.eye(1))
+    assert "is 0" in precisions[0].impossible
+    assert "internal damping is absent" in precisions[-1].impossible
+    assert not any(each.reached for each in precisions)
