@@ -39,12 +39,22 @@ if TYPE_CHECKING:
 
     from rigd.beam import Beam
 
-__all__ = ["MAX_GAP_S", "MAX_UNKNOWN_SHARE", "Gaps", "Record", "RecordError", "load_record"]
+__all__ = [
+    "MAX_GAP_S",
+    "MAX_SAMPLES",
+    "MAX_UNKNOWN_SHARE",
+    "RECORD_FIELDS",
+    "Gaps",
+    "Record",
+    "RecordError",
+    "load_record",
+    "record_of",
+]
 
 MAX_SAMPLES = MAX_TICKS
 """Most samples of a session that are read."""
 
-_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
+RECORD_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
 """Fields of the samples that an analysis needs."""
 
 _REPORTED_FLAGS = (
@@ -189,8 +199,25 @@ def load_record(path: Path) -> Record:
     >>> print(record.sweep_samples, record.gaps.missing_ticks)
     20000 0
     """
-    session = read_session(path, fields=_FIELDS, max_samples=MAX_SAMPLES)
-    samples = session.samples
+    return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES))
+
+
+def record_of(session: Session) -> Record:
+    """Put a session on a uniform time grid, as `load_record` does.
+
+    Parameters
+    ----------
+    session
+        As read from a file, or as recorded so far; of the samples `RECORD_FIELDS` are needed.
+
+    Raises
+    ------
+    rigd.session.SessionError
+        It lacks a required key.
+    RecordError
+        Its samples cannot be analysed.
+    """
+    path, samples = session.path, session.samples
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
     rate_hz = stated_rate_hz(session)

@@ -6,6 +6,7 @@ needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.Campa
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -271,3 +272,19 @@ def record_result(
 
 def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
     return replace(record, warnings=(*record.warnings, *more)) if more else record
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's.
+
+    Keys lose the underscore by which an attribute is told from a word of Python (``lambda_``).
+    """
+    from numpy import generic
+
+    if isinstance(value, dict):
+        return {str(key).rstrip("_"): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

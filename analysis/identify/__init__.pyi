@@ -50,6 +50,7 @@ from ._scales import DensityCheck as DensityCheck
 from ._scales import density_check as density_check
 from ._scales import scales_absorbed as scales_absorbed
 from ._scales import with_scales as with_scales
+from ._select import INTEGER as INTEGER
 from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select

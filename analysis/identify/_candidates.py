@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +19,7 @@ from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._rivals import with_extras
 from analysis.identify._visible_modes import visible_modes
-from analysis.models import STRUCTURES
+from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -48,11 +49,15 @@ _SHOWS: Final = 4.0
 """Deviance that a damping must save to stay in the freest structure: one that saves less moves no
 other parameter by more than two standard deviations, and only makes them uncertain."""
 
+_CERTAIN: Final = 5.0
+"""Size of a damping, in its standard deviations, from which it shows in any case."""
+
 _PLAIN: Final[Kind] = (True, ())
 """Kind of rig: a uniform beam, and nothing beside it."""
 
 _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
+_INTEGER: Final = STRUCTURES["VII"]
 
 _CROSS_CHECKS: Final = 3
 _NEARLY: Final = 1e-3
@@ -124,16 +129,18 @@ class CandidateSet:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
+        beside: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit nothing but the structure with every order free, on a uniform beam.
+        """Fit the structure with every order free, on a uniform beam, and few others beside it.
 
         Raises
         ------
         MeasurementError
             The record cannot be used.
         """
+        structures = (_FREEST, *beside)
         return cls._uniform(
-            fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz), fixed
+            fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
 
     @classmethod
@@ -326,6 +333,75 @@ class CandidateSet:
             return candidate
         found = first.further(MANY)
         return candidate if found.cost > least else found.candidate()
+
+    def with_special_cases(self) -> CandidateSet:
+        """Fit special cases of the freest structure from where that is, if they may be better.
+
+        An internal damping whose order is near 2 is an inertia, with a minimum of its own, which
+        the search for the freest may take for the lowest: from an order of 1 there is none. A
+        damping that does not show is left out, as of the freest of all structures (`freest`).
+        """
+        fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
+        low, high = fit.interval["alpha"] or (math.inf, -math.inf)
+        doubtful = [_INTEGER] if not low <= 1 <= high else []
+        for structure, other in zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True):
+            if other is None or other.value < _CERTAIN * other.std:
+                doubtful.append(structure)
+        found = []
+        for structure in doubtful:
+            unknowns = self.unknowns(structure, uniform=True)
+            found.append(self.descent(unknowns, unknowns.vector(fit.plant), MANY).candidate())
+        field = self.ranked((*self.candidates, *found)).cross_checked()
+        return field.led_by(field.freest)
+
+    def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
+        """Fit a candidate with the damping that it lacks, so that its modes count that as unknown.
+
+        A damping that does not show may be there, and a mode's damping ratio is that of both: where
+        the mode was excited for no longer than it rings, this is most of its uncertainty. So the
+        other damping is estimated beside, with order 1. One whose order rests on the edge of its
+        range is an inertia or a stiffness, and counts as absent, too.
+
+        Parameters
+        ----------
+        candidate : Candidate
+
+        Returns
+        -------
+        fit : RecordFit
+            The candidate's own if it lacks none.
+        bounded : bool
+            Whether the other damping would have to be negative: it is one standard deviation of it
+            then, and the fit no minimum.
+        """
+        structure, own = candidate.structure, candidate.fit
+        absent = [
+            (order, coefficient)
+            for order, coefficient in COEFFICIENT_OF.items()
+            if not structure.has(coefficient) or order in own.at_bounds
+        ]
+        if len(absent) != 1:
+            return own, False
+        ((order, coefficient),) = absent
+        fixed = {name: value for name, value in structure.fixed.items() if structure.has(name)}
+        fixed[order] = 1.0  # type: ignore[index]
+        free = tuple(name for name in PARAMETERS if name not in fixed)
+        both = replace(structure, free=free, fixed=fixed)
+        unknowns = self.unknowns(both, candidate.uniform, candidate.extras)
+        place = unknowns.names.index(coefficient)
+        little = self.descent(unknowns, unknowns.vector(own.plant), 1)
+        growth = 1 + float(little.promised_step[place])  # linear in the loss, not in its logarithm
+        if growth > 1:
+            start = little.x.copy()
+            start[place] += math.log(growth)
+            found = self.descent(unknowns, start, MANY)
+            if found.x[place] > little.x[place]:
+                return found.fit(), False
+        scaled, scale = little.equations.scaled_hessian()
+        spread = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))[place, place] ** 0.5
+        x = little.x.copy()
+        x[place] += max(math.log(spread / scale[place]), 0.0)
+        return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
         """Free the orders too, on a beam of the best's kind, if that was not done."""

@@ -18,7 +18,7 @@ from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
@@ -187,10 +187,13 @@ class Headline(Numbers):
         Fit of the freest structure that the record supports.
     explained : bool
         Whether it leaves nothing but noise; else every number carries a flag.
+    with_both : RecordFit
+        That fit with the damping that it lacks, if it does, which the modes are of.
     """
 
     fit: RecordFit
     explained: bool
+    with_both: RecordFit
 
     @property
     def flags(self) -> dict[str, str]:
@@ -277,7 +280,10 @@ def headline(
         for each in orders
         if each.profile.walked and each.order in freest.structure.free
     }
-    told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
+    told = of_fit(
+        freest.name, freest.fit, visible, reasons, intervals, unexplained,
+        field.with_both_dampings(freest),
+    )  # fmt: skip
     if field.drag is not None:
         drag = field.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
@@ -305,6 +311,7 @@ def of_fit(
     reasons: Mapping[str, str] = _NONE,
     intervals: Mapping[str, tuple[float, float]] = _NONE,
     unexplained: str | None = None,
+    both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
     """Tell one fit, with flags where they belong.
 
@@ -321,7 +328,10 @@ def of_fit(
         95 % intervals of orders that are better than those of the fit.
     unexplained : str, optional
         Why nothing is.
+    both : tuple of (RecordFit, bool), optional
+        The same with both dampings (`CandidateSet.with_both_dampings`), which tells the modes.
     """
+    with_both, bounded = both or (fit, False)
     flags: dict[str, str] = {
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
@@ -343,7 +353,11 @@ def of_fit(
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),
-        modes=tuple(_mode(mode, visible, unexplained) for mode in fit.modes),
+        modes=tuple(
+            _mode(mode, visible, unexplained)
+            for mode in (_bounded(fit, with_both) if bounded else with_both.modes)
+        ),
+        with_both=with_both,
         structures=((name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
@@ -485,6 +499,18 @@ def _loss(values: Mapping[str, float], each: Size) -> float:
     stored = 1.0 if each.damping == "internal" else values["density_over_stiffness"] * omega**2
     lost = values[coefficient] * math.pow(omega, values[order])
     return lost * math.sin(math.pi / 2 * values[order]) / stored
+
+
+def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
+    """Modes of a fit with the uncertainty of one that has next to nothing of another damping."""
+    theirs = {mode.number: mode for mode in with_both.modes}
+    for mode in fit.modes:
+        wider = theirs.get(mode.number, mode)
+        yield replace(
+            mode,
+            frequency_std_hz=wider.frequency_std_hz,
+            damping_ratio_std=wider.damping_ratio_std,
+        )
 
 
 def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:

@@ -184,13 +184,20 @@ class Refit:
     @property
     def promised_cost(self) -> float:
         """What it would be at the minimum, as far as can be seen from here."""
+        return max(self.cost + float(self.equations.gradient @ self.promised_step), 0.0)
+
+    @property
+    def promised_step(self) -> NDArray[np.float64]:
+        """Way to that minimum (Gauss and Newton's), shape (k,)."""
         equations = self.equations
         held = equations.held(self.x, *self.objective.unknowns.bounds)
         free = ~held & (np.diag(equations.hessian) > 0)
         scaled, scale = equations.scaled_hessian()
         slope = equations.gradient[free] / scale[free]
-        step = np.linalg.solve(scaled[np.ix_(free, free)] + 1e-12 * np.eye(slope.size), slope)
-        return max(self.cost - float(slope @ step), 0.0)
+        step = np.zeros(self.x.size)
+        solved = np.linalg.solve(scaled[np.ix_(free, free)] + 1e-12 * np.eye(slope.size), slope)
+        step[free] = -solved / scale[free]
+        return step
 
     @property
     def plant(self) -> Plant:

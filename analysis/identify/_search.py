@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 # Resonances
 
-_SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
+_SCANS: Final = {"density_over_stiffness": np.linspace(-0.5, 0.5, 101)}
 _OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
 _MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
 """Damping for these scans, as `Unknowns.start` takes it."""

@@ -31,6 +31,8 @@ EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
 """Deviance above the freest structure's from which a simpler one is excluded, by the number of
 parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a thousand records."""
 
+NOT_DETERMINED: Final = "the record does not determine the order"
+
 BESIDE_DRAG: Final = "air drag contributes to it, and its law is known to a few per cent only"
 """Why external damping beside drag must not be taken for a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
@@ -137,7 +139,7 @@ def _judged(
     if untold is not None:
         return "not identifiable", untold
     if not profile.identifiable:
-        return "not identifiable", "the record does not determine the order"
+        return "not identifiable", NOT_DETERMINED
     if doubt is not None:
         return "open", doubt
     if order == "lambda" and field.drag is not None:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from analysis.campaigns import headlines
 from analysis.models import STRUCTURES
 from analysis.report._campaign_tables import all_tables
-from analysis.report._document import finite, versions
+from analysis.report._document import versions
 from analysis.report._table import json_rows
+from analysis.results import finite
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping

@@ -10,7 +10,6 @@ ratio of transforms too, which is noisy but not biased.
 from __future__ import annotations
 
 import json
-import math
 import platform
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
 from analysis.report._bands import loss_factors, response_band, supported_band_hz
 from analysis.report._table import unreported
+from analysis.results import finite
 from analysis.statistics import nrmse_percent
 
 if TYPE_CHECKING:
@@ -419,19 +419,3 @@ def versions() -> dict[str, str]:
         "python": platform.python_version(),
         "numpy": np.__version__,
     }
-
-
-def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's.
-
-    Keys lose the underscore by which an attribute is told from a word of Python (``lambda_``).
-    """
-    if isinstance(value, dict):
-        return {str(key).rstrip("_"): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from analysis.report._document import finite, versions
+from analysis.report._document import versions
 from analysis.report._table import WORDS, Cell, Column, Entry, Table, number
+from analysis.results import finite
 from rigd.units import decimals, with_half_width
 
 if TYPE_CHECKING:

@@ -17,13 +17,14 @@ import pytest
 from analysis.identify import of_fit
 from analysis.identify._headline import Simpler
 from analysis.report import _style as style
-from analysis.report._document import finite, record_entries
+from analysis.report._document import record_entries
 from analysis.report._folder import OutputExistsError
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_page import record_page
 from analysis.report._style import Picture
 from analysis.report._text import damping_sentences
 from analysis.report._write import _write_page, report_tables
+from analysis.results import finite
 
 VOID = {"meta", "br", "img"}
 LIMIT_BYTES = 2_000_000

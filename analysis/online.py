@@ -1,0 +1,406 @@
+"""Online fit: the estimate of a session that still runs, from the samples recorded so far.
+
+`OnlineFit` is fed with samples and fits as often as it is asked, by the very functions of
+`analyze`, so that the last estimate of a session is that of its file. As a program,
+``python -m analysis.online``, it takes the samples on standard input (`rigd.session.write_start`
+and what follows) and answers on standard output, one line of JSON per estimate
+(docs/online_fit.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rigd.runtime import end_with, give_way, ignore, killed_first, use_one_thread
+from rigd.session import EstimateRequest, Session, SessionError, read_frames, read_start
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from analysis.identify import Finding, Headline, OrderVerdict, RecordAnalysis, RecordFit
+    from analysis.record import Record
+    from rigd.session import StreamStart
+
+_NOISE_POINTS: Final = 40
+_NICE: Final = 5
+"""Niceness of the program while somebody waits for its answers: behind the rig's own processes, a
+third of a processor beside another program."""
+
+_NEED_NO_MODE: Final = frozenset({"sign", "unit", "clipping", "stop", "hum", "sensor drift"})
+"""Kinds of findings that do not rest on a fitted beam."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnlineEstimate:
+    """What the samples up to a tick tell.
+
+    Attributes
+    ----------
+    tick : int
+        First tick that was left out.
+    duration_s : float
+        Length of the record used.
+    whole : bool
+        Whether every structure was tried, as `analysis.select` does; otherwise the freest alone,
+        under the same tests of what it leaves.
+    took_s : float
+        Time that it took.
+    headline : Headline or None
+        The numbers, with flags; None if there was no fit.
+    orders : tuple of OrderVerdict
+        Judgement of alpha and lambda; empty unless `whole`.
+    findings : tuple of Finding
+        Effects beside the beam, and what makes the numbers doubtful.
+    analysis : RecordAnalysis or None
+        The fits with the noise.
+    warnings : tuple of str
+        Sentences on the samples: missing, stale, saturated.
+    problem : str
+        Why there was no fit; else empty.
+    """
+
+    tick: int
+    duration_s: float
+    whole: bool
+    took_s: float
+    headline: Headline | None = None
+    orders: tuple[OrderVerdict, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    analysis: RecordAnalysis | None = None
+    warnings: tuple[str, ...] = ()
+    problem: str = ""
+
+    @property
+    def doubt(self) -> str | None:
+        """Why no number is to be believed; None if some are."""
+        told = self.headline
+        if told is None:
+            return self.problem
+        numbers = [
+            *told.parameters.values(),
+            *(each for mode in told.modes for each in (mode.frequency_hz, mode.damping_ratio)),
+        ]
+        flags = [each.flag for each in numbers]
+        return None if None in flags else flags[0]
+
+    @property
+    def predicting(self) -> RecordFit | None:
+        """The fit to predict the next excitation's answer with; None if there was no fit.
+
+        It has both dampings. One that does not show, or whose order is not identifiable and which
+        may thus be a stiffness or an inertia in truth, has order 1.
+        """
+        from analysis.identify import INTEGER
+        from analysis.models import COEFFICIENT_OF
+
+        told, analysis = self.headline, self.analysis
+        if told is None or analysis is None:
+            return None
+        untold = {name for name in COEFFICIENT_OF if name in told.flags}
+        if not untold or told.with_both is not told.fit:
+            return told.with_both
+        simple = (
+            fit
+            for fit in analysis.fits
+            if fit.structure is INTEGER
+            and not fit.plant.stiffness_offsets
+            and not any(fit.plant.extras.values())
+        )
+        return next(simple, told.fit)
+
+    def as_json(self) -> dict[str, Any]:
+        """As `json.dumps` takes it (docs/online_fit.md)."""
+        from analysis.identify import headline_json
+        from analysis.results import finite
+
+        content: dict[str, Any] = {
+            "tick": self.tick,
+            "duration_s": self.duration_s,
+            "whole": self.whole,
+            "took_s": round(self.took_s, 3),
+            "problem": self.problem,
+            "doubt": self.doubt,
+            "warnings": self.warnings,
+            "findings": [each.sentence for each in self.findings],
+            "modes": [],
+        }
+        told, fit = self.headline, self.predicting
+        if told is not None and fit is not None and self.analysis is not None:
+            content |= headline_json(None, told, self.orders, self.findings)
+            for mode, shown in zip(content["modes"], told.modes, strict=True):
+                mode["shown"] = shown.shown
+            content |= {
+                "predicting": fit.structure.name,
+                "plant": asdict(fit.plant),
+                "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
+                "noise": _noise(self.analysis),
+            }
+            del content["file"]
+        return dict(finite(content))
+
+
+def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
+    """Thin out the spectrum of the noise."""
+    import numpy as np
+
+    hz = analysis.frequency_hz
+    points_hz = np.geomspace(hz[0], hz[-1], _NOISE_POINTS)
+    levels = np.exp(np.interp(points_hz, hz, np.log(analysis.noise_nm2_per_hz)))
+    return {"frequency_hz": points_hz.tolist(), "nm2_per_hz": levels.tolist()}
+
+
+class OnlineFit:
+    """Fit of a session as far as it has been recorded.
+
+    Parameters
+    ----------
+    metadata : mapping of str to str
+        The record ``session`` of its file (docs/session_format.md): rate, beam, delays.
+    segments : mapping of str to (int, int), optional
+        Name → first tick and end (exclusive), as planned.
+    name : str
+        What messages call it.
+
+    Examples
+    --------
+    >>> from analysis.online import OnlineFit
+    >>> from rigd.session import read_session
+    >>> session = read_session("session.mcap")
+    >>> fit = OnlineFit(session.metadata, session.segments)
+    >>> fit.feed(session.samples)
+    >>> for tick in (400, 10_000):
+    ...     estimate = fit.estimate(tick)
+    ...     print(estimate.problem or estimate.headline.modes[0].shown)
+    Nothing is excited yet.
+    True
+    """
+
+    def __init__(
+        self,
+        metadata: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]] | None = None,
+        name: str = "session",
+    ) -> None:
+        self._metadata = dict(metadata)
+        self._segments = dict(segments or {})
+        self._path = Path(name)
+        self._blocks: list[NDArray[np.void]] = []
+        self._count = 0
+
+    def feed(self, samples: NDArray[np.void]) -> None:
+        """Take the next samples.
+
+        Parameters
+        ----------
+        samples : ndarray of `rigd.session.SAMPLE_DTYPE`, shape (n,)
+            In the order of their ticks.
+        """
+        from analysis.record import MAX_SAMPLES, RECORD_FIELDS
+
+        if self._count <= MAX_SAMPLES:  # one more than that, and `record` says that it is too long
+            kept = samples[list(RECORD_FIELDS)]
+            self._blocks.append(kept.astype([(name, kept.dtype[name]) for name in RECORD_FIELDS]))
+            self._count += len(samples)
+
+    def record(self, up_to_tick: int | None = None) -> Record:
+        """Return the record so far, as `analysis.load` would of a file with these samples.
+
+        Parameters
+        ----------
+        up_to_tick : int, optional
+            Samples from this tick on are left out.
+
+        Raises
+        ------
+        SessionError, RecordError
+            There is none, or it cannot be analysed.
+        """
+        import numpy as np
+
+        from analysis.record import RecordError, record_of
+
+        if len(self._blocks) > 1:
+            self._blocks = [np.concatenate(self._blocks)]
+        samples = self._blocks[0] if self._blocks else np.zeros(0, [("tick", "<u4")])
+        if up_to_tick is not None:
+            samples = samples[: np.searchsorted(samples["tick"], max(up_to_tick, 0))]
+        end = int(samples["tick"][-1]) + 1 if len(samples) else 0
+        # What is planned beyond was not cut short: it is still to come.
+        so_far = {
+            name: (first, min(last, end))
+            for name, (first, last) in self._segments.items()
+            if first < end
+        }
+        if not end or ("sweep" in self._segments and "sweep" not in so_far):
+            raise RecordError("Nothing is excited yet.")
+        return record_of(
+            Session(
+                path=self._path,
+                samples=samples,
+                start_utc_ns=0,
+                metadata=self._metadata,
+                segments=so_far,
+                outcome=None,
+                events=[],
+                attachments={},
+            )
+        )
+
+    def estimate(self, up_to_tick: int | None = None, *, whole: bool = False) -> OnlineEstimate:
+        """Fit what has been recorded.
+
+        Parameters
+        ----------
+        up_to_tick : int, optional
+            Samples from this tick on are left out.
+        whole : bool
+            Try every structure, as `analysis.select` does, in four times the time.
+
+        Returns
+        -------
+        OnlineEstimate
+            Where nothing can be fitted, one that says why.
+        """
+        from analysis.identify import Measurement, MeasurementError, freest_alone, select
+        from analysis.record import RecordError
+        from analysis.suited import record_band_hz
+
+        began_s = time.monotonic()
+        tick, duration_s = up_to_tick or 0, 0.0
+        try:
+            record = self.record(up_to_tick)
+            tick = round((record.time_s[-1]) * record.rate_hz) + 1
+            duration_s = record.time_s.size / record.rate_hz
+            measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
+            orders: tuple[OrderVerdict, ...] = ()
+            if whole:
+                selection = select(measurement, band_hz=band_hz)
+                told, analysis = selection.headline, selection.analysis
+                found = selection.verdict.findings
+                orders = (selection.verdict.alpha, selection.verdict.lambda_)
+            else:
+                told, found, analysis = freest_alone(measurement, band_hz)
+        except (SessionError, RecordError, MeasurementError) as error:
+            problem = str(error).removeprefix(f"{self._path}: ")
+            took_s = time.monotonic() - began_s
+            return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
+        shows = bool(told.visible_modes)
+        return OnlineEstimate(
+            tick=tick,
+            duration_s=duration_s,
+            whole=whole,
+            took_s=time.monotonic() - began_s,
+            headline=told if shows else None,
+            orders=orders if shows else (),
+            findings=found
+            if shows
+            else tuple(each for each in found if each.kind in _NEED_NO_MODE),
+            analysis=analysis if shows else None,
+            warnings=record.warnings,
+            problem="" if shows else "No mode has been excited enough yet.",
+        )
+
+
+# The program
+
+
+def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
+    """Answer to what comes, until it ends.
+
+    Parameters
+    ----------
+    start : StreamStart
+    frames : iterator
+        As `rigd.session.read_frames` gives them.
+
+    Raises
+    ------
+    SessionError
+        The stream is broken.
+    """
+    fit = OnlineFit(start.metadata, start.segments)
+    came: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
+    came = queue.SimpleQueue()
+
+    def read() -> None:
+        # Beside the fit, so that the sender never waits for it.
+        end = None
+        try:
+            for frame in frames:
+                came.put(frame)
+        except SessionError as error:
+            end = error
+        came.put(end)
+
+    threading.Thread(target=read, daemon=True).start()
+    due_s = None if start.every_s is None else time.monotonic() + start.every_s
+    number = 0
+    while True:
+        try:
+            frame = came.get(timeout=None if due_s is None else max(due_s - time.monotonic(), 0))
+        except queue.Empty:
+            # All that came meanwhile is in: the estimate is as fresh as it can be.
+            assert start.every_s is not None
+            due_s = time.monotonic() + start.every_s
+            _answer(fit, EstimateRequest(number, _ALL, whole=False))
+            number += 1
+            continue
+        if frame is None:
+            return
+        if isinstance(frame, SessionError):
+            raise frame
+        if isinstance(frame, EstimateRequest):
+            _answer(fit, frame)
+        else:
+            fit.feed(frame)
+
+
+_ALL: Final = 1 << 32
+"""Beyond every tick."""
+
+
+def _answer(fit: OnlineFit, request: EstimateRequest) -> None:
+    estimate = fit.estimate(request.tick, whole=request.whole)
+    line = json.dumps({"id": request.id, **estimate.as_json()}, allow_nan=False)
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Answer on standard output to the stream on standard input."""
+    # Ctrl-C stops the session safely; this ends with the stream.
+    ignore()
+    parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
+    parser.add_argument("--parent", type=int, help="End with the process of this number.")
+    asked = parser.parse_args()
+    if asked.parent is not None:
+        end_with(asked.parent)
+    killed_first()
+    use_one_thread()
+    try:
+        start = read_start(sys.stdin.buffer)
+        if start.every_s is None:
+            os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+        else:
+            give_way()  # nobody waits
+        with suppress(BrokenPipeError):  # nobody reads any more
+            serve(start, read_frames(sys.stdin.buffer))
+    except SessionError as error:
+        sys.exit(f"Error: {error}")
+
+
+if __name__ == "__main__":
+    main()

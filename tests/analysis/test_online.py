@@ -1,0 +1,242 @@
+"""Online fit: the same as the analysis of the file, honest before, and the program."""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.identify import Measurement, freest_alone
+from analysis.online import OnlineFit
+from analysis.record import load_record
+from analysis.results import whole_record
+from analysis.suited import record_band_hz
+from rigd.beam import Beam, Damping
+from rigd.session import (
+    SAMPLE_TYPES,
+    SAMPLE_WIRE_DTYPE,
+    EstimateRequest,
+    StreamStart,
+    field_tag,
+    read_session,
+    write_request,
+    write_samples,
+    write_start,
+)
+from rigd.testing import PAPER_BEAM, chirp_signals
+
+MODAL = ("frequency_hz", "damping_ratio")
+
+
+@pytest.fixture(scope="module")
+def session(short_chirps):
+    return read_session(short_chirps[0])
+
+
+def fed(session, block=777) -> OnlineFit:
+    fit = OnlineFit(session.metadata, session.segments, str(session.path))
+    for first in range(0, len(session.samples), block):
+        fit.feed(session.samples[first : first + block])
+    return fit
+
+
+def fed_with(signals, session, beam=PAPER_BEAM) -> OnlineFit:
+    """Online fit of signals, with the metadata of a session but for the beam's."""
+    samples = np.zeros(signals.angle_rad.size, session.samples.dtype)
+    samples["tick"] = np.arange(samples.size)
+    samples["t_ns"] = np.arange(samples.size) * 1_000_000
+    samples["angle_reference_rad"] = signals.reference_rad
+    samples["angle_rad"] = signals.angle_rad
+    samples["coupling_torque_nm"] = signals.torque_nm
+    stated = {
+        "rate_hz": "1000",
+        "beam_length_m": repr(beam.length_m),
+        "beam_density_kg_per_m": repr(beam.density_kg_per_m),
+        "beam_bending_stiffness_n_m2": repr(beam.bending_stiffness_n_m2),
+    }
+    fit = OnlineFit(stated, signals.segments)
+    fit.feed(samples)
+    return fit
+
+
+def scan(**others):
+    return chirp_signals(
+        **{"sweep_s": 5.0, "ring_down_s": 1.0, "start_hz": 0.5, "noise_nm": 1e-2} | others
+    )
+
+
+def test_the_last_estimate_is_that_of_the_file(session):
+    live = fed(session).estimate(whole=True)
+    selection = whole_record(load_record(session.path)).selection
+    assert live.headline.parameters == selection.headline.parameters
+    assert live.headline.modes == selection.headline.modes
+    assert live.findings == selection.verdict.findings
+    np.testing.assert_array_equal(live.headline.fit.covariance, selection.fit.covariance)
+    assert live.orders == (selection.verdict.alpha, selection.verdict.lambda_)
+    assert live.tick == len(session.samples)
+    assert live.doubt is None
+
+
+def test_the_quick_estimate_is_that_of_the_file(session):
+    live = fed(session).estimate()
+    record = load_record(session.path)
+    told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+    assert live.headline.parameters == told.parameters
+    assert live.headline.modes == told.modes
+    assert live.findings == found
+
+
+def test_an_estimate_depends_on_what_was_before_its_tick_alone(session):
+    early = OnlineFit(session.metadata, session.segments)
+    early.feed(session.samples[:12_000])
+    asked, early = fed(session).estimate(12_000), early.estimate()
+    assert asked.headline.modes == early.headline.modes
+    assert asked.tick == early.tick == 12_000
+    assert asked.duration_s == 12.0
+
+
+@pytest.mark.parametrize(
+    ("tick", "problem"),
+    [
+        (0, "Nothing is excited yet"),
+        (500, "Nothing is excited yet"),
+        (1000, "are too short for the band"),
+        (1600, "No mode has been excited enough yet"),
+    ],
+)
+@pytest.mark.parametrize("whole", [False, True])
+def test_what_cannot_be_fitted_yet_says_why(session, tick, problem, whole):
+    estimate = fed(session).estimate(tick, whole=whole)
+    assert problem in estimate.problem
+    assert str(session.path) not in estimate.problem
+    assert estimate.doubt == estimate.problem
+    assert estimate.headline is None
+    json.dumps(estimate.as_json(), allow_nan=False)
+
+
+def test_what_still_runs_was_not_cut_short(session):
+    estimate = fed(session).estimate(9000)
+    assert estimate.warnings == ()
+    assert [mode.shown for mode in estimate.headline.modes] == [True, True, False]
+    assert estimate.doubt is None
+
+
+def test_one_mode_alone_tells_no_order(session):
+    told = fed(session).estimate(4000).headline
+    assert told.visible_modes == (1,)
+    assert all(told.parameters[n].flag for n in {"alpha", "lambda"} & told.parameters.keys())
+    assert told.modes[0].damping_ratio.flag is None
+
+
+def test_a_hum_is_named_and_a_blow_makes_all_doubtful(session):
+    signals = scan()
+    time_s = np.arange(signals.torque_nm.size) / 1000
+    hum = signals.torque_nm + 5e-3 * np.sin(2 * np.pi * 33 * time_s)
+    estimate = fed_with(replace(signals, torque_nm=hum), session).estimate()
+    assert [finding.kind for finding in estimate.findings] == ["hum"]
+    assert estimate.doubt is None
+    since_s = np.maximum(time_s - 3.0, 0.0)
+    ring = 0.2 * np.exp(-0.15 * since_s) * np.sin(2 * np.pi * 2.57 * since_s)
+    struck = fed_with(replace(signals, torque_nm=signals.torque_nm + ring), session).estimate()
+    assert struck.doubt == "part of the record is unexplained"
+
+
+@pytest.mark.parametrize(("density", "stiffness"), [(1.2, 0.8), (0.8, 1.2)])
+def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
+    beam = Beam(0.98, density * 4.7e-3, stiffness * 0.090275)
+    told = fed_with(scan(beam=beam), session).estimate().headline
+    first, second, _ = told.modes
+    for mode, root in ((first, 1.875104), (second, 4.694091)):
+        undamped_hz = (root / 0.98) ** 2 / np.sqrt(beam.density_over_stiffness) / (2 * np.pi)
+        assert mode.shown
+        assert mode.frequency_hz.value == pytest.approx(undamped_hz, rel=0.01)
+        assert 0.003 < mode.damping_ratio.value < 0.011
+
+
+def test_damping_that_does_not_show_counts_as_uncertainty(session):
+    # 0.1 % of external damping at mode 1: in 5 s it decays by 8 %, and does not show.
+    truth = Damping(zeta=2e-4, alpha=1.0, gamma=5e-4, lambda_=1.0)
+    signals = scan(damping=truth, noise_nm=2e-2, seed=6)
+    estimate = fed_with(signals, session).estimate()
+    told = estimate.headline
+    assert told.name == "IV"
+    assert "gamma" in estimate.predicting.determined
+    mode, alone = told.modes[0].damping_ratio, told.fit.modes[0]
+    assert mode.std > 3 * alone.damping_ratio_std
+    true = 0.5 * (2e-4 * 16.1 + 5e-4 / (0.05206 * 16.1))
+    assert mode.interval_95[0] < true < mode.interval_95[1]
+
+
+# The program
+
+
+def wire(samples) -> bytes:
+    found = np.zeros(samples.size, SAMPLE_WIRE_DTYPE)
+    for number, (name, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
+        found[f"tag_{name}"], found[name] = field_tag(number, kind), samples[name]
+    return found.tobytes()
+
+
+@pytest.fixture
+def program():
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "analysis.online"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    yield process
+    process.kill()
+    process.wait()
+    for stream in (process.stdin, process.stdout, process.stderr):
+        stream.close()
+
+
+def test_the_program_answers_to_requests(session, program):
+    write_start(program.stdin, StreamStart(session.metadata, session.segments, None))
+    write_samples(program.stdin, wire(session.samples[:9500]))
+    for number, (tick, whole) in enumerate([(300, False), (9000, False), (9000, True)]):
+        write_request(program.stdin, EstimateRequest(number, tick, whole))
+    output, errors = program.communicate(timeout=60)
+    assert (program.returncode, errors) == (0, b"")
+    answers = [json.loads(line) for line in output.splitlines()]
+    assert [(each["id"], each["tick"], each["whole"]) for each in answers] == [
+        (0, 300, False), (1, 9000, False), (2, 9000, True),
+    ]  # fmt: skip
+    expected = fed(session).estimate(9000).as_json()
+    took_s = answers[1].pop("took_s")
+    assert 0 < took_s < 30
+    assert answers[1] == {"id": 1} | {k: v for k, v in expected.items() if k != "took_s"}
+    names = answers[1]["covariance"]["names"]
+    assert np.array(answers[1]["covariance"]["matrix"]).shape == (len(names), len(names))
+    assert set(answers[1]["plant"]["damping"]) == {"zeta", "alpha", "gamma", "lambda"}
+    noise = answers[1]["noise"]
+    white = np.median(noise["nm2_per_hz"]) * 500
+    assert white == pytest.approx(session_noise_nm2(session), rel=0.5)
+
+
+def session_noise_nm2(session) -> float:
+    """Variance of the torque at rest."""
+    return float(np.var(session.samples["coupling_torque_nm"][:400]))
+
+
+def test_the_program_estimates_unasked(session, program):
+    write_start(program.stdin, StreamStart(session.metadata, session.segments, 0.2))
+    write_samples(program.stdin, wire(session.samples[:5000]))
+    first = json.loads(program.stdout.readline())
+    while first["tick"] < 5000:  # it was quicker than the samples
+        first = json.loads(program.stdout.readline())
+    write_samples(program.stdin, wire(session.samples[5000:9000]))
+    deadline_s = time.monotonic() + 60
+    while json.loads(program.stdout.readline())["tick"] < 9000:
+        assert time.monotonic() < deadline_s
+    program.stdin.close()
+    assert program.wait(60) == 0
+
+
+@pytest.mark.parametrize("stream", [b"", b"{}\n", b'{"version": 1}'])
+def test_the_program_refuses_another_stream(program, stream):
+    _, errors = program.communicate(stream, timeout=60)
+    assert program.returncode == 1
+    assert errors.startswith(b"Error: The stream of samples to the online fit is broken")
