@@ -94,6 +94,10 @@ class Simulation:
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
     seed: Annotated[int, Ge(0)] = 0
     """Seed of the noise."""
+    density_ratio: Positive = field(default=1.0, metadata=OPTIONAL)
+    """Density of the simulated beam over the one that the profile states."""
+    stiffness_ratio: Positive = field(default=1.0, metadata=OPTIONAL)
+    """Bending stiffness of the simulated beam over the one that the profile states."""
     clamp_compliance_rad_per_nm: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """By how much the clamp turns, between sensor and beam, for a torque; 0: it is rigid."""
     tip_mass_kg: NonNegative = field(default=0.0, metadata=OPTIONAL)

@@ -6,6 +6,7 @@ here quantises or adds noise: that is what the simulated devices do with the val
 """
 
 from collections import deque
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -142,6 +143,13 @@ class SimulatedPlant:
         instants = (switch, period - angle_age, period - torque_age)
 
         simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
+        stated = parameters.beam
+        own = replace(
+            stated,
+            density_kg_per_m=simulation.density_ratio * stated.density_kg_per_m,
+            bending_stiffness_n_m2=simulation.stiffness_ratio * stated.bending_stiffness_n_m2,
+        )
+        parameters = replace(parameters, beam=own)
         beam = realise(
             parameters.beam,
             parameters.damping,

@@ -43,6 +43,7 @@ def low_pass(s, hertz, order):
     "more",
     [
         {},
+        {"density_ratio": 0.8, "stiffness_ratio": 1.2},
         {"clamp_compliance_rad_per_nm": 0.02},
         {"tip_mass_kg": 2e-4},
         {"torque_filter_hz": 80.0},
@@ -54,8 +55,13 @@ def test_torque_and_shear_are_those_of_the_exact_response(rig, more):
     angle, torque, shear = driven(rig, **more)
     decay = np.exp(-5.0 * np.arange(TICKS) / TICKS)
     s = 5.0 * RATE_HZ / TICKS + 2j * np.pi * np.fft.rfftfreq(4 * TICKS, 1 / RATE_HZ)
-    beam = LoadedBeam(
+    own = replace(
         rig.beam,
+        density_kg_per_m=more.get("density_ratio", 1.0) * rig.beam.density_kg_per_m,
+        bending_stiffness_n_m2=more.get("stiffness_ratio", 1.0) * rig.beam.bending_stiffness_n_m2,
+    )
+    beam = LoadedBeam(
+        own,
         rig.damping,
         more.get("tip_mass_kg", 0.0),
         more.get("clamp_compliance_rad_per_nm", 0.0),
