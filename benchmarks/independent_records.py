@@ -165,7 +165,7 @@ class Exact:
     Attributes
     ----------
     truth : Truth
-    reference_rad, angle_rad, torque_nm : ndarray, shape (136000,)
+    reference_rad, angle_rad, torque_nm : ndarray, shape (n,)
     """
 
     truth: Truth
@@ -224,18 +224,32 @@ def exact(truth: Truth, *, last_hz: float = LAST_HZ, ringing: bool = False) -> E
     shaken = t < -REST_S - 1.0
     since_s = t[shaken] + before_s + REST_S
     reference[shaken] = _SHAKEN_RAD * np.sin(2 * np.pi * truth.frequency_hz(1) * since_s)
+    return driven(truth, reference, first=round(before_s * rate_hz))
+
+
+def driven(truth: Truth, reference_rad: Real, first: int = 0) -> Exact:
+    """Record without noise of a motor that follows any reference, from rest.
+
+    Parameters
+    ----------
+    truth : Truth
+    reference_rad : ndarray, shape (n,)
+        At four times `RATE_HZ`.
+    first : int
+        Sample of it at which the record begins.
+    """
+    rate_hz, count = _FINER * RATE_HZ, reference_rad.size
     points = round(_PADDED * count)
     sigma = _DECAY * rate_hz / points
     decay = np.exp(-sigma * np.arange(count) / rate_hz)
     s = sigma + 2j * np.pi * np.fft.rfftfreq(points, 1 / rate_hz)
-    angle = np.fft.rfft(reference * decay, points)
+    angle = np.fft.rfft(reference_rad * decay, points)
     angle /= 1 + 1.4 * s / _LOOP_RAD_S + (s / _LOOP_RAD_S) ** 2
     torque = angle * truth.torque_per_angle(s) * np.exp(-s * truth.delay_s)
-    first = round(before_s * rate_hz)
     kept = slice(first, count, _FINER)
     return Exact(
         truth,
-        reference[kept],
+        reference_rad[kept],
         np.fft.irfft(angle, points)[kept] / decay[kept],
         np.fft.irfft(torque, points)[kept] / decay[kept],
     )

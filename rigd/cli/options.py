@@ -127,6 +127,10 @@ NoLook = Annotated[
     ),
 ]
 
+WatchFit = Annotated[
+    bool, typer.Option("--watch-fit", help="Fit the record while it is recorded, and tell.")
+]
+
 
 def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None

@@ -31,6 +31,7 @@ from rigd.cli.options import (
     Repeat,
     Seed,
     Specimen,
+    WatchFit,
     fail,
     session_notes,
 )
@@ -125,11 +126,13 @@ def run_sessions(
     hardware: Hardware = False,
     obstacle: Obstacles = None,
     no_look: NoLook = False,
+    watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note, meta)
-    stop, crew = start_processes(live=live, touch=kind == "touch")
+    fit = watch_fit or kind == "until"
+    stop, crew = start_processes(live=live, touch=kind == "touch", fit=fit)
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
 
@@ -151,6 +154,7 @@ def run_sessions(
             look=not no_look,
             obstacles=obstacle or (),
             from_angle=kind in ("move", "touch"),
+            watch_fit=watch_fit,
         )
     except SeriesFailedError as error:
         if as_json:
@@ -393,6 +397,83 @@ def move(
     if model is not None:
         parameters["path"] = model
     return parameters
+
+
+@excitation_command
+def until(
+    damping: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--damping",
+            metavar="STD",
+            help="Standard deviation of the modes' damping ratios, such as 1% (of each mode in "
+            "the band), 2:0.5% (of mode 2) or 1:2e-5.",
+        ),
+    ] = None,
+    frequency: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--frequency",
+            metavar="STD",
+            help="Of the modes' frequencies, such as 0.01% or 1:0.002 (Hz).",
+        ),
+    ] = None,
+    zeta: Annotated[
+        str | None, typer.Option("--zeta", metavar="STD", help="Of zeta, such as 5%.")
+    ] = None,
+    alpha: Annotated[
+        str | None, typer.Option("--alpha", metavar="STD", help="Of alpha, such as 0.01.")
+    ] = None,
+    gamma: Annotated[
+        str | None, typer.Option("--gamma", metavar="STD", help="Of gamma, such as 5%.")
+    ] = None,
+    lambda_: Annotated[
+        str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.01.")
+    ] = None,
+    at_most: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
+    tip_slope: Annotated[
+        float,
+        typer.Option(
+            "--tip-slope",
+            help="Largest slope of the free end; beyond 0.14 the linear model is not exact (rad).",
+        ),
+    ] = 0.14,
+    amplitude: Annotated[
+        float,
+        typer.Option(
+            "--amplitude", help="Amplitude of the scan, lower where limits require (rad)."
+        ),
+    ] = 0.05,
+    start_hz: Annotated[
+        float, typer.Option("--start-hz", help="Frequency where the scan starts (Hz).")
+    ] = 0.5,
+    stop_hz: Annotated[
+        float, typer.Option("--stop-hz", help="Frequency where the scan ends (Hz).")
+    ] = 52.0,
+    scan: Annotated[float, typer.Option("--scan", help="Duration of the scan (s).")] = 5.0,
+    rest: Rest = 1.0,
+) -> "dict[str, Value]":
+    """Excite what tells most until a precision is reached.
+
+    A quick scan finds the modes; then each piece is planned by what the record has told so far.
+
+    Example: rigd run until --damping 1% --at-most 60
+    """
+    asked = [
+        *(("damping", text) for text in damping or ()),
+        *(("frequency", text) for text in frequency or ()),
+        *(("zeta", zeta), ("alpha", alpha), ("gamma", gamma), ("lambda", lambda_)),
+    ]
+    return {
+        "targets": "; ".join(f"{name} {text}" for name, text in asked if text is not None),
+        "at_most_s": at_most,
+        "tip_slope_rad": tip_slope,
+        "amplitude_rad": amplitude,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "scan_s": scan,
+        "rest_s": rest,
+    }
 
 
 def _write_json(results: "list[SessionResult]") -> None:

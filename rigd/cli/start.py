@@ -25,6 +25,7 @@ from rigd.cli.options import (
     Operator,
     Repeat,
     Specimen,
+    WatchFit,
     fail,
     session_notes,
 )
@@ -58,18 +59,22 @@ class SessionCommands(TyperGroup):
             raise
 
 
-def start_processes(*, live: bool, touch: bool = False) -> "tuple[StopRequest, ProcessGroup]":
+def start_processes(
+    *, live: bool, touch: bool = False, fit: bool = False
+) -> "tuple[StopRequest, ProcessGroup]":
     """Catch the operator's stop, and start the processes of the first session.
 
     They import what they need while the command line imports the rest, and while it plans.
     """
+    from rigd.engine import FIT, TOUCH
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
     stop = StopRequest()
     stop.catch()
     try:
-        return stop, ProcessGroup(live=live, touch=touch)
+        also = [process for process, wanted in ((TOUCH, touch), (FIT, fit)) if wanted]
+        return stop, ProcessGroup(live=live, also=also)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "
@@ -91,6 +96,7 @@ def start_sessions(
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
     ] = False,
+    watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
     """Have the daemon run sessions, and report how they ended."""
@@ -115,6 +121,8 @@ def start_sessions(
         "notes": notes,
         "force": force,
     }
+    if watch_fit:  # an older daemon does not know the member
+        request["watch_fit"] = True
     with daemon_of(profile) as client:
         daemon = client.ask("status")["daemon"]
         typer.echo(daemon["what_moves"], err=True)
@@ -183,6 +191,7 @@ def _follow(
     done = 0
     awaited: set[str] = set()
     made: dict[str, str] = {}
+    fits: dict[str, Any] = {}
     ended: dict[str, Any] | None = None
     heard, deadline_s = 0, 0.0
     line = ProgressLine()
@@ -212,7 +221,7 @@ def _follow(
                     )
                 case "message" if event["level"] != "info":
                     line.say(f"{event['level'].capitalize()}: {event['text']}")
-                case "message" if event["text"].startswith("Live view"):
+                case "message" if event.get("notable") or event["text"].startswith("Live view"):
                     line.say(event["text"])
                 case "session":
                     line.say(result_line(event))
@@ -222,6 +231,8 @@ def _follow(
                             typer.echo(event["path"])
                         if looks:
                             awaited.add(event["path"])
+                        if "fit" in event:
+                            fits[event["path"]] = event["fit"]
                     line, done = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited:
                     awaited.discard(event["path"])
@@ -237,7 +248,12 @@ def _follow(
                         line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
         line.close()
-    sessions = [each | {"look": made.get(each["path"])} for each in ended["sessions"]]
+    sessions = [
+        each
+        | {"look": made.get(each["path"])}
+        | ({"fit": fits[each["path"]]} if each["path"] in fits else {})
+        for each in ended["sessions"]
+    ]
     return ended | {"sessions": sessions}
 
 

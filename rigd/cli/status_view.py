@@ -77,6 +77,9 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
         yield "series", Text(_series(series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
+    # A daemon of before an update tells none; one without lines is of a record that was lost.
+    if series is not None and (lines := (series.get("fit") or {}).get("text")):
+        yield "fit", Text("\n".join(lines))
     rig = told["rig"]
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])

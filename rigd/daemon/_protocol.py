@@ -19,6 +19,7 @@ LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""
 MOST_SESSIONS = 1000
 _LONGEST_PATH = 4096
+_LONGEST_TEXT = 1000
 _SHOWN = 60
 
 _LONGEST_ID = 64
@@ -132,6 +133,7 @@ class SessionRequest(Request):
     repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
     notes: Notes = Notes()
     force: bool = False
+    watch_fit: bool = False
 
 
 class Start(SessionRequest):
@@ -251,6 +253,13 @@ def _value(name: str, given: object, wanted: object) -> Value:
         if isinstance(given, int) and not isinstance(given, bool) and abs(given) < 2**63:
             return given
         raise RequestError(f"parameters.{name} = {_shown(given)} is not a whole number.")
+    if wanted is str:
+        if isinstance(given, str) and given.isprintable() and len(given) <= _LONGEST_TEXT:
+            return given
+        raise RequestError(
+            f"parameters.{name} = {_shown(given)} is not plain text of one line and at most "
+            f"{_LONGEST_TEXT} characters."
+        )
     if (
         isinstance(given, str)
         and given.isprintable()

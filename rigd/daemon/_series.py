@@ -1,13 +1,14 @@
 """Series of sessions that the daemon runs: how far one has come, and who is told of it."""
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
-from rigd.daemon._states import Document, State
+from rigd.daemon._states import Document, State, fit_document
 from rigd.engine import Event
 from rigd.runner import RigError, Series, SessionProgress, SessionResult, result_line
 from rigd.runtime import StopRequest
@@ -36,6 +37,8 @@ class ServedSeries:
     session: int = 0
     """The one that is run, from 1 on."""
     path: Path | None = None
+    fit: Document | None = None
+    """The last one of the record of that session."""
     results: list[SessionResult] = field(default_factory=list)
     """Also of one that failed."""
     reason: str = ""
@@ -58,7 +61,9 @@ class ServedSeries:
             "stopped": self.stop.requested,
             "failed": self.failed,
             "reason": self.reason,
-            "sessions": [result.as_dict() for result in self.results],
+            "fit": self.fit,
+            # Without their fits, each of which is as long as everything else together.
+            "sessions": [replace(result, fit=None).as_dict() for result in self.results],
         }
 
     def state_after(self, fault: str) -> tuple[State, str]:
@@ -92,18 +97,26 @@ class SeriesTeller:
                 "The daemon does not respond to requests: no further session is started."
             )
         self._series.session, self._series.path = number, path
+        self._series.fit = None
 
     def shown(self, where: str) -> None:
         self._tell("info", where)
 
-    def update(self, progress: SessionProgress, events: list[Event]) -> None:  # noqa: ARG002
+    def update(self, progress: SessionProgress, events: list[Event]) -> None:
         for event in events:
             if event.level in _LOGGED:
-                self._tell(event.level, event.message)
+                self._tell(event.level, event.message, notable=event.notable)
+        for fit in progress.fits:
+            self._tell_fit(fit)
 
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
+        fit = {}
+        if result.fit is not None:
+            # What is for the moment, such as the lines for people, is not in the result.
+            series.fit = (series.fit or {}) | fit_document(result.fit)
+            fit = {"fit": series.fit}
         line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
@@ -116,8 +129,14 @@ class SeriesTeller:
         )
         # For lists of events, in the words of the terminal.
         self._publish({"event": "message", "level": "info", "text": line})
-        self._publish({"event": "session", "number": series.session, **result.as_dict()})
+        document = result.as_dict() | fit
+        self._publish({"event": "session", "number": series.session, **document})
 
-    def _tell(self, level: str, text: str) -> None:
+    def _tell(self, level: str, text: str, *, notable: bool = False) -> None:
         _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
-        self._publish({"event": "message", "level": level, "text": text})
+        told = {"level": level, "text": text, "notable": notable}
+        self._publish({"event": "message", **told})
+
+    def _tell_fit(self, fit: Mapping[str, Any]) -> None:
+        document = self._series.fit = fit_document(fit)
+        self._publish({"event": "fit", "session": self._series.session, **document})

@@ -538,6 +538,7 @@ class Service:
                 repeat=request.repeat,
                 notes=notes,
                 force=request.force,
+                watch_fit=request.watch_fit,
             )
         except NoRoomError as error:  # the same request may succeed later
             raise CommandError(str(error)) from error

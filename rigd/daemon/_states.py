@@ -286,6 +286,37 @@ def _state(process: ProcessStatus, phase: Phase) -> str:
     return "done" if process.state == "ended" and passing and phase is Phase.OFF else process.state
 
 
+_OF_A_FIT = (
+    *("tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings"),
+    *("type", "modes", "parameters", "search", "text"),
+)
+"""Members of a fit that clients are told; those for computing, such as its covariance, are long."""
+_MOST_ITEMS, _LONGEST_TEXT = 16, 400
+
+
+def fit_document(fit: Mapping[str, Any]) -> Document:
+    """Tell what a fit of the record found, in a bounded number of bytes.
+
+    Parameters
+    ----------
+    fit
+        The fit, as in `SessionResult.fit`.
+    """
+    return {name: _bounded(fit[name]) for name in _OF_A_FIT if name in fit}
+
+
+def _bounded(value: Any) -> Any:  # noqa: ANN401 - what JSON has
+    """Return lists and texts cut to what a client can bear."""
+    if isinstance(value, str):
+        return value[:_LONGEST_TEXT]
+    if isinstance(value, Mapping):
+        # The pieces of a search are as many as it takes; the file has them.
+        return {key: _bounded(member) for key, member in value.items() if key != "pieces"}
+    if isinstance(value, list | tuple):
+        return [_bounded(item) for item in value[:_MOST_ITEMS]]
+    return value
+
+
 def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Document:
     """Tell how far a session is.
 

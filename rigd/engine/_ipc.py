@@ -282,6 +282,16 @@ TOUCH = Process(
     for_one_session=True,
     loss="touches are detected but not estimated, the session continues",
 )
+FIT = Process(
+    "fit",
+    "rigd.runner.fit_process",
+    Word.FIT_BEAT,
+    # A decision may take its time on a busy computer; the loop holds the angle meanwhile.
+    hung_after_s=15.0,
+    grace_s=1.0,
+    for_one_session=True,
+    loss="a session that plans itself ends with what was recorded, any other continues",
+)
 SUPERVISOR = Process(
     "supervisor",
     "",
@@ -292,7 +302,7 @@ SUPERVISOR = Process(
     loss="the control process ends the session as a fault",
 )
 
-PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, SUPERVISOR)
+PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
 """All processes, in the order in which they are ended: the one with the torque first."""
 
 

@@ -10,6 +10,8 @@ control       ControlJob, then SessionJob, Tare, Zero        Connected, then Rea
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
 touch         TouchJob                                       TouchReady, then TouchTold
+fit           FitJob, FileHeader, RecordEnded                FitReady, then FitTold, PieceTold,
+                                                             SearchEnded; or Failed
 ============  =============================================  ================================
 
 A message is one of these objects, pickled, behind its length. Each is short enough for a pipe's
@@ -29,9 +31,9 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
     from rigd.control import DamperSettings
     from rigd.devices import WhatMoves
-    from rigd.engine._ring import ReferenceSpec
+    from rigd.engine._reference import ReferenceSpec
     from rigd.engine._topics import ChannelSpecs
-    from rigd.excitation import Approach
+    from rigd.excitation import Approach, PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
     from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
 
@@ -208,6 +210,8 @@ class Close:
     """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
     touches: bytes = b""
     """Touches that were estimated, packed."""
+    segments: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """Segments that were not known before the record."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,6 +293,72 @@ class TouchTold:
     """Point, instant, force, stiffness and kind, as in JSON documents."""
     took_s: float
     """Time of the calculation."""
+
+
+# Fit
+
+
+@dataclass(frozen=True, slots=True)
+class FitJob:
+    """The session whose record is fitted while it grows."""
+
+    channels: "ChannelSpecs"
+    """Shared memory of the rig's processes."""
+    first: int
+    """Records in the ring of samples before the session."""
+    profile: "Profile"
+    """Profile of the rig."""
+    reference: "ReferenceSpec"
+    """Reference of the session."""
+    search: "PrecisionSearch | None" = None
+    """What the session goes on for; None: its reference is given, and nothing is planned."""
+    realtime: "RealtimeSettings | None" = None
+    """Where the loop runs, from whose core it keeps off; None: not in real time."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordEnded:
+    """The record has ended: fit all of it."""
+
+    ticks: int
+    """Ticks that were scheduled."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitReady:
+    """The record is fitted from now on."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitTold:
+    """Estimate from the record so far."""
+
+    document: Mapping[str, Any]
+    """Modes and parameters with their intervals, as in JSON documents."""
+    final: bool = False
+    """It rests on the whole record, and is the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class PieceTold:
+    """Piece of excitation that was appended to the reference."""
+
+    name: str
+    """What it is, for the operator."""
+    document: Mapping[str, Any]
+    """What it is expected to bring, as in JSON documents."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchEnded:
+    """No further piece comes; the record ends with those that are there."""
+
+    reached: bool
+    """The precision that was asked for is reached."""
+    reason: str
+    """Why it ended, a sentence for the operator."""
+    segments: Mapping[str, tuple[int, int]]
+    """First tick and end of the scan and of each piece, by name."""
 
 
 # On their way

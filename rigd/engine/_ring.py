@@ -1,4 +1,4 @@
-"""Shared memory between the processes: rings of fixed-size records, and a session's reference.
+"""Shared memory between the processes: rings of fixed-size records.
 
 A ring has one producer (the control loop), one consumer that must get everything (the recorder),
 and any number of observers that may miss records but never delay the writer (the live publisher).
@@ -11,9 +11,6 @@ The two counters in a ring's header only ever grow and are written by one side e
 processor keeps on x86-64; on a weaker memory model the interpreter's own work between the two
 stores is all that separates them, and a reader's own check of the record (tags, consecutive ticks)
 is the guard.
-
-The reference of a session lies in shared memory, too, so that the control process does not pause to
-receive it: however long the session is, a drive that monitors the loop's heartbeat sees no gap.
 """
 
 import mmap
@@ -21,11 +18,7 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from typing import Self
 
 HEADER_SIZE = 64
 _WRITTEN, _READ = 0, 1
@@ -201,47 +194,3 @@ def reserve(fd: int, size: int) -> None:
         os.posix_fallocate(fd, 0, size)
     else:
         os.ftruncate(fd, size)
-
-
-# Reference of a session
-
-_SIZE = 8  # bytes of a double
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceSpec:
-    """What the control process needs to find it: an inherited descriptor and its length."""
-
-    fd: int
-    ticks: int
-
-
-def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpec:
-    """Place a reference, shape (n,), in the memory of `fd`.
-
-    Parameters
-    ----------
-    fd
-        Descriptor of the memory.
-    reference_rad
-        From the rig's zero, one per tick.
-
-    Raises
-    ------
-    OSError
-        If there is not enough shared memory.
-    """
-    size = _SIZE * reference_rad.size
-    reserve(fd, size)
-    with mmap.mmap(fd, size) as memory:
-        memory[:] = reference_rad.astype("float64").tobytes()
-    return ReferenceSpec(fd, reference_rad.size)
-
-
-def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
-    """Attach to a reference: one Python number per tick, read where it lies.
-
-    What is written to it stays in this process.
-    """
-    memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=mmap.ACCESS_COPY)
-    return memoryview(memory).cast("d")

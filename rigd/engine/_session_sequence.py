@@ -19,6 +19,7 @@ from rigd.engine._ipc import Parent
 from rigd.engine._messages import Ending
 from rigd.engine._publish import Display, SampleLog
 from rigd.engine._realtime import page_faults
+from rigd.engine._reference import PieceReader
 from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
 from rigd.engine._timing import SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.engine._topics import Channels
@@ -101,6 +102,8 @@ class SessionSequence:
         What follows the record.
     touch
         Watches the record for a touch; None: nobody does.
+    pieces
+        The reference where it grows during the record; None: all of it is there.
     """
 
     def __init__(
@@ -117,8 +120,10 @@ class SessionSequence:
         stop: StopRequest,
         ending: Ending,
         touch: "TouchWatch | None" = None,
+        pieces: PieceReader | None = None,
     ) -> None:
         self._touch = touch
+        self._pieces = pieces
         self._display = display
         self._profile = profile
         self._cycle = cycle
@@ -273,7 +278,7 @@ class SessionSequence:
         total = len(reference)
         metronome, cycle, log, board = self._metronome, self._cycle, self._log, self._board
         counts, virtual, signals = self.counts, self._clock.virtual, self._stop
-        touch = self._touch
+        touch, pieces = self._touch, self._pieces
         stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
         self._recording = True
@@ -286,8 +291,14 @@ class SessionSequence:
         self._say("info", f"Record starts: {total} ticks at {self._rate_hz:g} Hz.")
         last = -1
         first_ns = last_ns = 0
+        reference_rad = start_rad
         end: SessionEnd | None = None
         while end is None and last < total - 1:
+            if pieces is not None:
+                if virtual:
+                    self._await_piece(pieces, last + 1)
+                if pieces.over(last + 1):
+                    break
             missed = metronome.wait()
             tick = metronome.tick
             if missed:
@@ -296,7 +307,7 @@ class SessionSequence:
                 board[Word.MISSED] = counts.missed
                 end = self._missed_too_many(missed, min(tick, total))
                 if tick >= total:
-                    last = total - 1
+                    last, reference_rad = total - 1, start_rad + reference[-1]
                     break
             if end is None and cycle.stale:  # in the tick before
                 end = self._stale_too_many(tick)
@@ -304,19 +315,21 @@ class SessionSequence:
                 stop[0] or counts.lost or signals.requested or tick % LOOK_EVERY == 0
             ):
                 end = self._look()
+            reference_rad = start_rad + (reference[tick] if pieces is None else pieces.at(tick))
             if end is None:
-                end = self._step(start_rad + reference[tick])
+                end = self._step(reference_rad)
                 if touch is not None and end is None:
                     end = self._watch_touch(touch, tick, missed)
             else:
                 self._switch_off_and_observe()
             wait = virtual or end is not None
-            log.write(tick, start_rad + reference[tick], missed, wait=wait)
+            log.write(tick, reference_rad, missed, wait=wait)
             scheduled[0] = tick + 1
             last_ns = metronome.t_ns + metronome.lateness_ns
             if last < 0:
                 first_ns = last_ns
             last = tick
+        self._end_angle_rad = reference_rad
         counts.scheduled = scheduled[0] = last + 1
         if counts.lost and end is None:
             end = self._stop_reason()
@@ -326,6 +339,12 @@ class SessionSequence:
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
+
+    def _await_piece(self, pieces: PieceReader, tick: int) -> None:
+        """Let virtual time stand still until a tick has its reference."""
+        while pieces.waits(tick) and self._stop_reason() is None:
+            self._display.show(self._cycle, self._metronome.due_ns)
+            time.sleep(_GO_POLL_S)
 
     def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
         """Look for a touch in the tick that was just run; the watch changes the reference."""
@@ -343,7 +362,7 @@ class SessionSequence:
     def damp(self) -> None:
         """Hold the motor where the record ended, yielding until the beam has come to rest."""
         self._board[Word.PHASE] = Phase.RETURNING
-        end_rad = self._end_angle_rad = self._start_angle_rad + self._relative_reference[-1]
+        end_rad = self._end_angle_rad
         if self._ending.damper is None:
             return
         damper = VibrationDamper(self._ending.damper, self._rate_hz)

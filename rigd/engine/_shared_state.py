@@ -105,8 +105,17 @@ class Word(IntEnum):
     """Recorded ticks with a stale wrench."""
     TOUCHES = 23
     """Touches detected in the record."""
+    HELD = 25
+    """Ticks of the record in which the angle was held because there was no next piece."""
     # Written by the touch process
     TOUCH_BEAT = 24
+    # Written by the fit process
+    FIT_BEAT = 26
+    PLANNED = 27
+    """Ticks of the reference that are planned, where it grows during the session."""
+    # Written by the supervisor
+    LAST_PIECE = 28
+    """The record ends with what is planned."""
 
 
 UNKNOWN = -1

@@ -36,7 +36,7 @@ from rigd.engine._messages import (
 )
 from rigd.engine._publish import Display
 from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
-from rigd.engine._ring import map_reference
+from rigd.engine._reference import PieceReader, map_reference
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine._shared_state import Event, Phase, Word, write_event
 from rigd.engine._timing import Clock, RealClock, TickScheduler, VirtualClock
@@ -258,6 +258,7 @@ class _Attendance:
             Word.STALE_ANGLES,
             Word.STALE_WRENCHES,
             Word.TOUCHES,
+            Word.HELD,
         ):
             board[word] = 0
         self._warn_of_refusals(job)
@@ -268,6 +269,9 @@ class _Attendance:
             from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
 
             touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
+        pieces = None
+        if job.reference.planned is not None:
+            pieces = PieceReader(reference, job.reference.planned, board)
         procedure = SessionSequence(
             job.profile,
             reference,
@@ -281,6 +285,7 @@ class _Attendance:
             self._stop,
             job.ending,
             touch,
+            pieces,
         )
         outcome, reason = "complete", ""
         recorded = device_failed = False

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from math import ceil
 from pathlib import Path
+from types import MappingProxyType
 
 from rigd.engine._ipc import Parent
 from rigd.engine._messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
@@ -94,11 +95,11 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
             case FileHeader():
                 recorder.header = message
                 parent.send(Armed())
-            case Close(outcome, touches):
+            case Close(outcome, touches, segments):
                 recorder.transfer()
                 if recorder.begun:
                     writer.write_touches(touches)
-                    parent.send(recorder.close(outcome))
+                    parent.send(recorder.close(outcome, segments))
                 else:
                     writer.discard()
                     parent.send(Closed())
@@ -175,8 +176,20 @@ class Recorder:
         self._writer.write_samples(block)
         self._recorded += len(block) // SAMPLE_SIZE
 
-    def close(self, outcome: Mapping[str, str]) -> Closed:
-        """Write the rest and the outcome."""
+    def close(
+        self,
+        outcome: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+    ) -> Closed:
+        """Write the rest and what is known at the end.
+
+        Parameters
+        ----------
+        outcome
+            As of the loop.
+        segments
+            Segments that were not known before the record.
+        """
         while self.transfer():
             pass
         accounted = self._recorded + int(outcome["missed"])
@@ -194,7 +207,7 @@ class Recorder:
                 "reason": "Samples were lost before the recorder.",
             }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        path = self._writer.close(counted)
+        path = self._writer.close(counted, segments)
         return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:

@@ -1,3 +1,9 @@
+from ._experiment_design import Design as Design
+from ._experiment_design import DesignRig as DesignRig
+from ._experiment_design import design_excitation as design_excitation
+from ._experiment_design import next_piece as next_piece
+from ._fisher_information import BeamEstimate as BeamEstimate
+from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
 from ._moves import Braking as Braking
 from ._moves import braked as braked
@@ -11,6 +17,9 @@ from ._named import KINDS as KINDS
 from ._named import Value as Value
 from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
+from ._piece_search import SHORTEST_S as SHORTEST_S
+from ._piece_search import Forecast as Forecast
+from ._piece_search import Piece as Piece
 from ._shortest_move import Move as Move
 from ._shortest_move import MovePlant as MovePlant
 from ._shortest_move import move as move
@@ -23,7 +32,13 @@ from ._signals import hold as hold
 from ._signals import multisine as multisine
 from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
+from ._targets import Precision as Precision
+from ._targets import Target as Target
+from ._targets import parse_target as parse_target
 from ._touch_passes import Approach as Approach
 from ._touch_passes import Pass as Pass
 from ._touch_passes import after_touch as after_touch
 from ._touch_passes import touch as touch
+from ._until import PAUSE_S as PAUSE_S
+from ._until import PrecisionSearch as PrecisionSearch
+from ._until import until as until

@@ -10,11 +10,12 @@ from rigd.excitation._narrow_sweeps import LoopPreview, modes
 from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
+from rigd.excitation._until import ScanRig, until
 
 Value = float | int | str | Path
 
 
-class RigPreview(LoopPreview, MoveRig, Protocol):
+class RigPreview(LoopPreview, MoveRig, ScanRig, Protocol):
     """What an excitation that is made for one rig may know of it."""
 
 
@@ -27,6 +28,7 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
     "modes": modes,
     "move": move,
     "touch": touch,
+    "until": until,
 }
 """Functions by the names that the command line and session files use."""
 

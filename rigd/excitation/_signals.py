@@ -12,6 +12,7 @@ from rigd.errors import UserError
 
 if TYPE_CHECKING:
     from rigd.excitation._touch_passes import Approach
+    from rigd.excitation._until import PrecisionSearch
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +34,8 @@ class Excitation:
     Attributes
     ----------
     kind
-        ``chirp``, ``hold``, ``step``, ``multisine``, ``file``, ``modes``, ``move`` or ``touch``.
+        ``chirp``, ``hold``, ``step``, ``multisine``, ``file``, ``modes``, ``move``, ``touch`` or
+        ``until``.
     parameters
         The options it was made from, and what follows from them, with units in the names.
     rate_hz
@@ -46,6 +48,8 @@ class Excitation:
         The motor stays where the reference ends; else it returns to the start angle.
     approach
         What the loop does when it detects a touch; None: it does not look for one.
+    search
+        What is asked of a session that goes on until it has found it; None: its end is planned.
     """
 
     kind: str
@@ -55,6 +59,7 @@ class Excitation:
     segments: Mapping[str, tuple[int, int]]
     stays: bool = False
     approach: "Approach | None" = None
+    search: "PrecisionSearch | None" = None
 
     @property
     def shows_modes(self) -> bool:

@@ -77,6 +77,14 @@ class LiveTouches:
 
 
 @dataclass(frozen=True, slots=True)
+class LiveFit:
+    """Fit of the record so far, of the session that is shown."""
+
+    fit: Mapping[str, Any]
+    """As in JSON documents; it takes the place of the one before."""
+
+
+@dataclass(frozen=True, slots=True)
 class LiveEnd:
     """The end of a session that is shown.
 

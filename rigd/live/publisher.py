@@ -30,7 +30,14 @@ from rigd.engine import (
 )
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
-from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown, LiveTouches
+from rigd.live._ring_reader import (
+    Intake,
+    LiveEnd,
+    LiveFit,
+    LiveSession,
+    LiveShown,
+    LiveTouches,
+)
 from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import last_look, look_path, read_look, touch_line
@@ -121,6 +128,9 @@ class _Publisher:
                 case LiveTouches(touches):
                     if self._shown is not None:
                         self._shown.touched(touches)
+                case LiveFit(fit):
+                    if self._shown is not None:
+                        self._shown.fitted(fit)
                 case LiveEnd():
                     self._finish(message)
         self._outlive()
@@ -242,6 +252,12 @@ class _Shown:
         picture, t_ns = self.intake.picture, self.intake.t_ns
         lines = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
         self.backlog.owe([*picture.touches(touches), *picture.events(lines)])
+
+    def fitted(self, fit: "Mapping[str, Any]") -> None:
+        """Draw a fit of the record so far, and tell of it among the events."""
+        picture, t_ns = self.intake.picture, self.intake.t_ns
+        lines = [Note(t_ns, "info", line) for line in fit["text"]]
+        self.backlog.owe([*picture.fit(fit), *picture.events(lines)])
 
     def finish(self, end: LiveEnd) -> None:
         """Take the rest of it, and what can only be known at its end."""

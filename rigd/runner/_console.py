@@ -34,7 +34,8 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
 
     what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
     sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
-    yield f"{what}{sweep}record of {plan['record_s']:g} s."
+    at_most = "at most " if plan.get("ends_itself") else ""
+    yield f"{what}{sweep}record of {at_most}{plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."

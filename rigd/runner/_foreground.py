@@ -70,6 +70,7 @@ def run_in_foreground(
     from_angle: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
+    watch_fit: bool = False,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -99,6 +100,8 @@ def run_in_foreground(
         Changes the profile before it is planned with.
     obstacles
         What a simulated beam meets, as on the command line.
+    watch_fit
+        Fit each record while it is recorded, and tell.
 
     Raises
     ------
@@ -136,7 +139,13 @@ def run_in_foreground(
                 rig.connect(moving)
                 build = partial(build, start_rad=rig.angle_rad)
             series = Series(
-                mounted, build(mounted), folder, repeat=repeat, notes=notes, force=force
+                mounted,
+                build(mounted),
+                folder,
+                repeat=repeat,
+                notes=notes,
+                force=force,
+                watch_fit=watch_fit,
             )
             results = series.results
             for line in plan_lines(series.plan_document()):

@@ -1,12 +1,16 @@
 """The live view of a rig: started with its processes, watched, started again if it is lost."""
 
+import math
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
-from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown, LiveTouches
+from rigd.live import LiveAddress, LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
@@ -18,6 +22,10 @@ _PATIENCE_S = 10.0
 _START_PATIENCE_S = 60.0
 """On a computer that is busy, before one that only starts counts as hung."""
 _BEGIN_PATIENCE_S = 1.0
+_FIT_BAND_HZ = 50.0
+"""End of the band of an excitation that has none."""
+_MOST_FIT_MODES = 4
+"""Modes of which fits are plotted: of more, a plot would be too low to be read."""
 _MOST_RESTARTS = 3
 """Most restarts in one session: a process that dies again and again is given up."""
 
@@ -102,6 +110,11 @@ class LiveView:
         """Show touches of the session, as in JSON documents."""
         if touches and self._session is not None:
             self._send(LiveTouches(tuple(touches)))
+
+    def fitted(self, fits: Sequence[Mapping[str, Any]]) -> None:
+        """Show the last of the fits of the record so far, as in JSON documents."""
+        if fits and self._session is not None:
+            self._send(LiveFit(fits[-1]))
 
     def finish(self, outcome: str, reason: str) -> None:
         """Note the end of the session that is shown; its outcome may be unknown."""
@@ -203,7 +216,8 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
         name=order.path.stem,
         rate_hz=rig.rate_hz,
         ticks=excitation.reference_rad.size,
-        sweep=excitation.segments["sweep"],
+        # Pieces after a scan are no sweep through the band.
+        sweep=excitation.segments.get("scan", excitation.segments["sweep"]),
         beam=rig.beam,
         damping=rig.damping,
         tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
@@ -215,7 +229,19 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
         limits=gauge_limits(order.profile),
         thermal_time_constant_s=rig.motor.thermal_time_constant_s,
         absent=frozenset(absent),
+        fit_modes=_fit_modes(order),
     )
+
+
+def _fit_modes(order: Order) -> int | None:
+    """Return of how many modes fits are plotted: those that are expected in the excited band."""
+    excitation = order.excitation
+    if excitation.search is None and not order.watch_fit:
+        return None
+    ends = (excitation.parameters.get(name, _FIT_BAND_HZ) for name in ("start_hz", "stop_hz"))
+    highest_hz = max(float(end) for end in ends)
+    expected_hz = undamped_frequencies_rad_s(order.profile.rig.beam, _MOST_FIT_MODES) / math.tau
+    return max(1, int(np.count_nonzero(expected_hz < highest_hz)))
 
 
 def gauge_limits(profile: Profile) -> dict[str, float]:

@@ -11,9 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, participation, poles, tip_motion
+from rigd.beam import (
+    SMALL_SLOPE_RAD,
+    Beam,
+    Damping,
+    RealisationError,
+    TipMotion,
+    participation,
+    poles,
+    tip_motion,
+)
 from rigd.control import (
     ClosedLoop,
+    ControlDesignError,
     LoopResponse,
     check_stability,
     close_loop,
@@ -144,19 +154,49 @@ class LoopPreview:
         RealisationError
             If its damping cannot be realised.
         """
+        if not path:
+            rig = self._profile.rig
+            return self._plant_with(rig.beam, rig.damping, _UNSURE)
+        found = read_identified_beam(path, self.beam.length_m)
+        return self._plant_with(found.beam, found.damping, found.frequency_uncertainty)
+
+    def tip_slope_rad(self, reference_rad: Real) -> float:
+        """Largest slope of the free end that is predicted for a reference (n,)."""
+        angle_rad = self._loop.simulate(reference_rad).angle_rad
+        rig = self._profile.rig
+        return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
+
+    def plant_with(self, beam: Beam, damping: Damping) -> MovePlant:
+        """Return the rig with an estimated beam, for the design of excitation.
+
+        Where the loop cannot be computed with its damping, that of the profile is taken: the motor
+        hardly moves otherwise for it, since the coupling torque is fed forward.
+
+        Parameters
+        ----------
+        beam, damping
+            The beam as estimated.
+
+        Raises
+        ------
+        ControlDesignError
+            If the loop is unstable with that beam.
+        RealisationError
+            If no damping can be realised.
+        """
+        try:
+            return self._plant_with(beam, damping, _UNSURE)
+        except (ControlDesignError, RealisationError):
+            return self._plant_with(beam, self._profile.rig.damping, _UNSURE)
+
+    def _plant_with(self, beam: Beam, damping: Damping, uncertainty: float) -> MovePlant:
         profile = self._profile
-        model, uncertainty = profile.loop_model(), _UNSURE
-        if path:
-            identified = read_identified_beam(path, self.beam.length_m)
-            model = replace(model, beam=identified.beam, damping=identified.damping)
-            uncertainty = identified.frequency_uncertainty
-        # tanh of the speed is not linear: a move takes its largest value off the torque.
+        model = replace(profile.loop_model(), beam=beam, damping=damping)
+        # tanh of the speed is not linear: its largest value is taken off the torque.
         settings = replace(model.settings, friction_compensation_nm=0.0)
         loop = close_loop(replace(model, settings=settings))
         check_stability(loop)
         ringing = mode_poles(loop)
-        beam = loop.model.beam
-        assert beam is not None
         # Torque of a mode of the beam for the angle's acceleration: a² rho omega sin(omega t).
         omega = np.abs(ringing)
         per_angle = participation(beam, ringing.size) * beam.density_kg_per_m * omega
@@ -305,7 +345,8 @@ def largest_amplitude(
     -------
     float or None
         In rad, rounded down to three digits; None where the excitation has no amplitude of its own
-        (``hold``, ``file``), keeps it within the limits by itself (``modes``), or none would do.
+        (``hold``, ``file``), keeps it within the limits by itself (``modes``, ``until``), or none
+        would do.
 
     Raises
     ------
@@ -314,7 +355,7 @@ def largest_amplitude(
     RealisationError
         If the beam's damping cannot be realised.
     """
-    if excitation.kind == "modes" or not _has_amplitude(excitation.kind):
+    if excitation.kind in ("modes", "until") or not _has_amplitude(excitation.kind):
         return None
     loop = close_loop(profile.loop_model())
     given_rad = abs(float(excitation.parameters["amplitude_rad"]))
@@ -357,6 +398,7 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
         "parameters": dict(excitation.parameters),
         "segments": {name: list(ends) for name, ends in excitation.segments.items()},
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
+        "ends_itself": excitation.search is not None,
         **asdict(plan.prediction),
         "limits": {
             "angle_rad": profile.limits.angle_rad,
@@ -386,6 +428,8 @@ def _sweep_in_words(excitation: Excitation) -> str:
         return _move_in_words(excitation.parameters)
     if excitation.kind == "touch":
         return _search_in_words(excitation.parameters)
+    if excitation.search is not None:
+        return _scan_in_words(excitation)
     if excitation.kind != "chirp":
         return ""
     start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
@@ -417,6 +461,20 @@ def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
         f"{f', {passes} times' if passes > 1 else ''}, brakes within "
         f"{1e3 * float(parameters['braking_s']):.0f} ms of a touch (beam of "
         f"{parameters['file'] or 'profile'})"
+    )
+
+
+def _scan_in_words(excitation: Excitation) -> str:
+    """Say what a session begins with that goes on until a precision is reached, and which."""
+    assert excitation.search is not None
+    start_hz, stop_hz, scan_s, amplitude_rad = (
+        float(excitation.parameters[name])
+        for name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
+    )
+    asked = ", ".join(str(target) for target in excitation.search.targets)
+    return (
+        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_s:g} s at up to {amplitude_rad:.3g} rad, "
+        f"then excites what tells most until {asked} (standard deviation)"
     )
 
 

@@ -6,6 +6,7 @@ import what they need while the supervisor reads the profile and plans.
 
 import contextlib
 import os
+from collections.abc import Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -14,7 +15,6 @@ from rigd.engine import (
     LIVE,
     PROCESSES,
     RECORDER,
-    TOUCH,
     Child,
     ChildError,
     Process,
@@ -36,8 +36,8 @@ class ProcessGroup:
     ----------
     live
         Start the live publisher too.
-    touch
-        Start the process that estimates touches too; else it is started when it is needed.
+    also
+        Processes of one session to start too; others are started when they are needed.
 
     Raises
     ------
@@ -55,9 +55,9 @@ class ProcessGroup:
         own.
     """
 
-    def __init__(self, *, live: bool, touch: bool = False) -> None:
+    def __init__(self, *, live: bool, also: Collection[Process] = ()) -> None:
         self.live = live
-        self._touch = touch
+        self._also = frozenset(also)
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
@@ -66,8 +66,8 @@ class ProcessGroup:
         try:
             while len(self._fds) < _DESCRIPTORS:
                 self._fds.append(shared_memory_fd())
-            wanted = {CONTROL: True, RECORDER: True, LIVE: live, TOUCH: touch}
-            for process in (process for process in PROCESSES if wanted.get(process)):
+            wanted = {CONTROL, RECORDER, *self._also} | ({LIVE} if live else set())
+            for process in (process for process in PROCESSES if process in wanted):
                 self._start(process)
         except (OSError, ChildError):
             self.end()
@@ -119,7 +119,7 @@ class ProcessGroup:
         assert self._channels is not None
         return self._channels
 
-    def lay_out(self, rate_hz: float, *, fast: bool = False) -> None:
+    def lay_out(self, rate_hz: float, *, fast: bool = False, watched: bool = False) -> None:
         """Size the shared memory for sessions at ``rate_hz``, `fast` under the virtual clock.
 
         Parameters
@@ -128,6 +128,8 @@ class ProcessGroup:
             Ticks a second.
         fast
             Under the virtual clock.
+        watched
+            Processes that watch samples may be started later.
 
         Raises
         ------
@@ -137,7 +139,9 @@ class ProcessGroup:
         from rigd.engine import HURRIED_BUFFERED_S, create_channels
         from rigd.safety import BUFFERED_S
 
-        buffered_s = HURRIED_BUFFERED_S if fast and (self.live or self._touch) else BUFFERED_S
+        # Whoever watches samples, as a live view does and a fit, is slower than the virtual clock.
+        hurried = fast and (self.live or self._also or watched)
+        buffered_s = HURRIED_BUFFERED_S if hurried else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:

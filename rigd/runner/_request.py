@@ -66,6 +66,8 @@ class Order:
     """What follows the record."""
     touch: TouchSearch | None = None
     """What the loop looks for; None: nothing."""
+    watch_fit: bool = False
+    """Fit the record while it is recorded."""
 
 
 def load_rig(

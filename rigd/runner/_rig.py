@@ -132,11 +132,13 @@ class Rig:
         if self.connected:
             self.disconnect()
         try:
+            # Nobody knows yet what sessions the processes that it starts itself will run.
+            any_session = self._crew is None
             crew = self._crew = self._crew or ProcessGroup(live=self._live)
             granted = self._take_precedence(crew)
             if reset_fault:
                 self._reset_fault(moving)
-            _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast)
+            _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
             job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
             crew.fresh(CONTROL).start(job)
             told = self._ask(_CONNECT_PATIENCE_S)
@@ -388,11 +390,13 @@ def _wipe(board: SharedState) -> None:
     board[Word.STOP] = Stop.NO
     board[Word.GO] = 0
     board[Word.LIVE_DROPPED] = 0
+    board[Word.PLANNED] = 0
+    board[Word.LAST_PIECE] = 0
 
 
-def _lay_out(crew: ProcessGroup, rate_hz: float, *, fast: bool) -> None:
+def _lay_out(crew: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:
     try:
-        crew.lay_out(rate_hz, fast=fast)
+        crew.lay_out(rate_hz, fast=fast, watched=watched)
     except OSError as error:
         raise RigError(
             f"No shared memory for the session processes ({error.strerror}); check the "

@@ -107,6 +107,8 @@ class Series:
         specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
+    watch_fit
+        Fit each record while it is recorded.
 
     Attributes
     ----------
@@ -133,7 +135,9 @@ class Series:
         repeat: int = 1,
         notes: Mapping[str, str] | None = None,
         force: bool = False,
+        watch_fit: bool = False,
     ) -> None:
+        self._watch_fit = watch_fit
         self._profile = profile
         self._excitation = excitation
         self._folder = folder
@@ -217,6 +221,7 @@ class Series:
                 tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
                 self.plan.ending,
                 self._touch,
+                self._watch_fit,
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:

@@ -40,6 +40,7 @@ from rigd.engine import (
 )
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
+from rigd.runner._online_fit import OnlineFit
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order, another_path, file_header, part_of
 from rigd.runner._touch_search import TouchEstimates
@@ -106,6 +107,7 @@ class SessionFailedError(FailureError):
             hardware=self.hardware,
             look=None,
             touches=None,
+            fit=None,
             **self.counts,
         )
 
@@ -150,6 +152,8 @@ class SessionResult:
     """Path of the quick look at it; None: there is none, or none yet."""
     touches: tuple[Mapping[str, Any], ...] | None = None
     """Touches in the order in which they happened; None: none was looked for."""
+    fit: Mapping[str, Any] | None = None
+    """Fit of the record made while it ran, as in JSON documents; None: none was asked for."""
 
     @property
     def went_well(self) -> bool:
@@ -159,6 +163,7 @@ class SessionResult:
     def as_dict(self) -> dict[str, object]:
         """Return it as JSON documents have it."""
         touches = {} if self.touches is None else {"touches": list(self.touches)}
+        fit = {} if self.fit is None else {"fit": dict(self.fit)}
         return {
             "path": None if self.path is None else str(self.path),
             "part": None if self.part is None else str(self.part),
@@ -174,6 +179,7 @@ class SessionResult:
             "hardware": self.hardware,
             "look": None if self.look is None else str(self.look),
             **touches,
+            **fit,
         }
 
 
@@ -189,6 +195,8 @@ class SessionProgress:
     """Ticks missed so far."""
     late: int
     """Ticks that woke late so far."""
+    fits: tuple[Mapping[str, Any], ...] = ()
+    """Fits of the record that came since the last time, as in JSON documents."""
 
 
 Watcher = Callable[[SessionProgress, list[Event]], None]
@@ -246,6 +254,7 @@ class Session:
         self._opened: Path | None = None
         self._kept: Path | None = None
         self._touches: TouchEstimates | None = None
+        self._fit: OnlineFit | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -277,10 +286,12 @@ class Session:
         self._board[Word.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
-        crew = self._crew
+        crew, search = self._crew, self._order.excitation.search
         try:
             reference = put_reference(
-                crew.channels.reference_fd, self._order.excitation.reference_rad
+                crew.channels.reference_fd,
+                self._order.excitation.reference_rad,
+                None if search is None else search.planned_ticks,
             )
         except OSError as error:
             raise SessionFailedError(
@@ -288,10 +299,15 @@ class Session:
                 "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
             ) from None
         order = self._order
+        profile = order.profile
+        realtime = None if self._virtual else profile.realtime
         if order.touch is not None:
-            profile = order.profile
-            realtime = None if self._virtual else profile.realtime
             self._touches = TouchEstimates(crew, order.touch, profile.rig.rate_hz, realtime)
+        if search is not None or order.watch_fit:
+            self._fit = OnlineFit(crew, profile, reference, search, realtime)
+            lost = self._fit.await_ready(self._reports)
+            if lost and search is not None:
+                raise SessionFailedError(lost)
         self._open_file()
         order = self._order
         self._control_at_work = True
@@ -302,7 +318,10 @@ class Session:
         crew.control.send(job)
         answer = self._listen_to_control()
         if isinstance(answer, Ready):
-            crew.recorder.send(file_header(order, self._connected, answer.tare))
+            header = file_header(order, self._connected, answer.tare)
+            crew.recorder.send(header)
+            if self._fit is not None:
+                self._fit.begin(header)
             self._ask_recorder(Armed)
             self._board[Word.GO] = 1
             answer = self._listen_to_control()
@@ -310,6 +329,11 @@ class Session:
             raise SessionFailedError(self._recorder_lost)
         assert isinstance(answer, Finished)
         return self._close(answer)
+
+    def _reports(self) -> bool:
+        """Report while nothing moves yet; return whether the session is still wanted."""
+        self._report()
+        return self._board[Word.STOP] == Stop.NO
 
     def _open_file(self) -> None:
         """Have the file made, under another name if somebody else has just taken the one chosen."""
@@ -459,12 +483,19 @@ class Session:
             events += self._touches.attend()
             if self._live is not None:
                 self._live.touched(self._touches.news())
+        fits: Sequence[Mapping[str, Any]] = ()
+        if self._fit is not None:
+            events += self._fit.attend()
+            fits = self._fit.news()
+            if self._live is not None:
+                self._live.fitted(fits)
         self._watcher(
             SessionProgress(
                 Phase(board[Word.PHASE]),
                 board[Word.SCHEDULED],
                 board[Word.MISSED],
                 board[Word.LATE],
+                tuple(fits),
             ),
             events,
         )
@@ -482,9 +513,14 @@ class Session:
             touches = self._touches.finish(self._board[Word.TOUCHES], self._report)
             outcome["touches"] = json.dumps(touches)
             self._report()
+        fit, segments = self._finish_fit(finished)
+        if fit is not None:
+            outcome["fit"] = json.dumps(fit)
+            if finished.outcome == "complete" and not finished.reason:
+                outcome["reason"] = self._fit.shortcoming if self._fit is not None else ""
         self._crew.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
-        self._crew.recorder.send(Close(outcome, packed))
+        self._crew.recorder.send(Close(outcome, packed, segments))
         closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
@@ -501,10 +537,29 @@ class Session:
             lost=counts.get("lost", 0),
             stale_angles=counts["stale_angles"],
             stale_wrenches=counts["stale_wrenches"],
-            fault=finished.fault or ended == "fault",
+            fault=finished.fault
+            or ended == "fault"
+            or (self._fit is not None and self._fit.ended_session),
             live_dropped=self._board[Word.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
+            fit=fit,
         )
+
+    def _finish_fit(
+        self, finished: Finished
+    ) -> tuple[dict[str, Any] | None, dict[str, tuple[int, int]]]:
+        """Return the fit of the whole record, and the segments that were planned on the way."""
+        if self._fit is None:
+            return None, {}
+        ticks = finished.counts["scheduled"]
+        fit = self._fit.finish(ticks, self._report)
+        self._report()
+        played = {
+            name: (first, min(end, ticks))
+            for name, (first, end) in self._fit.segments.items()
+            if first < ticks
+        }
+        return fit, played
 
 
 def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:

@@ -13,6 +13,8 @@ import numpy as np
 
 from rigd.printable import counts_text, grouped, printable
 from rigd.session._format import SessionError, Status
+from rigd.session._online_fit import mode_line
+from rigd.session._quick_look import fit_of
 from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
 from rigd.session._touches import touch_line, touches_of
 from rigd.units import suffix_of, unit_of
@@ -285,7 +287,8 @@ def _utc(utc_ns: int) -> datetime:
 
 
 def _outcome(outcome: dict[str, str]) -> Iterator[tuple[str, str]]:
-    told = {"outcome", "reason", "touches", *(_RECOVERED + key for key in _recovery(outcome))}
+    told = {"outcome", "reason", "touches", "fit"}
+    told |= {_RECOVERED + key for key in _recovery(outcome)}
     text = outcome.get("outcome", "unknown").capitalize()
     with suppress(KeyError, ValueError):  # of another program, or of a recovery
         text += f": {counts_text(outcome)}"
@@ -294,6 +297,9 @@ def _outcome(outcome: dict[str, str]) -> Iterator[tuple[str, str]]:
     yield "outcome", f"{text}. {reason}" if reason else text
     for touch in touches_of(outcome):
         yield "touch", touch_line(touch).removeprefix("Touch ")
+    for mode in (fit_of(outcome) or {"modes": []})["modes"]:
+        if mode["shown"]:
+            yield "fit", mode_line(mode)
     yield from (_rounded(key, value) for key, value in outcome.items() if key not in told and value)
 
 

@@ -1,11 +1,12 @@
 """Quick looks: the files that the analyzer writes beside session files, and how they are read.
 
 docs/quick_look.md describes them. Any user may have put such a file there: what is read of it is
-checked here, once for the live view, the page, the library and the analyzer.
+checked here, once for the live view, the page, the library and the analyzer. So is the fit that a
+session file has of its record.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from math import isfinite
 from pathlib import Path
@@ -169,6 +170,53 @@ def _modes(documents: list[object]) -> Iterator[Document]:
             ):
                 known = {"frequency_hz": frequency, "damping_ratio": damping}
                 yield {"mode": number, "shown": shown, **known}
+
+
+def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
+    """Return the fit that was made of a record while it was recorded.
+
+    Parameters
+    ----------
+    outcome
+        The record ``outcome`` of a file, as anybody may have written it.
+
+    Returns
+    -------
+    dict or None
+        ``duration_s`` of the record that was fitted, ``problem``, ``modes`` as of `modes_of`,
+        ``parameters`` by name, ``findings``, and ``search`` of a session that went on until a
+        precision was reached: ``reason`` of its end, and ``targets`` with ``name``, ``value``,
+        ``std`` and ``asked_std``. None if there is none that can be used.
+    """
+    try:
+        text = (outcome or {})["fit"]
+        found = json.loads(text, parse_constant=lambda _: None, parse_float=_parsed)
+        duration_s = _finite(found["duration_s"])
+        parameters = {
+            _text(name): _quantity(value) for name, value in found.get("parameters", {}).items()
+        }
+        search = found.get("search") or {}
+        return {
+            "duration_s": max(duration_s or 0.0, 0.0),
+            "problem": _text(found.get("problem") or ""),
+            "modes": modes_of(found.get("modes")),
+            "parameters": {name: value for name, value in parameters.items() if value is not None},
+            "findings": [_text(line) for line in found.get("findings") or []],
+            "search": {
+                "reason": _text(search.get("reason") or ""),
+                "targets": list(_targets(search.get("targets"))),
+            },
+        }
+    except (*_UNREADABLE, AttributeError):
+        return None
+
+
+def _targets(documents: object) -> Iterator[Document]:
+    for target in documents if isinstance(documents, list) else ():
+        if isinstance(target, dict):
+            numbers = {name: _finite(target.get(name)) for name in ("value", "std", "asked_std")}
+            if numbers["asked_std"] is not None:
+                yield {"name": _text(target.get("name") or ""), **numbers}
 
 
 def _quantity(document: object) -> Document | None:

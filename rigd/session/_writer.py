@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -179,7 +180,7 @@ class SessionWriter:
                 "format_version": FORMAT_VERSION,
                 "start_utc_ns": str(start_utc_ns),
             }
-            ticks = {name: f"{first},{end}" for name, (first, end) in segments.items()}
+            ticks = _segment_texts(segments)
             mcap.add_metadata("session", session)
             mcap.add_metadata("segments", ticks)
             for name, data in attachments.items():
@@ -249,8 +250,17 @@ class SessionWriter:
             with self._explained():
                 self._write_chunk(everything=True)
 
-    def close(self, outcome: Mapping[str, str]) -> Path:
+    def close(
+        self,
+        outcome: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+    ) -> Path:
         """Write the record ``outcome``, complete the file and give it its final name.
+
+        Parameters
+        ----------
+        outcome : the record ``outcome``
+        segments : those that were not known at the beginning, or were different
 
         Returns
         -------
@@ -265,6 +275,8 @@ class SessionWriter:
         mcap = self._begun()
         with self._explained():
             self._write_chunk(everything=True)
+            if segments:
+                mcap.add_metadata("segments", _segment_texts(segments))
             mcap.add_metadata("outcome", outcome)
             mcap.finish()
             self._sync()
@@ -459,6 +471,10 @@ def _event_records(
         )
         records += data
     return records, index
+
+
+def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    return {name: f"{first},{end}" for name, (first, end) in segments.items()}
 
 
 def _chunk_samples(metadata: Mapping[str, str]) -> int:

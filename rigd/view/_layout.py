@@ -22,6 +22,8 @@ import numpy.typing as npt
 from rigd.view import _antenna as antenna
 from rigd.view import _banner
 from rigd.view import _plots as plots
+from rigd.view._fits import TABLE as FIT_TABLE
+from rigd.view._fits import fit_source
 from rigd.view._frequency_charts import (
     COHERENCE,
     MAGNITUDE,
@@ -50,6 +52,9 @@ CLOSE_UP_S = 2.0
 
 HISTORY_S = 60.0
 """Time shown of what comes a few times a second only."""
+
+WHOLE_S = 86_400.0
+"""Stands for the whole session: time shown of what comes once a second at the most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +112,32 @@ _TWO_COLUMNS: Final = 4
 TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
 
 TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
+FIT_TAB = "Fit"
+"""Second tab of sessions whose record is fitted."""
+_FIT_TAB_HEIGHT: Final = 640.0
+_FIT_PLOT_MARGIN: Final = 50.0
 
 
-def blueprint(active_tab: str = TABS[0], *, absent: Collection[str] = ()) -> "rrb.Blueprint":
+def fit_views(source: Source) -> tuple[TimeView, ...]:
+    """Return the plots of the tab Fit.
+
+    Parameters
+    ----------
+    source
+        Source of the plots, two of each mode.
+    """
+    rows = max(1, len(source.plots) // 2)
+    height = _FIT_TAB_HEIGHT / rows - _FIT_PLOT_MARGIN
+    return tuple(TimeView(source, plot, WHOLE_S, height) for plot in source.plots)
+
+
+def blueprint(
+    active_tab: str = TABS[0],
+    *,
+    absent: Collection[str] = (),
+    fit_modes: int | None = None,
+    fit_asked: bool = False,
+) -> "rrb.Blueprint":
     """Return the layout, which follows the newest sample, with one of its tabs in front.
 
     Parameters
@@ -118,21 +146,29 @@ def blueprint(active_tab: str = TABS[0], *, absent: Collection[str] = ()) -> "rr
         The tab in front.
     absent
         Components of plots that are left out, for nothing of theirs comes.
+    fit_modes
+        As `Subject.fit_modes`.
+    fit_asked
+        Whether a precision of fits may be asked for.
     """
     import rerun.blueprint as rrb
 
-    contents = (
+    contents = [
         _overview(),
         _signals(),
         _frequency_response(),
         _spectrogram(),
         _health(absent),
         _events(),
-    )
-    for tab, name in zip(contents, TABS, strict=True):
+    ]
+    names = list(TABS)
+    if fit_modes is not None:
+        contents.insert(1, _fit(fit_modes, asked=fit_asked))
+        names.insert(1, FIT_TAB)
+    for tab, name in zip(contents, names, strict=True):
         tab.name = name
     return rrb.Blueprint(
-        rrb.Tabs(*contents, active_tab=TABS.index(active_tab)),
+        rrb.Tabs(*contents, active_tab=names.index(active_tab)),
         rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -195,6 +231,19 @@ def _health(absent: Collection[str]) -> "rrb.Container":
     )
 
 
+def _fit(modes: int, *, asked: bool) -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    table = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
+    if modes == 0:
+        return rrb.Vertical(table)
+    return rrb.Horizontal(
+        rrb.Grid(*map(_plot, fit_views(fit_source(modes, asked=asked))), grid_columns=2),
+        table,
+        column_shares=[7, 4],
+    )
+
+
 def _events() -> "rrb.Container":
     import rerun.blueprint as rrb
 
@@ -222,15 +271,22 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
     }
     if plot.span is None:
         visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values(view.ticks)])
-    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-view.window_s)
+    start = (
+        rrb.TimeRangeBoundary.absolute(seconds=0.0)
+        if view.window_s == WHOLE_S
+        else rrb.TimeRangeBoundary.cursor_relative(seconds=-view.window_s)
+    )
     end = rrb.TimeRangeBoundary.cursor_relative()
     return rrb.TimeSeriesView(
         name=plot.title,
         origin=view.source.entity,
         contents=[str(entity) for entity in visualizers],
         overrides=visualizers,
-        # The title says it all where there is but one curve.
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
+        # The title says it all where there is but one curve. Intervals of fits are wide at first.
+        plot_legend=rrb.PlotLegend(
+            corner="RightTop" if view.window_s == WHOLE_S else "LeftTop",
+            visible=len(plot.curves) > 1,
+        ),
         # Left to itself it shows a minute around the cursor, half of it yet to come.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
-from rigd.session import Session, SessionError, Status, touch_line, touches_of
+from rigd.session import Session, SessionError, Status, fit_of, touch_line, touches_of
 from rigd.units import unit_of
 from rigd.view._banner import ended
 from rigd.view._layout import blueprint
@@ -73,7 +73,7 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_within(session, "rate_hz", 1.0, 1e5),
         ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
-        sweep=session.segments.get("sweep", (first, end)),
+        sweep=session.segments.get("scan", session.segments.get("sweep", (first, end))),
         beam=Beam(
             _within(session, "beam_length_m", 1e-3, 1e3),
             _within(session, "beam_density_kg_per_m", 1e-6, 1e3),
@@ -89,6 +89,8 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
         limits=_stated_limits(attached[-1]),
         absent=_absent(session, timings),
         recorded=True,
+        # The fits before the last one are not in the file.
+        fit_modes=None if fit_of(session.outcome) is None else 0,
     )
 
 
@@ -173,7 +175,9 @@ def draw_session(
         As `subject_of_session` does.
     """
     subject = subject_of_session(session, timings)
-    picture = Scene(subject, lambda: recorded_blueprint(front, subject.absent))
+    picture = Scene(
+        subject, lambda: recorded_blueprint(front, subject.absent, fit_modes=subject.fit_modes)
+    )
     outcome = session.outcome or {}
     state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
     picture.state(0, replace(state, over=False))
@@ -207,12 +211,19 @@ def draw_session(
             draw(stream)
         touches = touches[len(drawn) :]
         on_progress(done / len(samples))
-    for draw in (*picture.finish(), *picture.touches(touches)):
+    fit = fit_of(session.outcome)
+    for draw in (
+        *picture.finish(),
+        *picture.touches(touches),
+        *(picture.fit(fit) if fit is not None else ()),
+    ):
         draw(stream)
 
 
 def recorded_blueprint(
-    front: "Sequence[rrb.Container]" = (), absent: Collection[str] = ()
+    front: "Sequence[rrb.Container]" = (),
+    absent: Collection[str] = (),
+    fit_modes: int | None = None,
 ) -> "rrb.Blueprint":
     """Return the layout of the live view, which here is played from the start.
 
@@ -222,10 +233,12 @@ def recorded_blueprint(
         Tabs that stand before those of the live view.
     absent
         Components of plots that are left out.
+    fit_modes
+        As `Subject.fit_modes`.
     """
     import rerun.blueprint as rrb
 
-    live = blueprint(absent=absent)
+    live = blueprint(absent=absent, fit_modes=fit_modes)
     return rrb.Blueprint(
         rrb.Tabs(*front, *live.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),

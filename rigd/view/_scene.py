@@ -12,6 +12,7 @@ from rigd.spectral import RunningSpectrogram
 from rigd.view import _banner
 from rigd.view._antenna import Antenna
 from rigd.view._banner import State, preparing
+from rigd.view._fits import fit_record, fit_source, send_table
 from rigd.view._frequency_charts import (
     LAST_HZ,
     LastResponse,
@@ -20,7 +21,7 @@ from rigd.view._frequency_charts import (
     SweepResponse,
 )
 from rigd.view._gauges import Gauge, Gauges
-from rigd.view._layout import TIME_VIEWS, Scale, blueprint
+from rigd.view._layout import TIME_VIEWS, Scale, blueprint, fit_views
 from rigd.view._plots import HEALTH, READINGS, SIGNALS, Source, send_columns
 from rigd.view._session_info import (
     Health,
@@ -75,7 +76,10 @@ class Scene:
         last: LastResponse | None = None,
     ) -> None:
         self._subject = subject
-        self._layout = layout or partial(blueprint, absent=subject.absent)
+        asked = subject.excitation == "until"
+        self._layout = layout or partial(
+            blueprint, absent=subject.absent, fit_modes=subject.fit_modes, fit_asked=asked
+        )
         last_hz = min(LAST_HZ, subject.rate_hz / 2)
         self._antenna = Antenna(subject)
         self._response = SweepResponse(subject, last_hz)
@@ -90,6 +94,13 @@ class Scene:
         self._samples = _Gathering(subject.rate_hz)
         self._timings = _Gathering(subject.rate_hz)
         self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
+        # With a record of nothing first: a view complains of what it never got.
+        self._fits = [fit_record(None, subject.fit_modes or 0)]
+        self._fit: Mapping[str, Any] | None = None
+        self._fit_source: Source | None = None
+        if subject.fit_modes:
+            source = self._fit_source = fit_source(subject.fit_modes, asked=asked)
+            self._scales[source] = Scale(source, fit_views(source))
         self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
         self._peaks_shown = False
@@ -114,6 +125,7 @@ class Scene:
             self._spectrogram_chart.draw,
             *self._antenna.frame(),
             *(drawing for drawings in self._touches.values() for drawing in drawings),
+            *self._draw_fits(np.concatenate(self._fits)),
             *(partial(send_note, note=note) for note in self._notes),
             self._recent(self._t_ns),
             *self._banner(),
@@ -142,6 +154,12 @@ class Scene:
         drawn = {touch["number"]: self._antenna.touch(touch) for touch in touches}
         self._touches |= drawn
         return [drawing for drawings in drawn.values() for drawing in drawings]
+
+    def fit(self, fit: Mapping[str, Any]) -> list[Drawing]:
+        """Take a fit of the record so far, as JSON documents have it."""
+        self._fit = fit
+        self._fits.append(fit_record(fit, self._subject.fit_modes or 0))
+        return self._draw_fits(self._fits[-1])
 
     def state(self, t_ns: int, state: State) -> list[Drawing]:
         """Take the state of the session; nothing is drawn as long as it stays the same.
@@ -184,6 +202,13 @@ class Scene:
             *self._draw_timings(self._timings.rest()),
             *self._charts(),
         ]
+
+    def _draw_fits(self, records: Records) -> list[Drawing]:
+        if self._subject.fit_modes is None:
+            return []
+        source = self._fit_source
+        plotted = [] if source is None else self._plot(source, records)
+        return [*plotted, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
         if samples is None:

@@ -64,6 +64,9 @@ class Subject:
         Components of plots of which nothing comes, such as the load of a bus that is not there.
     recorded
         The session is played from a file.
+    fit_modes
+        Modes of which fits are plotted over time; 0: only the last fit is shown, as a table; None:
+        the record is not fitted.
     """
 
     name: str
@@ -82,6 +85,7 @@ class Subject:
     thermal_time_constant_s: float = 10.0
     absent: frozenset[str] = frozenset()
     recorded: bool = False
+    fit_modes: int | None = None
 
     def frequency_hz(self, tick: int) -> float | None:
         """Return the present frequency of the sweep; None before, after, or without one.

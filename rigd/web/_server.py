@@ -194,6 +194,8 @@ class PageServer:
             self._take_status(message)
         elif event == "signals":
             self._take_signals(message)
+        elif event == "fit":
+            self._link.ask_for_status()  # which has the last one, for pages opened later too
         elif event == "message":
             self.pages.note(message["level"], message["text"])
         else:
@@ -304,6 +306,7 @@ def _excitations() -> Iterator[tuple[str, list[Document]]]:
                     "default": None if option.default is Parameter.empty else option.default,
                     "help": described.get(option.name, ""),
                 }
+                | ({"text": True} if option.annotation is str else {})
                 for option in signature(function).parameters.values()
                 if option.name not in FROM_THE_RIG
             ],

@@ -118,6 +118,19 @@ def test_a_second_ctrl_c_in_a_session_leaves_it_to_the_daemon(follow):
     assert (ended, sent) == (130, ["stop"])
 
 
+def test_what_is_notable_is_told_and_the_fit_is_in_the_document(follow):
+    told = [
+        {"event": "message", "level": "info", "text": text, "notable": notable}
+        for text, notable in (("  8.0 s 0.910 ± 0.010 %", True), ("Next: mode 1.", False))
+    ]
+    fit = {"duration_s": 9.5, "modes": []}
+    ended, done, _ = follow(*told, session(1) | {"fit": fit}, session(2), series(1, 2), looks=False)
+    said = [each[1] for each in done if each[0] == "say"]
+    assert said[0] == "  8.0 s 0.910 ± 0.010 %"
+    assert not any("Next" in each for each in said)
+    assert [each.get("fit") for each in ended["sessions"]] == [fit, None]
+
+
 @pytest.fixture
 def interrupting_daemon(runtime_folder):
     """A daemon that keeps a start waiting, and presses Ctrl-C once it has it; what it heard."""

@@ -208,6 +208,21 @@ def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, brief_looks):
     assert f"INFO {look['text'][0]}" in said
 
 
+def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
+    serve("--fast")
+    swept = ("--start-hz", "0.5", "--duration", "5", "--rest", "0.5", "--ring-down", "1")
+    code, out, err = ask("start", "chirp", *swept, "--watch-fit", "--json")
+    assert code == 0, err
+    (session,) = json.loads(out)["sessions"]
+    assert [mode["mode"] for mode in session["fit"]["modes"] if mode["shown"]][:2] == [1, 2]
+    told = request("status")["series"]["fit"]
+    assert told["duration_s"] == session["fit"]["duration_s"] == 6.5
+    assert "\n".join(told["text"]) in err
+    code, out, _ = ask_here("status")
+    assert code == 0
+    assert told["text"][0] in out
+
+
 def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")

@@ -36,6 +36,13 @@ def test_a_start_has_the_parameters_of_its_excitation():
     assert request.parameters == {"path": Path("/data/reference.csv")}
 
 
+def test_a_precision_is_asked_for_in_words():
+    parameters = {"targets": "damping 1%; alpha 0.01", "at_most_s": 60.0}
+    assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
+    assert parse(START | {"watch_fit": True}).watch_fit
+    assert not parse(START).watch_fit
+
+
 def test_a_prediction_is_asked_for_as_a_start_is():
     request = parse(START | {"command": "predict", "parameters": {"stop_hz": 20}, "force": True})
     assert (request.parameters, request.force) == ({"stop_hz": 20.0}, True)
@@ -97,6 +104,11 @@ def test_what_is_no_request_is_refused_by_name(line, named):
         ({"excitation": "file", "parameters": {"path": "reference.csv"}}, "absolute"),
         ({"excitation": "file", "parameters": {"path": "/a\u0000b"}}, "path"),
         ({"excitation": "file", "parameters": {"path": "/a\ud800"}}, "path"),
+        ({"excitation": "until"}, "targets is missing"),
+        ({"excitation": "until", "parameters": {"targets": 1}}, "targets = 1 is not plain text"),
+        ({"excitation": "until", "parameters": {"targets": "damping\n1%"}}, "not plain text"),
+        ({"excitation": "until", "parameters": {"targets": "x" * 1001}}, "1000 characters"),
+        ({"watch_fit": 1}, "watch_fit"),
         ({"repeat": 0}, "repeat"),
         ({"repeat": 10_000}, "repeat"),
         ({"repeat": 1.0}, "repeat"),

@@ -91,7 +91,7 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
     for command in (("bash", "-c", script_of(shells)), (sys.executable, "-c", python[0])):
         with start(*command) as process:
             assert_went_well(process)
-    assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 7
+    assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 8
     for report in ("one_look", "another_look"):
         assert (tmp_path / report / "figures" / "welch_frf.png").stat().st_size > 50_000
 

@@ -8,7 +8,8 @@ import pytest
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine._messages import Finished, SessionJob
-from rigd.engine._ring import put_reference, shared_memory_fd
+from rigd.engine._reference import put_reference
+from rigd.engine._ring import shared_memory_fd
 from rigd.engine._shared_state import Phase, Word, read_events
 from rigd.engine._timing import VirtualClock
 from rigd.engine._topics import DESCRIPTORS, create_channels

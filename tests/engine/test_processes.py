@@ -10,7 +10,8 @@ import pytest
 
 from rigd.engine._ipc import Child, ChildError
 from rigd.engine._messages import Ended, MessageReader, Ready, SessionJob, encode
-from rigd.engine._ring import map_reference, put_reference, shared_memory_fd
+from rigd.engine._reference import map_reference, put_reference
+from rigd.engine._ring import shared_memory_fd
 from rigd.excitation._signals import MAX_TICKS
 from rigd.profile import load_profile
 

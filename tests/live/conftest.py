@@ -145,11 +145,12 @@ class Publisher:
         name: str = "chirp under test",
         begins: tuple[int, ...] | None = None,
         folder: Path | None = None,
+        **members: object,
     ) -> None:
         """Have it show a session; `begins` says how many records were written before it."""
         begins = begins or (0,) * len(TOPICS)
         ticks = 120_000
-        subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3))
+        subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3), **members)
         self.send(LiveSession(subject, f"recording of {name}", begins, folder))
         self._hear(LiveShown)
 

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
 from rigd.engine._messages import Failed, MessageReader
 from rigd.engine._shared_state import Word
 from rigd.live._address import LiveAddress, find
-from rigd.live._ring_reader import LiveJob
+from rigd.live._ring_reader import LiveFit, LiveJob
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
@@ -93,6 +94,27 @@ def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
     assert dropped[-1, 1] == 0
     assert publisher.dropped == 0
     assert producer.refused == 0
+
+
+def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publisher, save):
+    publisher.show("fitted", fit_modes=2, excitation="until")
+    saver = save(publisher.address)
+    fits = online_fit(0.4, 2.0), online_fit(0.8)
+    for fit in fits:
+        publisher.send(LiveFit(fit))
+    assert eventually(saver.has_begun)
+    publisher.producer.stop()
+    publisher.finish()
+    assert eventually(saver.has_all)
+    publisher.end()
+    columns = saver.recordings()["recording of fitted"]
+    # A connection that comes in between gets them again.
+    time_ns, damping = columns("/fits", "damping_1_percent")
+    last = damping[np.argmax(time_ns)]
+    assert set(time_ns.tolist()) >= {400_000_000, 800_000_000}
+    assert last[2:] == pytest.approx([0.91 - 0.0196, 0.91 + 0.0196, 0.91])
+    _, lines = columns("/events", "TextLog:text")
+    assert [fit["text"][0] in [text for (text,) in lines] for fit in fits] == [True, True]
 
 
 def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):

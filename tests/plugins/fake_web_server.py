@@ -29,6 +29,10 @@ EXCITATIONS = {
     ],
     "hold": [{"name": "duration_s", "unit": "s", "default": 10.0, "help": "Duration."}],
     "file": [{"name": "path", "unit": "", "default": None, "help": "CSV file."}],
+    "until": [
+        {"name": "targets", "unit": "", "default": None, "help": "What is asked.", "text": True},
+        {"name": "at_most_s", "unit": "s", "default": 120.0, "help": "Longest record."},
+    ],
 }
 
 

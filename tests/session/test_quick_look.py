@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from library_folders import mode, quantity
+from online_fits import online_fit
 
-from rigd.session import last_look, look_path, modes_of, read_look
+from rigd.session import fit_of, last_look, look_path, modes_of, read_look
+from rigd.view._fits import fit_table
 
 RESPONSE = {
     "frequency_hz": [1.0, 2.0],
@@ -133,3 +135,30 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     assert last("") == "none.mcap"
     assert last("C") is None
     assert last_look(tmp_path / "missing", "A", usable=bool) is None
+
+
+def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():
+    fit = online_fit(9.5, third="doubtful")
+    found = fit_of({"fit": json.dumps(fit)})
+    assert found["duration_s"] == 9.5
+    assert [each["mode"] for each in found["modes"]] == [1, 2, 3]
+    assert found["modes"][2]["damping_ratio"]["flag"] == "It depends on the structure."
+    assert found["parameters"].keys() == fit["parameters"].keys()
+    assert [each["std"] for each in found["search"]["targets"]] == [1e-4, None]
+    assert fit_of(None) is None
+    assert fit_of({"outcome": "complete"}) is None
+
+
+@given(
+    st.recursive(
+        st.none() | st.floats() | st.text(),
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(st.sampled_from([*online_fit(), "name", "asked_std"]), inner)
+        ),
+    )
+)
+def test_anything_else_in_its_place_is_no_fit_or_one_without_it(found):
+    for content in (found, online_fit() | found if isinstance(found, dict) else found):
+        fit = fit_of({"fit": json.dumps(content)})
+        assert fit is None or fit_table(fit)

@@ -88,6 +88,8 @@ def test_a_page_that_opens_is_told_of_rig_state_and_model(served, pages):
     assert chirp["amplitude_rad"] == {
         "name": "amplitude_rad", "unit": "rad", "default": 0.025, "help": "Amplitude A.",
     }  # fmt: skip
+    (targets, *_) = hello["excitations"]["until"]
+    assert (targets["name"], targets["text"]) == ("targets", True)
     assert all(option["help"] for kind in hello["excitations"].values() for option in kind)
     assert set(hello["excitations"]) == set(KINDS)
 

@@ -17,6 +17,7 @@ from fake_web_server import (
     status,
     strip,
 )
+from online_fits import online_fit
 from playwright.sync_api import expect
 
 
@@ -93,6 +94,69 @@ def test_each_excitation_has_its_own_parameters_with_units(page):
     page.select_option("#excitation", "hold")
     assert page.locator("#parameters input").count() == 1
     assert page.input_value("#parameter-duration_s") == "10"
+
+
+def test_a_precision_is_asked_for_in_words(server, page):
+    page.select_option("#excitation", "until")
+    assert not page.is_visible("#watch-fit")  # it is fitted anyway
+    page.fill("#parameter-targets", "damping 1%; alpha 0.01")
+    server.replies["start"] = {"series": 1, "plan": PLAN}
+    page.click("#start-button")
+    says(page, "#prediction", "Predicted peaks")
+    request = {"targets": "damping 1%; alpha 0.01", "at_most_s": 120}
+    assert (server.requests[0]["excitation"], server.requests[0]["parameters"]) == (
+        "until", request,
+    )  # fmt: skip
+    assert "watch_fit" not in server.requests[0]
+
+
+def test_the_record_of_any_excitation_can_be_fitted(server, page):
+    server.replies["start"] = {"series": 1, "plan": PLAN}
+    page.check("#watch-fit")
+    page.click("#start-button")
+    says(page, "#prediction", "Predicted peaks")
+    assert server.requests[0]["watch_fit"] is True
+
+
+def series(fit, **members):
+    return {
+        "series": 1, "excitation": "until", "session": 1, "repeat": 1, "notes": {}, "plan": PLAN,
+        "path": "/data/sessions/1.mcap", "running": True, "stopped": False, "failed": False,
+        "reason": "", "fit": fit, "sessions": [], **members,
+    }  # fmt: skip
+
+
+def width(page, cell):
+    """Width of the bar that stands for an interval."""
+    return page.locator(f"{cell} .fill").bounding_box()["width"]
+
+
+def test_modes_and_what_is_asked_for_are_shown_as_fits_come(server, page):
+    assert not page.is_visible("#fit")
+    server.tell(status("running", series=series(None)))
+    says(page, "#fit-of", "not yet")
+    server.tell(status("running", series=series(online_fit(6.0, 4.0))))
+    says(page, "#fit-of", "first 6.0 s of the record")
+    says(page, "#fit-search", "About 12 s more.")
+    cell = "#fit-modes tbody tr:nth-child(1) td:nth-child(3)"
+    says(page, cell, "0.910 ± 0.078")
+    widest = width(page, cell)
+    asked = "#fit-targets tbody tr:nth-child(1)"
+    says(page, asked, "0.00040 (4.4 %)")
+    says(page, asked, "5 %")
+    says(page, "#fit-targets tbody tr:nth-child(2)", "damping of mode 3")
+    assert page.locator("#fit-modes tbody tr").count() == 2  # the third is not visible yet
+    server.tell(status("running", series=series(online_fit(8.0, 0.8, third="doubtful"))))
+    says(page, cell, "0.910 ± 0.016")
+    assert width(page, cell) == pytest.approx(0.2 * widest, rel=0.05)
+    says(page, f"{asked} .reached", "100 %")
+    says(page, "#fit-modes tbody tr:nth-child(3)", "0.990 (doubtful)")
+    says(page, "#fit-result", "A disturbance at 50 Hz was modelled.")
+    ended = online_fit(9.0, search=False) | {"search": {"reason": "Reached: <all>."}}
+    server.tell(status(series=series(ended, running=False)))
+    says(page, "#fit-search", "Reached: <all>.")
+    server.tell(status(series=series(None, excitation="hold", path="/data/sessions/2.mcap")))
+    expect(page.locator("#fit")).to_be_hidden()
 
 
 def test_a_value_that_is_no_number_is_told_and_not_sent(server, page):

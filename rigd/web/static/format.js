@@ -95,6 +95,17 @@ const decimalsOf = (std, digit) =>
   Math.min(8, Math.max(digit - 1 - Math.floor(Math.log10(std)), 0));
 
 /**
+ * A number with half the width of its interval, to the second digit of that.
+ * @param {number} value
+ * @param {number} half
+ */
+export function withHalfWidth(value, half) {
+  if (!(half > 0)) return digits(value, 5);
+  const decimals = decimalsOf(half, 2);
+  return minus(`${value.toFixed(decimals)} ± ${half.toFixed(decimals)}`);
+}
+
+/**
  * An estimate with its 95 % interval.
  * @param {{value: number, std: number|null, interval_95: number[]|null}} found
  * @param {number} factor - such as 100 for per cent

@@ -2,6 +2,7 @@
 
 import { Bar } from "./bar.js";
 import { Events } from "./events.js";
+import { Fit } from "./fit.js";
 import { useUnits } from "./format.js";
 import { Gauges } from "./gauges.js";
 import { Link } from "./link.js";
@@ -13,7 +14,7 @@ import { Strips } from "./strips.js";
 
 const link = new Link();
 link.on("hello", ({ units }) => useUnits(units));
-for (const Part of [Bar, Gauges, Strips, LiveResponse, StartForm, Rig, Sessions, Events]) {
+for (const Part of [Bar, Gauges, Strips, Fit, LiveResponse, StartForm, Rig, Sessions, Events]) {
   new Part(link);
 }
 link.connect();

@@ -5,6 +5,10 @@ import { unitOf, wordsOf } from "./format.js";
 import { Prediction } from "./prediction.js";
 
 const OPERATOR = "rigd-operator";
+const PLACEHOLDERS = {
+  path: "/absolute/path, read by the daemon",
+  targets: "damping 1%; frequency 2:0.01%; alpha 0.01",
+};
 
 export class StartForm {
   #link;
@@ -65,18 +69,19 @@ export class StartForm {
     const fields = (this.#excitations[byId("excitation").value] ?? []).map((parameter) =>
       this.#field(parameter));
     byId("parameters").replaceChildren(...fields);
+    show(byId("watch-fit-choice"), byId("excitation").value !== "until");  // which is fitted anyway
     this.#prediction.clear();
     byId("start-result").replaceChildren();
   }
 
-  #field({ name, unit, default: usual, help }) {
-    const isText = name === "path";
+  #field({ name, unit, default: usual, help, text = false }) {
+    const isText = text || name === "path";
     const known = usual !== null && usual !== undefined;
     const input = make("input", {
       id: `parameter-${name}`, value: known ? String(usual) : "", title: help ?? "",
       inputMode: isText ? "text" : "decimal",
     });
-    if (isText) input.placeholder = "/absolute/path, read by the daemon";
+    if (isText) input.placeholder = PLACEHOLDERS[name] ?? "";
     input.addEventListener("change", () => this.#parsed(name));
     this.#inputs.set(name, { input, isText, unit: unit || unitOf(name) });
     return make("label", { class: isText ? "field wide" : "field", title: known
@@ -159,7 +164,9 @@ export class StartForm {
     }
     if (Object.keys(meta).length) notes.meta = meta;
     const force = byId("force").checked;
-    return { excitation: byId("excitation").value, parameters, repeat, notes, force };
+    const excitation = byId("excitation").value;
+    const watch = byId("watch-fit").checked && excitation !== "until" ? { watch_fit: true } : {};
+    return { excitation, parameters, repeat, notes, force, ...watch };
   }
 
   async #predict() {

@@ -1,0 +1,306 @@
+"""Sessions that end themselves, on simulated rigs that are not what their profile says.
+
+Each rig has a beam whose density and stiffness differ from the profile's by up to a fifth, one of
+the seven structures of damping with modes of 0.1 to 3 %, torque noise of 3 to 20 mN·m, and some a
+clamp that gives way or a mass at the tip. It is asked for the damping of its modes as precisely as
+a chirp of 136 s would tell it within the same range of slopes, by ``rigd run until --fast`` as an
+operator types it, and what it says is compared with the truth.
+
+    python benchmarks/bench_until.py --rigs 100 --jsonl results.jsonl
+    python benchmarks/bench_until.py --table results.jsonl
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify import Plant, mode_poles
+from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping, modes, tip_motion
+from rigd.excitation import BeamEstimate, chirp, information, parse_target
+from rigd.excitation._targets import Quantities
+from rigd.profile import load_profile
+
+Real = NDArray[np.float64]
+
+RATE_HZ = 1000.0
+STRUCTURES = {
+    "I": "i", "II": "e", "III": "ie", "IV": "I", "V": "E", "VI": "IE", "VII": "iE",
+}  # fmt: skip
+"""Types of damping: internal and external, in capitals those of a fractional order."""
+BAND_HZ = 50.0
+PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """What a simulated rig is."""
+
+    number: int
+    structure: str
+    density_ratio: float
+    stiffness_ratio: float
+    zeta: float
+    alpha: float
+    gamma: float
+    lambda_: float
+    noise_nm: float
+    clamp_compliance_rad_per_nm: float = 0.0
+    tip_mass_kg: float = 0.0
+
+    @property
+    def damping(self) -> Damping:
+        """Damping of its beam."""
+        return Damping(self.zeta, self.alpha, self.gamma, self.lambda_)
+
+    def beam(self) -> Beam:
+        """Its beam, without clamp and tip mass."""
+        stated = load_profile("sim").rig.beam
+        return replace(
+            stated,
+            density_kg_per_m=self.density_ratio * stated.density_kg_per_m,
+            bending_stiffness_n_m2=self.stiffness_ratio * stated.bending_stiffness_n_m2,
+        )
+
+    def truth(self) -> dict[str, dict[str, float]]:
+        """Frequencies and damping ratios of the modes in the band."""
+        plant = Plant(
+            self.beam(),
+            self.damping,
+            root_compliance_rad_per_nm=self.clamp_compliance_rad_per_nm,
+            tip_mass_kg=self.tip_mass_kg,
+        )
+        found = {}
+        for pole in mode_poles(plant, 4, ()):
+            frequency_hz = pole.at_rad_s.imag / (2 * np.pi)
+            if 0 < frequency_hz < BAND_HZ:
+                found[f"frequency {pole.mode}"] = frequency_hz
+                found[f"damping {pole.mode}"] = -pole.at_rad_s.real / abs(pole.at_rad_s)
+        return found
+
+
+def draw(number: int, seed: int) -> Rig:
+    """Draw a rig whose modes have 0.1 to 3 % damping."""
+    rng = np.random.default_rng([seed, number])
+    structure = list(STRUCTURES)[number % len(STRUCTURES)]
+    kinds = STRUCTURES[structure]
+    while True:
+        density, stiffness = rng.uniform(0.8, 1.2, 2)
+        alpha = rng.uniform(0.6, 0.95) if "I" in kinds else 1.0
+        lambda_ = rng.uniform(0.3, 0.9) if "E" in kinds else 1.0
+        zeta = 10 ** rng.uniform(-6, -2.5) if kinds.lower().startswith("i") else 0.0
+        gamma = 10 ** rng.uniform(-3, 0) if kinds.lower().endswith("e") else 0.0
+        rig = Rig(
+            number, structure, density, stiffness, zeta, alpha, gamma, lambda_,
+            noise_nm=float(np.exp(rng.uniform(np.log(3e-3), np.log(20e-3)))),
+        )  # fmt: skip
+        found = [mode for mode in modes(rig.beam(), rig.damping, 3) if mode.frequency_hz > 0]
+        if len(found) == 3 and all(1e-3 < mode.damping_ratio < 3e-2 for mode in found):
+            break
+    extra = rng.integers(5)
+    if extra == 0:
+        rig = replace(rig, clamp_compliance_rad_per_nm=float(rng.uniform(5e-3, 3e-2)))
+    elif extra == 1:
+        rig = replace(rig, tip_mass_kg=float(rng.uniform(2e-5, 2e-4)))
+    return rig
+
+
+def asked(rig: Rig) -> float:
+    """Relative standard deviation of the worst mode's damping after the chirp of 136 s.
+
+    Its amplitude is the paper's, lower where the tip's slope would leave the range that pieces keep
+    to.
+    """
+    beam, damping = rig.beam(), rig.damping
+    angle_rad = chirp(rate_hz=RATE_HZ).reference_rad
+    slope = tip_motion(beam, damping, angle_rad, RATE_HZ).slope_rad
+    angle_rad = angle_rad * min(1.0, 0.9 * SMALL_SLOPE_RAD / slope)
+    free = {"zeta": rig.zeta, "alpha": rig.zeta, "gamma": rig.gamma, "lambda": rig.gamma}
+    estimate = BeamEstimate(
+        beam=beam,
+        damping=damping,
+        names=(
+            *(name for name, there in free.items() if there),
+            "density_over_stiffness",
+            "bending_stiffness_n_m2",
+            "delay_s",
+        ),
+        noise_frequency_hz=np.array([1.0]),
+        noise_nm2_per_hz=np.array([2 * rig.noise_nm**2 / RATE_HZ]),
+    )
+    covariance = np.linalg.inv(information(angle_rad, estimate, RATE_HZ))
+    told = Quantities.of([parse_target("damping", "100%")], estimate).precisions(covariance)
+    return max(each.std / each.value for each in told)
+
+
+def profile_of(rig: Rig, folder: Path) -> Path:
+    """Write the profile of a rig: the shipped one, with another simulation."""
+    text = PROFILE.read_text("utf-8")
+    for key, value in (
+        ("torque_noise_nm", rig.noise_nm), ("rest_torque_nm", 2.5 * rig.noise_nm),
+        ("zeta", rig.zeta), ("alpha", rig.alpha), ("gamma", rig.gamma), ("lambda", rig.lambda_),
+    ):  # fmt: skip
+        text, count = re.subn(rf"(?m)^({key} = \{{ value = )[^,]+", rf"\g<1>{value!r}", text)
+        assert count == 1, key
+    more = {
+        "density_ratio": rig.density_ratio,
+        "stiffness_ratio": rig.stiffness_ratio,
+        "clamp_compliance_rad_per_nm": rig.clamp_compliance_rad_per_nm,
+        "tip_mass_kg": rig.tip_mass_kg,
+    }
+    lines = [f'{k} = {{ value = {float(v)!r}, source = "assumed" }}' for k, v in more.items() if v]
+    text = text.replace("[simulation]\n", "[simulation]\n" + "\n".join(lines) + "\n")
+    path = folder / f"rig{rig.number}.toml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def run(rig: Rig, at_most_s: float, options: list[str]) -> dict[str, Any]:
+    """Run a session on a rig, and return what came of it."""
+    share = asked(rig)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        command = [
+            str(Path(sys.executable).with_name("rigd")), "run", "until",
+            "--damping", f"{100 * share:.4g}%", "--at-most", str(at_most_s), "--fast", "--no-look",
+            "--json", "--seed", str(rig.number), "--profile", str(profile_of(rig, folder)),
+            "--output", name, *options,
+        ]  # fmt: skip
+        environment = os.environ | {"XDG_RUNTIME_DIR": name}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+        try:
+            [session] = json.loads(done.stdout)["sessions"]
+        except (ValueError, KeyError):
+            return {"rig": asdict(rig), "asked": share, "failed": done.stderr[-2000:]}
+    fit = session["fit"]
+    return {
+        "rig": asdict(rig),
+        "asked": share,
+        "duration_s": session["recorded"] / RATE_HZ,
+        "outcome": session["outcome"],
+        "reason": session["reason"],
+        "search": fit["search"],
+        "modes": fit["modes"],
+        "parameters": fit.get("parameters", {}),
+        "findings": fit.get("findings", []),
+        "type": fit.get("type"),
+        "course": [line for line in done.stderr.splitlines() if re.match(r" *[\d.]+ s ", line)],
+    }
+
+
+# What came of them
+
+
+def intervals(result: dict[str, Any]) -> Iterator[tuple[str, float, float, float, float]]:
+    """Yield quantity, truth, value, and the ends of each interval without a flag."""
+    rig = Rig(**result["rig"])
+    truth = rig.truth()
+    for mode in result["modes"]:
+        for key, name in (("frequency_hz", "frequency"), ("damping_ratio", "damping")):
+            told = mode[key]
+            true = truth.get(f"{name} {mode['mode']}")
+            if mode["shown"] and true is not None and not told["flag"] and told["interval_95"]:
+                yield f"{name} {mode['mode']}", true, told["value"], *told["interval_95"]
+    values = {"zeta": rig.zeta, "alpha": rig.alpha, "gamma": rig.gamma, "lambda": rig.lambda_}
+    there = {"zeta": rig.zeta, "alpha": rig.zeta, "gamma": rig.gamma, "lambda": rig.gamma}
+    for name, told in result["parameters"].items():
+        if there.get(name) and told["interval_95"] and not told["flag"]:
+            yield name, values[name], told["value"], *told["interval_95"]
+
+
+def table(results: list[dict[str, Any]]) -> Iterator[str]:
+    """Write times, coverage and bias."""
+    failed = [each for each in results if "failed" in each]
+    done = [each for each in results if "failed" not in each]
+    reached = [each for each in done if each["search"]["reached"]]
+    times = np.array([each["duration_s"] for each in reached])
+    yield f"{len(results)} rigs, {len(failed)} failed, {len(reached)} reached what was asked"
+    if times.size:
+        shares = " ".join(f"{p} %: {np.percentile(times, p):.1f} s" for p in (10, 50, 90, 100))
+        yield f"time to it: {shares}; asked {', '.join(_asked(reached))}"
+    for each in done:
+        if not each["search"]["reached"]:
+            rig = each["rig"]
+            yield (
+                f"  rig {rig['number']} (type {rig['structure']}, {1e3 * rig['noise_nm']:.0f} mN·m,"
+                f" {each['duration_s']:.0f} s): {each['search']['reason']}"
+            )
+    ratios = np.array(list(predicted(done)))
+    if ratios.size:
+        low, median, high = np.percentile(ratios, (10, 50, 90))
+        yield (
+            f"stated over expected deviations: median {median:.2f}, 80 % from {low:.2f} to "
+            f"{high:.2f} ({ratios.size})"
+        )
+    for kinds in (("damping",), ("frequency",), ("zeta", "alpha", "gamma", "lambda")):
+        scores, hits = [], []
+        for each in done:
+            for name, true, value, low, high in intervals(each):
+                if name.split()[0] in kinds:
+                    hits.append(low <= true <= high)
+                    scores.append((value - true) / ((high - low) / 3.92))
+        if hits:
+            yield (
+                f"{' '.join(kinds)}: {sum(hits)} of {len(hits)} intervals hold the truth "
+                f"({100 * np.mean(hits):.1f} %), bias {np.mean(scores):+.2f} std, "
+                f"scatter {np.std(scores):.2f}, worst {max(map(abs, scores)):.1f}"
+            )
+
+
+def predicted(results: list[dict[str, Any]]) -> Iterator[float]:
+    """Yield what fits state over what was expected of the piece before."""
+    for each in results:
+        pieces = [piece for piece in each["search"]["pieces"] if "expected" in piece]
+        # A decision rests on the samples up to the beginning of the piece before.
+        for piece, later in zip(pieces, pieces[2:], strict=False):
+            for one in piece["expected"]:
+                if later["stated"].get(one["name"]):
+                    yield later["stated"][one["name"]] / one["std"]
+
+
+def _asked(results: list[dict[str, Any]]) -> Iterator[str]:
+    shares = [100 * each["asked"] for each in results]
+    for name, value in zip(
+        ("least", "median", "most"), np.percentile(shares, (0, 50, 100)), strict=True
+    ):
+        yield f"{name} {value:.2g} %"
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rigs", type=int, default=7)
+    parser.add_argument("--first", type=int, default=0, help="number of the first rig")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--at-most", type=float, default=120.0)
+    parser.add_argument("--jsonl", type=Path, help="where each result is added")
+    parser.add_argument("--table", type=Path, help="show what is there, run nothing")
+    parser.add_argument("options", nargs="*", help="more options of rigd run until, after --")
+    chosen = parser.parse_args()
+    results = []
+    if chosen.table:
+        results = [json.loads(line) for line in chosen.table.read_text("utf-8").splitlines()]
+    else:
+        for number in range(chosen.first, chosen.first + chosen.rigs):
+            result = run(draw(number, chosen.seed), chosen.at_most, chosen.options)
+            results.append(result)
+            if chosen.jsonl:
+                with chosen.jsonl.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(result) + "\n")
+            said = result.get("failed") or f"{result['duration_s']:.1f} s, {result['reason']}"
+            print(f"rig {number}: asked {100 * result['asked']:.2g} %, {said}", flush=True)
+    print("\n".join(table(results)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""Sessions that go on until a precision is reached: what is asked, and the scan they begin with.
+
+The reference of such a session is planned up to the end of a quick sweep over all modes. What
+follows is planned while it runs, from what the record has told by then (`_experiment_design`).
+"""
+
+from dataclasses import dataclass
+from math import pi
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import SMALL_SLOPE_RAD
+from rigd.excitation._moves import quintic
+from rigd.excitation._narrow_sweeps import SHARE_OF_LIMITS
+from rigd.excitation._signals import (
+    Excitation,
+    ExcitationError,
+    frequency,
+    lay_out_segments,
+    positive,
+    within_a_turn,
+)
+from rigd.excitation._targets import QUANTITIES, Target, parse_target
+
+Real = NDArray[np.float64]
+
+PAUSE_S: Final = 0.5
+"""Pause in which a fit is made, such as the first: it tells as much as the beam still rings."""
+_FADE_S: Final = 0.25
+_FIRST_SHARE: Final = 0.25
+"""Amplitude at the beginning of the scan over that at its end: low modes swing farthest."""
+_EXAMPLE: Final = "--damping 1%"
+
+
+class ScanRig(Protocol):
+    """What a scan may know of the rig."""
+
+    def share_of_limits(self, reference_rad: Real) -> float:
+        """Largest share of a limit that a reference (n,) is predicted to take."""
+
+    def tip_slope_rad(self, reference_rad: Real) -> float:
+        """Largest slope of the free end that is predicted for a reference (n,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PrecisionSearch:
+    """What a session goes on for.
+
+    Attributes
+    ----------
+    targets
+        Standard deviations to be reached.
+    planned_ticks
+        Ticks of the reference that are planned before the session: rest, scan and a pause.
+    scan
+        First tick of the scan, and its reference, shape (n,).
+    tip_slope_rad
+        Largest slope of the beam's free end.
+    """
+
+    targets: tuple[Target, ...]
+    planned_ticks: int
+    scan: tuple[int, Real]
+    tip_slope_rad: float
+
+
+def until(
+    *,
+    rate_hz: float,
+    targets: str,
+    at_most_s: float = 120.0,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
+    amplitude_rad: float = 0.05,
+    start_hz: float = 0.5,
+    stop_hz: float = 52.0,
+    scan_s: float = 5.0,
+    rest_s: float = 1.0,
+    rig: ScanRig | None = None,
+) -> Excitation:
+    """Scan all modes quickly, then excite what tells most until a precision is reached.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    targets
+        Standard deviations to be reached: one or several of ``QUANTITY STD``, such as
+        ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.parse_target`.
+    at_most_s
+        Longest record.
+    tip_slope_rad
+        Largest slope of the beam's free end, of which 90 % are used. Beyond the default, the linear
+        model is not exact.
+    amplitude_rad
+        Amplitude at the end of the scan, a quarter of it at its beginning; lower where the rig's
+        limits or the slope ask for it.
+    start_hz, stop_hz
+        Band of the scan.
+    scan_s
+        Duration of the scan.
+    rest_s
+        Time before it.
+    rig
+        Limits the amplitude; without it, it is not limited.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not what it should be.
+
+    Examples
+    --------
+    >>> from rigd.excitation import until
+    >>> session = until(rate_hz=1000, targets="damping 1%", at_most_s=60)
+    >>> session.search.planned_ticks, session.reference_rad.size
+    (6500, 60000)
+    """
+    asked = _parsed(targets)
+    positive("at_most_s", at_most_s, "s")
+    positive("amplitude_rad", amplitude_rad, "rad")
+    within_a_turn("amplitude_rad", amplitude_rad)
+    positive("tip_slope_rad", tip_slope_rad, "rad")
+    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    frequency("stop_hz", stop_hz, rate_hz)
+    segments = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
+    first, end = segments["sweep"]
+    if scan_s < 2 * _FADE_S:
+        raise ExcitationError(
+            f"scan_s = {scan_s:g} s is too short for fades of {_FADE_S:g} s at both ends; choose "
+            f"at least {2 * _FADE_S:g} s."
+        )
+    planned_ticks = end + round(PAUSE_S * rate_hz)
+    ticks = round(at_most_s * rate_hz)
+    if ticks < planned_ticks:
+        raise ExcitationError(
+            f"at_most_s = {at_most_s:g} s is too short for rest, scan and pause; choose at least "
+            f"{planned_ticks / rate_hz:g} s."
+        )
+    scan_rad = np.zeros(end)
+    scan_rad[first:] = amplitude_rad * _rising_chirp(end - first, rate_hz, start_hz, stop_hz)
+    if rig is not None:
+        share = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
+        if share > SHARE_OF_LIMITS:
+            amplitude_rad *= SHARE_OF_LIMITS / share
+            scan_rad *= SHARE_OF_LIMITS / share
+    reference_rad = np.zeros(ticks)
+    reference_rad[: scan_rad.size] = scan_rad
+    reference_rad.flags.writeable = False
+    return Excitation(
+        kind="until",
+        parameters={
+            "targets": targets,
+            "at_most_s": at_most_s,
+            "tip_slope_rad": tip_slope_rad,
+            "amplitude_rad": amplitude_rad,
+            "start_hz": start_hz,
+            "stop_hz": stop_hz,
+            "scan_s": scan_s,
+            "rest_s": rest_s,
+        },
+        rate_hz=rate_hz,
+        reference_rad=reference_rad,
+        # The sweep goes on for as long as it takes.
+        segments={
+            "rest": (0, first),
+            "scan": (first, end),
+            "sweep": (first, ticks),
+        },
+        search=PrecisionSearch(asked, planned_ticks, (first, scan_rad[first:]), tip_slope_rad),
+    )
+
+
+def _rising_chirp(n: int, rate_hz: float, start_hz: float, stop_hz: float) -> Real:
+    """Linear sweep whose amplitude rises to 1, (n,); at rest at both ends."""
+    t = np.arange(n) / rate_hz
+    phase = 2.0 * pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2.0 * n / rate_hz))
+    size = np.linspace(_FIRST_SHARE, 1.0, n)
+    fade = quintic(_FADE_S, rate_hz)
+    size[: fade.size] *= fade
+    size[n - fade.size :] *= 1.0 - fade
+    sweep: Real = size * np.sin(phase)
+    return sweep
+
+
+def _parsed(targets: str) -> tuple[Target, ...]:
+    """Read all that is asked."""
+    asked = []
+    for text in targets.split(";"):
+        if text.strip():
+            quantity, _, size = text.strip().partition(" ")
+            asked.append(parse_target(quantity, size))
+    if not asked:
+        raise ExcitationError(
+            f"No precision is asked for; give that of one or more of {', '.join(QUANTITIES)}, such "
+            f"as {_EXAMPLE}."
+        )
+    return tuple(asked)

@@ -1,0 +1,241 @@
+"""Fits of a running session: what its fit process tells, and what follows for the session."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from rigd.engine import (
+    FIT,
+    ChildError,
+    Event,
+    Failed,
+    FileHeader,
+    FitJob,
+    FitReady,
+    FitTold,
+    PieceTold,
+    Pulse,
+    RecordEnded,
+    SearchEnded,
+    Stop,
+    Word,
+)
+from rigd.runner._precision_search import in_words, stated, targets_json
+
+if TYPE_CHECKING:
+    from rigd.engine import ReferenceSpec
+    from rigd.excitation import PrecisionSearch
+    from rigd.profile import Profile, RealtimeSettings
+    from rigd.runner._process_group import ProcessGroup
+
+_READY_PATIENCE_S: Final = 20.0
+"""Time for the process to start on a busy computer; nothing moves yet."""
+_LAST_PATIENCE_S: Final = 60.0
+"""Time for the fit of the whole record, when the torque is off; a stop skips it."""
+_STOP_PATIENCE_S: Final = 5.0
+_POLL_S: Final = 0.05
+_KEPT: Final = (
+    "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "modes",
+    "parameters",
+)  # fmt: skip
+"""What of the last estimate goes into the file; the rest is what pieces are designed from."""
+
+
+class OnlineFit:
+    """What the fit process tells of one session.
+
+    A session that goes on until a precision is reached ends with its last piece: when the process
+    says so, and when the process is lost.
+
+    Parameters
+    ----------
+    crew
+        Processes of the rig, their memory laid out.
+    profile
+        Profile of the rig.
+    reference
+        Reference of the session.
+    search
+        What the session goes on for; None: its reference is given.
+    realtime
+        Where the loop runs; None: not in real time.
+
+    Attributes
+    ----------
+    segments
+        Segments of the record that were planned while it ran.
+    shortcoming
+        What is missing of the precision that was asked for, once the record is fitted; empty if
+        nothing is.
+    """
+
+    def __init__(
+        self,
+        crew: "ProcessGroup",
+        profile: "Profile",
+        reference: "ReferenceSpec",
+        search: "PrecisionSearch | None",
+        realtime: "RealtimeSettings | None" = None,
+    ) -> None:
+        self._crew = crew
+        self._board = crew.channels.board
+        self._search = search
+        self._events: list[Event] = []
+        self._news: list[Mapping[str, Any]] = []
+        self._pieces: list[Mapping[str, Any]] = []
+        self._told: FitTold | None = None
+        self._ended: SearchEnded | None = None
+        self._ready = self._begun = False
+        self._lost = ""
+        self._pulse = Pulse()
+        self.segments: Mapping[str, tuple[int, int]] = {}
+        self.shortcoming = ""
+        first = crew.channels.samples.written
+        job = FitJob(crew.channels.specs, first, profile, reference, search, realtime)
+        try:
+            crew.fresh(FIT).start(job)
+        except ChildError as error:
+            self._lose(str(error))
+
+    def await_ready(self, meanwhile: Callable[[], bool]) -> str:
+        """Wait until the process can fit; return why it cannot, or nothing.
+
+        Parameters
+        ----------
+        meanwhile
+            Called some times a second; says whether to go on waiting.
+        """
+        deadline_s = time.monotonic() + _READY_PATIENCE_S
+        while not (self._ready or self._lost) and meanwhile():
+            self._listen(_POLL_S)
+            if time.monotonic() > deadline_s:
+                self._lose(f"The fit process was not ready within {_READY_PATIENCE_S:g} s.")
+        return self._lost
+
+    def begin(self, header: FileHeader) -> None:
+        """Tell what the file says of the session, before its record begins."""
+        self._begun = True
+        self._send(header)
+
+    def attend(self) -> list[Event]:
+        """Take what has come, and return what the operator is to be told."""
+        self._listen(0.0)
+        if self._ready and not self._lost:
+            self._feel_pulse()
+        events, self._events = self._events, []
+        return events
+
+    def _feel_pulse(self) -> None:
+        """End a process that hangs."""
+        assert FIT.hung_after_s is not None
+        still_s = self._pulse.look(self._board[Word.FIT_BEAT], time.monotonic())
+        if still_s > FIT.hung_after_s:
+            self._crew[FIT].kill()
+            self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
+
+    def news(self) -> list[Mapping[str, Any]]:
+        """Return the estimates that came since the last time, for the live view."""
+        news, self._news = self._news, []
+        return news
+
+    def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
+        """Wait for the fit of the whole record; return what is known as a JSON document.
+
+        Parameters
+        ----------
+        ticks
+            Ticks that were scheduled.
+        meanwhile
+            Called some times a second.
+        """
+        self._send(RecordEnded(ticks))
+        begun_s = time.monotonic()
+        while self._begun and not (self._lost or (self._told is not None and self._told.final)):
+            self._listen(_POLL_S)
+            meanwhile()
+            if self._board[Word.STOP] != Stop.NO and time.monotonic() > begun_s + _STOP_PATIENCE_S:
+                break
+            if time.monotonic() > begun_s + _LAST_PATIENCE_S:
+                self._lose("The fit of the whole record took too long.")
+        told = {} if self._told is None else self._told.document
+        document = {key: told[key] for key in _KEPT if key in told}
+        if self._search is not None:
+            self.shortcoming = self._judge(document)
+            document["search"] = {
+                "asked": [str(target) for target in self._search.targets],
+                "targets": targets_json(stated(document, self._search.targets))
+                if "modes" in document
+                else [],
+                "reached": not self.shortcoming,
+                "reason": self.shortcoming or self._reason,
+                "pieces": self._pieces,
+            }
+        return document
+
+    @property
+    def _reason(self) -> str:
+        """Why a search for a precision ended, a sentence; empty if it was stopped."""
+        return self._ended.reason if self._ended is not None else self._lost
+
+    def _judge(self, document: Mapping[str, Any]) -> str:
+        """Say what is missing of what was asked for; empty if the whole record has all of it."""
+        assert self._search is not None
+        if self._told is None:
+            return self._reason or "Nothing was fitted."
+        short = [each for each in stated(document, self._search.targets) if each.ratio > 1.0]
+        if self._told.final and not short:
+            return ""
+        reason = self._reason
+        if self._ended is not None and self._ended.reached:
+            reason = self._lost or "Reached on the way, but not by the whole record."
+        return f"{reason} So far: {in_words(short)}.".strip()
+
+    @property
+    def ended_session(self) -> bool:
+        """Whether the session ended because the process was lost."""
+        return self._search is not None and self._ended is None and bool(self._lost)
+
+    def _send(self, message: object) -> None:
+        if self._lost:
+            return
+        try:
+            self._crew[FIT].send(message)
+        except ChildError as error:
+            self._lose(str(error))
+
+    def _listen(self, patience_s: float) -> None:
+        if self._lost:
+            return
+        try:
+            while (message := self._crew[FIT].poll(patience_s)) is not None:
+                self._take(message)
+                patience_s = 0.0
+        except ChildError as error:
+            self._lose(str(error))
+
+    def _take(self, message: object) -> None:
+        match message:
+            case FitReady():
+                self._ready = True
+            case FitTold(document):
+                self._told = message
+                self._news.append(document)
+                self._events += [Event(0, "info", line, notable=True) for line in document["text"]]
+            case PieceTold(name, document):
+                self._pieces.append({"name": name, **document})
+                self._events.append(Event(0, "info", f"Next: {name}."))
+            case SearchEnded(_, reason, segments):
+                self._ended, self.segments = message, segments
+                self._board[Word.LAST_PIECE] = 1
+                self._events.append(Event(0, "info", reason, notable=True))
+            case Failed(reason):
+                self._lose(reason)
+
+    def _lose(self, why: str) -> None:
+        """Go on without the process; a reference that it was to plan ends with what there is."""
+        self._lost = why
+        follows = "The session continues without fits."
+        if self._search is not None and self._ended is None:
+            self._board[Word.LAST_PIECE] = 1
+            follows = "The session ends with what is planned."
+        self._events.append(Event(0, "warning", f"{why} {follows}"))

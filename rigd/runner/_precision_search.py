@@ -1,0 +1,491 @@
+"""Search for a precision: what to excite next, and when the session has told enough.
+
+Each decision rests on a fit of the samples up to the beginning of the last piece that is planned,
+so that it is made while that piece is played, in real time as under the virtual clock. Where what
+is planned is expected to suffice, a pause follows instead of a piece; after it all structures are
+fitted, as `analyze` does, and only what that says counts as reached.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf, isfinite
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.engine import FitTold, PieceTold, PieceWriter, SearchEnded
+from rigd.errors import RigdError
+from rigd.excitation import (
+    PAUSE_S,
+    SHORTEST_S,
+    BeamEstimate,
+    ExcitationError,
+    Piece,
+    PrecisionSearch,
+    Target,
+    next_piece,
+)
+from rigd.profile import Profile
+from rigd.runner._planning import LoopPreview
+from rigd.units import with_half_width
+
+Real = NDArray[np.float64]
+
+_ENOUGH: Final = 0.98
+"""Expected deviation over the one asked for, up to which a pause follows instead of a piece."""
+_FORECAST_FROM: Final = 4
+"""Estimates from which on the time left is forecast."""
+_HOPELESS: Final = 2.0
+"""Forecast over the time that is left from which on a search is out of reach."""
+_SAID: Final = 3
+"""Decisions in a row that have to find so before the search is given up."""
+_NOT_SEEN: Final = "not visible yet"
+_DOUBTED: Final = 4
+"""Fits of all structures in a row of which no number is to be believed, before it is given up."""
+_WIDTH: Final = 22
+_SCANS: Final = 2
+"""How often the scan is repeated where nothing can be fitted."""
+_OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
+
+
+# What an estimate states of what is asked
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """One quantity that is asked for, as a fit states it."""
+
+    name: str
+    """The quantity, for the operator."""
+    value: float | None
+    """None: there is none."""
+    std: float
+    """Standard deviation; infinite where the value is not to be believed."""
+    asked_std: float
+    """The standard deviation that is asked for, in the same unit."""
+    doubt: str = ""
+    """Why the value is not to be believed; empty if it is."""
+    mode: int | None = None
+    """Its mode, from 1 on."""
+
+    @property
+    def ratio(self) -> float:
+        """Standard deviation over the one asked for."""
+        return self.std / self.asked_std if self.asked_std > 0.0 else inf
+
+
+def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[Stated]:
+    """Return what an estimate states of everything that is asked for.
+
+    Parameters
+    ----------
+    document
+        Answer of the fit program; see docs/online_fit.md.
+    targets
+        What is asked for; of modes without a number, it is asked of each one in the band.
+    """
+    return [each for target in targets for each in _stated(document, target)]
+
+
+def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
+    key = _OF_MODES.get(target.quantity)
+    if key is None:
+        yield _read(target, target.name, document.get("parameters", {}).get(target.quantity))
+        return
+    modes = [m for m in document["modes"] if target.mode in (None, m["mode"])]
+    for mode in modes:
+        number = int(mode["mode"])
+        found = replace(
+            _read(target, f"{target.quantity} of mode {number}", mode[key]), mode=number
+        )
+        yield found if mode["shown"] else replace(found, std=inf, doubt=_NOT_SEEN)
+    if not modes:
+        name = target.name if target.mode else f"{target.quantity} of any mode"
+        yield Stated(name, None, inf, target.std, "no such mode was found in the band")
+
+
+def _read(target: Target, name: str, found: Mapping[str, Any] | None) -> Stated:
+    if found is None or found["value"] is None:
+        return Stated(name, None, inf, target.std, "it is not part of what was found")
+    value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
+    asked_std = target.std * (abs(value) if target.relative else 1.0)
+    return Stated(name, value, inf if doubt or std is None else float(std), asked_std, doubt)
+
+
+def uniform_beam(document: Mapping[str, Any]) -> BeamEstimate | None:
+    """Return the beam of an answer of the fit program, for the design of excitation.
+
+    Parameters
+    ----------
+    document
+        The answer, which has a fit.
+
+    Returns
+    -------
+    BeamEstimate or None
+        None if it is no uniform beam with a rigid clamp, by whose parameters alone its modes are
+        not known.
+
+    Raises
+    ------
+    ExcitationError
+        If it cannot be used.
+    """
+    plant = document["plant"]
+    if plant.get("stiffness_offsets") or plant.get("root_compliance_rad_per_nm"):
+        return None
+    if plant.get("tip_mass_kg"):
+        return None
+    return BeamEstimate.from_dict(
+        {
+            "beam": plant["beam"],
+            "damping": plant["damping"],
+            "delay_s": plant["delay_s"],
+            "tool_inertia_kg_m2": plant["tool_inertia_kg_m2"],
+            "names": document["covariance"]["names"],
+            "noise": document["noise"],
+        }
+    )
+
+
+# The search
+
+
+@dataclass(slots=True)
+class _Stretch:
+    """Stretch of the reference, and of the record."""
+
+    name: str
+    reference_rad: Real
+    place: int
+    """Its first tick in the reference."""
+    begins: int
+    """Its first tick in the record."""
+
+    @property
+    def size(self) -> int:
+        return int(self.reference_rad.size)
+
+
+class Search:
+    """Decides on the pieces of one session.
+
+    Parameters
+    ----------
+    search
+        What is asked.
+    profile
+        Profile of the rig.
+    writer
+        Takes the pieces.
+    start_rad
+        Where the motor stands, from the rig's zero.
+
+    Attributes
+    ----------
+    due
+        Tick of the reference up to which samples are needed for the next decision; None: no more
+        is to be decided.
+    may_be_last
+        The next estimate may be the last: all structures are to be fitted.
+    """
+
+    def __init__(
+        self,
+        search: PrecisionSearch,
+        profile: Profile,
+        writer: PieceWriter,
+        *,
+        start_rad: float = 0.0,
+    ) -> None:
+        self._targets = search.targets
+        self._tip_slope_rad = search.tip_slope_rad
+        self._rig = LoopPreview(profile, start_rad)
+        self._writer = writer
+        self._rate_hz = profile.rig.rate_hz
+        self._most_ticks = writer.ticks + writer.room
+        first, scan_rad = search.scan
+        self._stretches = [_Stretch("scan", scan_rad, first, first)]
+        self._pieces = self._scans = 0
+        self._shows_modes = False
+        self._hopeless = self._doubtful = 0
+        self._course = _Course()
+        self._uniform: BeamEstimate | None = None
+        self._columns: list[str] = []
+        self.due: int | None = first + scan_rad.size
+        self.may_be_last = False
+
+    def answered(self, document: Mapping[str, Any], held: int) -> Iterator[object]:
+        """Decide by an estimate; yields what the supervisor is to be told.
+
+        Parameters
+        ----------
+        document
+            Answer of the fit program to the samples before `due`.
+        held
+            Ticks of the record in which the angle was held because there was no piece.
+        """
+        last = self._stretches[-1]
+        last.begins = last.place + held
+        if document["problem"] or "plant" not in document:
+            problem = document["problem"] or "Nothing could be fitted."
+            if self._columns:
+                # What could be fitted before now has a gap, or a sensor that stands still.
+                yield self._end(f"Given up: {problem}", reached=False)
+            else:
+                yield from self._scan_again(problem, held)
+            return
+        found = stated(document, self._targets)
+        time_s = document["tick"] / self._rate_hz
+        self._course.note(time_s, max(each.ratio for each in found))
+        doubt = document["doubt"]
+        # Doubts of a uniform beam alone are looked into first.
+        yield self._told(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
+        if self.may_be_last and all(each.ratio <= 1.0 for each in found):
+            yield self._end(f"Reached: {in_words(found)}.", reached=True)
+            return
+        if self.may_be_last:
+            self._doubtful = self._doubtful + 1 if doubt else 0
+        if self._doubtful >= _DOUBTED:
+            findings = " ".join(document["findings"])
+            yield self._end(f"The record is doubtful: {doubt}. {findings}".strip(), reached=False)
+            return
+        try:
+            self._uniform = uniform_beam(document) or self._uniform
+            yield from self._go_on(self._uniform, found, held, doubt)
+        except (RigdError, ArithmeticError, np.linalg.LinAlgError) as error:
+            # An estimate so far off that nothing can be planned with it.
+            yield from self._scan_again(str(error), held)
+
+    def ended(self, ticks: int) -> SearchEnded:
+        """Return what there is of a search whose record has ended after so many ticks."""
+        return self._end(self._too_long if ticks >= self._most_ticks else "", reached=False)
+
+    @property
+    def _too_long(self) -> str:
+        return f"Not reached within {self._most_ticks / self._rate_hz:g} s (--at-most)."
+
+    def _go_on(
+        self, estimate: BeamEstimate | None, found: Sequence[Stated], held: int, doubt: str | None
+    ) -> Iterator[object]:
+        """Append a piece, or a pause where what is planned is expected to suffice."""
+        reference_rad = self._reference_rad(held)
+        left_s = (self._most_ticks - reference_rad.size) / self._rate_hz
+        if left_s < SHORTEST_S + PAUSE_S:
+            if self.may_be_last:
+                yield self._end(self._too_long, reached=False)
+            else:
+                self._pause(min(PAUSE_S, left_s))
+            return
+        if estimate is None:
+            raise ExcitationError("No uniform beam was found.")
+        plant = self._rig.plant_with(estimate.beam, estimate.damping)
+        angle_rad = plant.respond(reference_rad).angle_rad
+        piece = next_piece(
+            estimate,
+            angle_rad,
+            self._targets,
+            self._rig,
+            left_s - PAUSE_S,
+            tip_slope_rad=self._tip_slope_rad,
+            through=self._through(found),
+        )
+        if not self.may_be_last and all(each.ratio <= _ENOUGH for each in piece.now):
+            self._pause(PAUSE_S)
+            return
+        never = [f"{each.impossible}." for each in piece.now if each.impossible]
+        # Two ways to look ahead: from what pieces can tell, and from what they did tell.
+        slow = piece.forecast.seconds > _HOPELESS * left_s
+        hopeless = never[0] if never else slow and self._course.hopeless(left_s)
+        self._hopeless = self._hopeless + 1 if hopeless else 0
+        if self._hopeless >= _SAID:
+            yield self._end(f"Out of reach: {hopeless}", reached=False)
+            return
+        self._pieces += 1
+        self._append(f"piece_{self._pieces}", piece.reference_rad)
+        self.due = self._stretches[-1].place
+        # What a uniform beam does not explain, another structure may: a clamp that gives way.
+        self.may_be_last = bool(doubt) and not self.may_be_last
+        yield PieceTold(piece.name, self._document(piece, found))
+
+    def _through(self, found: Sequence[Stated]) -> list[int]:
+        """Return modes that the next piece has to drive, because the record does not show them.
+
+        A model may tell of such a mode by the others, as the design expects; the judgement of the
+        record does not accept that. Every other piece is left to the design.
+        """
+        unseen = [each.mode for each in found if each.doubt == _NOT_SEEN and each.mode]
+        self._shows_modes = bool(unseen) and self._pieces > 0 and not self._shows_modes
+        return unseen if self._shows_modes else []
+
+    def _scan_again(self, why: str, held: int) -> Iterator[object]:
+        """Repeat the scan where an estimate is of no use."""
+        scan = self._stretches[0]
+        left = self._most_ticks - self._writer.ticks - held
+        if self._scans >= _SCANS or left < scan.size:
+            yield self._end(f"Given up: {why}", reached=False)
+            return
+        self._scans += 1
+        self._append(f"scan_{self._scans + 1}", scan.reference_rad)
+        self.due, self.may_be_last = self._writer.ticks, False
+        yield PieceTold("the scan once more", {"why": why})
+
+    def _pause(self, duration_s: float) -> None:
+        """Hold the angle for a while; then have all structures fitted to the whole record."""
+        self._append("pause", np.zeros(round(duration_s * self._rate_hz)))
+        self.due, self.may_be_last = self._writer.ticks, True
+
+    def _append(self, name: str, reference_rad: Real) -> None:
+        place = self._writer.ticks
+        self._stretches.append(_Stretch(name, reference_rad, place, place))
+        self._writer.append(reference_rad)
+
+    def _reference_rad(self, held: int) -> Real:
+        """Return the reference of the record up to the end of what is planned, shape (n,)."""
+        whole = np.zeros(self._writer.ticks + held)
+        for each in self._stretches:
+            whole[each.begins : each.begins + each.size] = each.reference_rad
+        return whole
+
+    def _told(
+        self,
+        document: Mapping[str, Any],
+        found: Sequence[Stated],
+        time_s: float,
+        *,
+        quietly: bool,
+    ) -> FitTold:
+        """Return an estimate with a row of the table of what is asked for."""
+        columns = [each.name for each in found]
+        lines = []
+        if columns != self._columns and not quietly:
+            self._columns = columns
+            heads = (f"{name:<{_WIDTH}}" for name in columns)
+            lines.append(f"  time  {''.join(heads)}left   (± one standard deviation)")
+        left_s = self._course.left_s
+        state = {"left_s": left_s, **self.state(document)}
+        cells = (f"{_cell(each):<{_WIDTH}}" for each in found)
+        left = "" if left_s is None else f"{left_s:.0f} s"
+        lines.append(f"{time_s:5.1f} s {''.join(cells)}{left}")
+        return FitTold({**document, "search": state, "text": [] if quietly else lines})
+
+    def state(self, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what an estimate states of what is asked for, as JSON documents have it.
+
+        Parameters
+        ----------
+        document
+            Answer of the fit program.
+        """
+        return {"targets": targets_json(stated(document, self._targets))}
+
+    def _document(self, piece: Piece, found: Sequence[Stated]) -> dict[str, Any]:
+        """Return what is expected of a piece, and what was stated when it was planned."""
+        return {
+            "duration_s": piece.reference_rad.size / self._rate_hz,
+            "stated": {each.name: each.std for each in found if isfinite(each.std)},
+            "expected": [
+                {"name": each.target.name, "std": each.std, "asked_std": each.asked_std}
+                for each in piece.expected
+                if isfinite(each.std)
+            ],
+            "share_of_limits": piece.share_of_limits,
+            "left_s": self._course.left_s,
+        }
+
+    def _end(self, reason: str, *, reached: bool) -> SearchEnded:
+        """End the search; the record ends with what is planned."""
+        self.due = None
+        segments = {
+            each.name: (each.begins, each.begins + each.size)
+            for each in self._stretches
+            if each.name != "pause"
+        }
+        segments["sweep"] = (self._stretches[0].begins, self._most_ticks)
+        return SearchEnded(reached, reason, segments)
+
+
+class _Course:
+    """How the largest deviation over the one asked for goes down, and where that leads.
+
+    Its inverse square grows as the information does: with time, once what tells most is driven.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[tuple[float, float]] = []
+
+    def note(self, time_s: float, ratio: float) -> None:
+        """Take the ratio at a time of the record."""
+        if isfinite(ratio):
+            self._known.append((time_s, ratio**-2))
+
+    @property
+    def left_s(self) -> float | None:
+        """Time until the ratio is 1, by the latest half of the course; None: not known yet."""
+        if len(self._known) < _FORECAST_FROM:
+            return None
+        (now_s, now), (then_s, then) = self._known[-1], self._known[len(self._known) // 2 - 1]
+        if now >= 1.0:
+            return 0.0
+        return (1.0 - now) * (now_s - then_s) / (now - then) if now > then else None
+
+    def hopeless(self, time_left_s: float) -> str:
+        """Say why the time that is left will not do, and what would; empty if it may."""
+        left_s = self.left_s
+        if left_s is None or left_s <= _HOPELESS * time_left_s:
+            return ""
+        now_s, now = self._known[-1]
+        ratio = (now + (1.0 - now) * time_left_s / left_s) ** -0.5
+        return (
+            f"it would take about {left_s:.0f} s more and {time_left_s:.0f} s are left; in these "
+            f"{ratio:.2g} times the deviation asked for can be reached. Ask for that, or give "
+            f"--at-most {1.2 * (now_s + left_s):.0f}."
+        )
+
+
+def _cell(each: Stated) -> str:
+    """Write a quantity for the table: ratios and frequencies as people read them."""
+    if each.value is None or each.doubt:
+        return each.doubt if each.doubt == _NOT_SEEN else "doubtful"
+    scale, unit = (100.0, " %") if each.name.startswith("damping") else (1.0, "")
+    half = scale * each.std
+    return f"{with_half_width(scale * each.value, (-half, half))}{unit}"
+
+
+def targets_json(found: Sequence[Stated]) -> list[dict[str, Any]]:
+    """Return what is stated of what is asked for, as JSON documents have it.
+
+    Parameters
+    ----------
+    found
+        As of `stated`.
+    """
+    return [
+        {
+            "name": each.name,
+            "value": each.value,
+            "std": each.std if isfinite(each.std) else None,
+            "asked_std": each.asked_std if isfinite(each.asked_std) else None,
+            "doubt": each.doubt,
+        }
+        for each in found
+    ]
+
+
+def in_words(found: Sequence[Stated]) -> str:
+    """Say how precise everything is.
+
+    Parameters
+    ----------
+    found
+        What an estimate states.
+    """
+    return ", ".join(_one_in_words(each) for each in found)
+
+
+def _one_in_words(each: Stated) -> str:
+    if each.value is None or each.doubt:
+        return f"{each.name}: {each.doubt}"
+    share = f" ({100 * each.std / abs(each.value):.2g} %)" if each.value else ""
+    return f"{each.name} {each.value:.5g}, standard deviation {each.std:.2g}{share}"

@@ -1,0 +1,241 @@
+"""The fit process: fits the record of a running session, and plans what is excited next.
+
+It watches the ring of samples as the live publisher does, so that it can neither delay the loop nor
+take a sample from the recorder, and hands them to the program of the analyser that fits them
+(``python -m analysis.online``). What that answers goes to the supervisor. Where the session goes on
+until a precision is reached, the answer decides on the next piece of the reference (`Search`).
+"""
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from typing import Any, BinaryIO, Final, Self, cast
+
+from rigd.engine import (
+    Channels,
+    Failed,
+    FileHeader,
+    FitJob,
+    FitReady,
+    FitTold,
+    Observer,
+    Parent,
+    PieceWriter,
+    RecordEnded,
+    Word,
+    attach_channels,
+    keep_off_loop,
+)
+from rigd.runner._precision_search import Search
+from rigd.runtime import SINGLE_THREADED
+from rigd.runtime import ignore as ignore_signals
+from rigd.session import (
+    EstimateRequest,
+    StreamStart,
+    decode_samples,
+    estimate_lines,
+    write_request,
+    write_samples,
+    write_start,
+)
+
+_PROGRAM: Final = "analysis.online"
+_BLOCK: Final = 500
+_IDLE_S: Final = 0.005
+_EVERY_S: Final = 1.0
+"""Time between two fits of a session that is only watched."""
+_GRACE_S: Final = 1.0
+_FIRST_ASKED: Final = 1_000_000_000
+"""Numbers of the estimates that are asked for; those made unasked count from 0 on."""
+
+
+class FitProgramError(Exception):
+    """The fit program ended; the message says how."""
+
+
+def main() -> None:
+    """Run as ``python -m rigd.runner.fit_process``."""
+    ignore_signals()
+    parent = Parent()
+    job: FitJob = parent.receive_job()
+    if job.realtime is not None:
+        keep_off_loop(job.realtime.cpu)
+    try:
+        with FitProgram() as program:
+            follower = _Follower(job, parent, program, attach_channels(job.channels))
+            try:
+                follower.follow()
+            except BrokenPipeError:
+                raise program.ended() from None
+    except FitProgramError as error:
+        parent.send(Failed(str(error)))
+        raise SystemExit(1) from None
+
+
+class FitProgram:
+    """The analyser's program that fits; leaving its context ends it."""
+
+    def __init__(self) -> None:
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", _PROGRAM, "--parent", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env=os.environ | SINGLE_THREADED,
+            )
+        except OSError as error:
+            raise FitProgramError(
+                f"The fit program cannot be started ({error.strerror})."
+            ) from None
+        self.input = cast("BinaryIO", self._process.stdin)
+        """Takes a stream as `rigd.session` writes it."""
+        self._answers: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def answer(self) -> dict[str, Any] | None:
+        """Return an answer, or None if none has come.
+
+        Raises
+        ------
+        FitProgramError
+            If the program has ended.
+        """
+        try:
+            answer = self._answers.get_nowait()
+        except queue.Empty:
+            return None
+        if answer is None:
+            raise self.ended()
+        return answer
+
+    def ended(self) -> FitProgramError:
+        """Return how the program has ended."""
+        code = self._process.wait()
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return FitProgramError(f"The fit program {how}.")
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with contextlib.suppress(ValueError):  # not whole: it ended while it wrote
+            for line in self._process.stdout:
+                self._answers.put(json.loads(line))
+        self._answers.put(None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self.input.close()
+        try:
+            self._process.wait(_GRACE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class _Follower:
+    """Follows one session from its first sample to the fit of the whole record."""
+
+    def __init__(
+        self, job: FitJob, parent: Parent, program: FitProgram, channels: Channels
+    ) -> None:
+        self._parent = parent
+        self._program = program
+        self._board = channels.board
+        self._reader = Observer(channels.samples, job.first)
+        self._job = job
+        self._search: Search | None = None
+        self._asked: EstimateRequest | None = None
+        self._before: dict[str, Any] | None = None
+        self._ticks = self._number = 0
+        self._ended_after: int | None = None
+
+    def follow(self) -> None:
+        """Serve until the whole record is fitted, or the supervisor is gone."""
+        self._parent.send(FitReady())
+        while True:
+            self._board.beat(Word.FIT_BEAT)
+            moved = self._feed()
+            answer = self._program.answer()
+            if answer is not None and self._answered(answer):
+                return
+            self._ask(drained=not moved)
+            try:
+                message = self._parent.poll(0.0 if moved else _IDLE_S)
+            except EOFError:
+                return
+            match message:
+                case FileHeader():
+                    self._begin(message)
+                case RecordEnded(ticks):
+                    self._ended_after = ticks
+                    if self._search is not None and self._search.due is not None:
+                        self._parent.send(self._search.ended(ticks))
+
+    def _begin(self, header: FileHeader) -> None:
+        """Begin with what the file says of the session."""
+        job = self._job
+        if job.search is not None:
+            writer = PieceWriter(job.reference, self._board)
+            start_rad = float(header.metadata["start_angle_rad"])
+            self._search = Search(job.search, job.profile, writer, start_rad=start_rad)
+        every_s = _EVERY_S if job.search is None else None
+        start = StreamStart(dict(header.metadata), dict(header.segments), every_s)
+        write_start(self._program.input, start)
+
+    def _feed(self) -> bool:
+        """Hand on what was recorded; say whether there was anything."""
+        block = self._reader.take(_BLOCK)
+        if not block:
+            return False
+        write_samples(self._program.input, block)
+        self._ticks = int(decode_samples(block)["tick"][-1]) + 1
+        return True
+
+    def _ask(self, *, drained: bool) -> None:
+        """Ask for the next estimate once the samples that it rests on are there."""
+        if self._asked is not None:
+            return
+        search = self._search
+        if self._ended_after is not None:
+            if drained:
+                self._request(self._ended_after, whole=True)
+        elif search is not None and search.due is not None:
+            # Read after the samples: the loop counts what it holds before it gives the sample.
+            tick = search.due + self._board[Word.HELD]
+            if self._ticks >= tick:
+                self._request(tick, whole=search.may_be_last)
+
+    def _request(self, tick: int, *, whole: bool) -> None:
+        self._number += 1
+        self._asked = EstimateRequest(_FIRST_ASKED + self._number, tick, whole)
+        write_request(self._program.input, self._asked)
+
+    def _answered(self, answer: dict[str, Any]) -> bool:
+        """Tell of an estimate, and plan by it; say whether it is of the whole record."""
+        # The last one of a search is of the record that the one before was of.
+        answer["text"] = estimate_lines(answer, None if self._search else self._before)
+        self._before = answer
+        asked, search = self._asked, self._search
+        if asked is not None and asked.id == answer["id"]:
+            self._asked = None
+            if asked.tick == self._ended_after:
+                if search is not None:
+                    answer["search"] = search.state(answer)
+                self._parent.send(FitTold(answer, final=True))
+                return True
+        if search is None:
+            self._parent.send(FitTold(answer))
+        elif self._ended_after is None:
+            for message in search.answered(answer, self._board[Word.HELD]):
+                self._parent.send(message)
+        return False
+
+
+if __name__ == "__main__":
+    main()

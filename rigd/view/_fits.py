@@ -1,0 +1,235 @@
+"""Fits of the record: modes over time with their shrinking intervals, and a table of the last fit.
+
+Fits of a session that runs come every second or with every piece of a search for a precision; a
+recorded file has the last one only, of which there is the table.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.units import suffix_of, unit_of, with_half_width
+from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
+from rigd.view._session_info import plain
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+Fit = Mapping[str, Any]
+"""Answer of the fit program, as JSON documents have it (docs/online_fit.md)."""
+
+TABLE: Final = "/fit_table"
+_ENTITY: Final = "/fits"
+_MOST_FINDINGS: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    name: str
+    key: str
+    """Its key in a mode of a fit."""
+    suffix: str
+    """Ending of the component's name."""
+    title: str
+    unit: str
+    factor: float
+
+    def field(self, mode: int) -> str:
+        return f"{self.name}_{mode}"
+
+
+_QUANTITIES: Final = (
+    _Quantity("damping", "damping_ratio", "percent", "Damping ratio", "%", 100.0),
+    _Quantity("frequency", "frequency_hz", "hz", "Frequency", "Hz", 1.0),
+)
+_ASKED_LOW, _ASKED_HIGH, _LOW, _HIGH, _VALUE = range(5)
+"""Columns of a field of a fit's record; NaN is what is not known."""
+
+
+def fit_source(modes: int, *, asked: bool) -> Source:
+    """Return the plots of the first modes: of each its damping ratio, then its frequency.
+
+    Parameters
+    ----------
+    modes
+        How many.
+    asked
+        Whether a precision may be asked for.
+    """
+    plots = (
+        _plot(quantity, n, asked=asked) for n in range(1, modes + 1) for quantity in _QUANTITIES
+    )
+    return Source(_ENTITY, tuple(plots))
+
+
+def _plot(quantity: _Quantity, mode: int, *, asked: bool) -> Plot:
+    field, unit = quantity.field(mode), quantity.unit
+
+    def values(records: npt.NDArray[Any], column: int) -> Values:
+        found: Values = records[field][:, column]
+        return found
+
+    # What is called the same has one entry in the legend.
+    wanted, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
+    wanted_ends = (
+        Curve(wanted, GREY, partial(values, column=_ASKED_LOW)),
+        Curve(wanted, GREY, partial(values, column=_ASKED_HIGH)),
+    )
+    return Plot(
+        f"{quantity.name}_{mode}_{quantity.suffix}",
+        f"{quantity.title} of mode {mode} ({unit})",
+        (
+            *(wanted_ends if asked else ()),
+            Curve(interval, ORANGE, partial(values, column=_LOW)),
+            Curve(interval, ORANGE, partial(values, column=_HIGH)),
+            Curve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
+        ),
+    )
+
+
+def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
+    """Return an array (1,) with ``t_ns`` and what the plots of `fit_source` show of a fit.
+
+    What the record does not show, or is doubtful, is left out.
+
+    Parameters
+    ----------
+    fit
+        The fit; None: nothing is known yet.
+    modes
+        How many modes the plots are of.
+    """
+    fields = [(q.field(n), "<f8", (5,)) for n in range(1, modes + 1) for q in _QUANTITIES]
+    record = np.zeros(1, [("t_ns", "<i8"), *fields])
+    for name, *_ in fields:
+        record[name] = np.nan
+    if fit is None:
+        return record
+    record["t_ns"] = round(1e9 * fit["duration_s"])
+    stds = {each["name"]: each["asked_std"] for each in _targets(fit)}
+    for mode in fit.get("modes", ()):
+        for quantity in _QUANTITIES if mode["mode"] <= modes else ():
+            found = mode[quantity.key]
+            ends = found["interval_95"]
+            if not mode.get("shown", True) or found["flag"] or ends is None:
+                continue
+            value, (low, high) = found["value"], ends
+            asked_std = stds.get(f"{quantity.name} of mode {mode['mode']}")
+            half = np.nan
+            if asked_std is not None and found["std"]:
+                half = asked_std * (high - low) / (2.0 * found["std"])
+            shown = np.array([value - half, value + half, low, high, value])
+            record[quantity.field(mode["mode"])] = quantity.factor * shown
+    return record
+
+
+def _targets(fit: Fit) -> list[Mapping[str, Any]]:
+    return list((fit.get("search") or {}).get("targets") or ())
+
+
+# Table
+
+
+def fit_table(fit: Fit | None) -> str:
+    """Return a fit as Markdown: what is asked for and how much of it is reached, modes, parameters.
+
+    Parameters
+    ----------
+    fit
+        The fit; None: none has been made yet.
+    """
+    if fit is None:
+        return "No fit yet."
+    search = fit.get("search") or {}
+    parts = []
+    if search.get("reason"):
+        parts.append(f"**{plain(search['reason'])}**")
+    targets = _targets(fit)
+    if targets:
+        rows = [_target_row(each) for each in targets]
+        parts.append(_markdown("asked for", "value", "std", "asked std", rows=rows))
+    if not search.get("reason") and search.get("left_s") is not None:
+        parts.append(f"About **{search['left_s']:.0f} s** more.")
+    if not search.get("reason") and search.get("piece"):
+        parts.append(f"Excited now: {plain(str(search['piece']))}")
+    if fit.get("problem"):
+        parts.append(f"**After {fit['duration_s']:.1f} s:** {plain(fit['problem'])}")
+    else:
+        parts.append(f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)")
+    modes = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
+    if modes:
+        parts.append(_markdown("mode", "frequency (Hz)", "damping ratio (%)", rows=modes))
+    unseen = [str(mode["mode"]) for mode in fit.get("modes", ()) if not mode.get("shown", True)]
+    if unseen:
+        parts.append(f"Not visible so far: mode {' and '.join(unseen)}.")
+    rows = [_parameter_row(*each) for each in fit.get("parameters", {}).items()]
+    if rows:
+        parts.append(_markdown("parameter", "value", rows=[row for row in rows if row]))
+    parts += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
+    return "\n\n".join(parts)
+
+
+def _markdown(*heads: str, rows: list[tuple[str, ...]]) -> str:
+    lines = (heads, ("---",) * len(heads), *rows)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
+    value, std, asked_std = target["value"], target["std"], target["asked_std"]
+    if value is None:
+        return plain(target["name"]), "–", "–", "–"
+    if std is None:
+        return plain(target["name"]), f"{value:.4g}", "doubtful", _std(asked_std, value)
+    reached = " ✓" if std <= asked_std else ""
+    return (
+        plain(target["name"]),
+        f"{value:.4g}",
+        f"**{_std(std, value)}**{reached}",
+        _std(asked_std, value),
+    )
+
+
+def _std(std: float, value: float) -> str:
+    return f"{std:.2g} ({100.0 * std / abs(value):.2g} %)" if value else f"{std:.2g}"
+
+
+def _mode_row(mode: Mapping[str, Any]) -> tuple[str, ...]:
+    hz, damping = mode["frequency_hz"], mode["damping_ratio"]
+    return (
+        str(mode["mode"]),
+        with_half_width(hz["value"], hz["interval_95"]) + _doubt(hz),
+        with_half_width(damping["value"], damping["interval_95"], 100.0) + _doubt(damping),
+    )
+
+
+def _parameter_row(name: str, found: Mapping[str, Any]) -> tuple[str, ...]:
+    value, ends = found["value"], found["interval_95"]
+    if value is None:
+        return ()
+    # Small numbers, such as zeta, in powers of ten that are the same for value and interval.
+    size = abs(value) if ends is None else max(abs(value), (ends[1] - ends[0]) / 2.0)
+    power = 0 if size == 0 or size >= 1e-2 else int(np.floor(np.log10(size)))
+    text = with_half_width(value, ends, 10.0**-power)
+    if power:
+        text = f"({text})·10{str(power).translate(_RAISED)}"
+    words = name.removesuffix(suffix_of(name)).replace("_", " ")
+    return words, f"{text} {unit_of(name)}".rstrip() + _doubt(found)
+
+
+_RAISED: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _doubt(found: Mapping[str, Any]) -> str:
+    return f" (doubtful: {plain(found['flag'])})" if found.get("flag") else ""
+
+
+def send_table(stream: "RecordingStream", fit: Fit | None) -> None:
+    """Show the table of a fit, from the end of its samples on; without one, that there is none."""
+    import rerun as rr
+
+    stream.set_time(TIMELINE, duration=0.0 if fit is None else fit["duration_s"])
+    stream.log(TABLE, rr.TextDocument(fit_table(fit), media_type=rr.MediaType.MARKDOWN))

@@ -1,0 +1,227 @@
+"""`rigd run until`, from the command line to the session file and what `analyze` says of it."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import child_running
+
+from analysis.record import load_record
+from analysis.results import whole_record
+from rigd.beam import SMALL_SLOPE_RAD, tip_motion
+from rigd.profile import load_profile
+from rigd.session import read_session
+
+RIGD = Path(sys.executable).parent / "rigd"
+ASKED = 0.03
+LONG = ("run", "until", "--damping", "0.05%", "--at-most", "600", "--json", "--no-look", "--fast")
+ROW = re.compile(r" *\d+\.\d s 0\.")
+"""Row of the table of what is asked for."""
+
+
+@pytest.fixture(scope="module")
+def done(made_once):
+    """A session that went on until the damping was known to 3 %: exit code, errors, result."""
+
+    def make(folder):
+        command = [RIGD, "run", "until", "--damping", f"{100 * ASKED}%", "--at-most", "60"]
+        command += ["--fast", "--json", "--no-look", "--output", folder]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=400)
+        (folder / "told.json").write_text(json.dumps([done.returncode, done.stdout, done.stderr]))
+
+    code, output, errors = json.loads((made_once("until", make) / "told.json").read_text())
+    assert output, errors
+    (session,) = json.loads(output)["sessions"]
+    return code, errors, session
+
+
+@pytest.fixture(scope="module")
+def record(done):
+    return read_session(done[2]["path"])
+
+
+def test_it_ends_when_the_precision_is_reached(done):
+    code, errors, session = done
+    assert code == 0, errors
+    assert (session["outcome"], session["reason"]) == ("complete", "")
+    assert session["scheduled"] == session["recorded"] + session["missed"] < 30_000
+    assert session["lost"] == 0
+    fit = session["fit"]
+    assert fit["search"]["reached"]
+    assert fit["search"]["asked"] == ["damping to 3 %"]
+    assert len(fit["modes"]) == 3
+    for mode in fit["modes"]:
+        damping = mode["damping_ratio"]
+        assert damping["flag"] is None
+        assert damping["std"] <= ASKED * damping["value"]
+    assert "Reached: damping of mode 1" in errors
+    assert errors.count("± one standard deviation") == 1
+
+
+def test_analyze_says_of_the_file_what_the_session_said_last(done, record):
+    told = whole_record(load_record(record.path)).headline
+    fit = done[2]["fit"]
+    assert json.loads(record.outcome["fit"]) == fit
+    for mode, live in zip(told.modes, fit["modes"], strict=True):
+        for quantity in ("frequency_hz", "damping_ratio"):
+            assert getattr(mode, quantity).as_json() == live[quantity]
+    for name, quantity in told.parameters.items():
+        assert quantity.as_json() == fit["parameters"][name]
+
+
+def test_the_numbers_are_those_of_the_simulated_beam(done):
+    from rigd.beam import modes
+
+    rig = load_profile("sim").rig
+    for mode, true in zip(done[2]["fit"]["modes"], modes(rig.beam, rig.damping, 3), strict=True):
+        for key, value in (
+            ("frequency_hz", true.frequency_hz),
+            ("damping_ratio", true.damping_ratio),
+        ):
+            assert abs(mode[key]["value"] - value) < 4 * mode[key]["std"]
+
+
+def test_segments_name_what_was_played(done, record):
+    segments = dict(record.segments)
+    ticks = done[2]["scheduled"]
+    assert segments.pop("rest") == (0, 1000)
+    assert segments.pop("sweep") == (1000, ticks)
+    assert segments.pop("scan") == (1000, 6000)
+    pieces = done[2]["fit"]["search"]["pieces"]
+    assert list(segments) == [f"piece_{number + 1}" for number in range(len(pieces))]
+    ends = [6000]
+    for (first, end), piece in zip(segments.values(), pieces, strict=True):
+        assert ends[-1] <= first < end <= ticks
+        assert end - first == round(1000 * piece["duration_s"])
+        ends.append(end)
+
+
+def test_the_file_is_described_by_its_modes(rigd, record):
+    told = rigd("info", record.path).stdout
+    assert told.count("\nfit ") == 3
+    assert "mode 1: 2.5" in told
+    assert "covariance" not in told
+
+
+def test_pieces_join_at_rest(record):
+    """At the joints: no step in angle, speed or acceleration beside those of the pieces."""
+    reference_rad = record.samples["angle_reference_rad"]
+    relative_rad = reference_rad - reference_rad[0]
+    speed = np.gradient(relative_rad, 1e-3)
+    acceleration = np.gradient(speed, 1e-3)
+    joints = [tick for name, ends in record.segments.items() if name != "sweep" for tick in ends]
+    for tick in joints:
+        near = slice(max(tick - 2, 0), tick + 3)
+        assert np.abs(relative_rad[near]).max(initial=0.0) < 2e-6
+        assert np.abs(speed[near]).max(initial=0.0) < 2e-3
+        assert np.abs(acceleration[near]).max(initial=0.0) < 0.02 * np.abs(acceleration).max()
+
+
+def test_the_free_end_stays_within_small_slopes(record):
+    rig = load_profile("sim").rig
+    angle_rad = record.samples["angle_rad"]
+    slope_rad = tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
+    assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
+
+
+def test_what_is_not_reached_in_its_time_is_said(rigd, tmp_path):
+    options = ("--damping", "0.01%", "--at-most", "8", "--fast", "--json", "--no-look")
+    run = rigd("run", "until", *options)
+    assert run.returncode == 1, run.stderr
+    (session,) = json.loads(run.stdout)["sessions"]
+    assert session["outcome"] == "complete"
+    assert session["reason"].startswith("Not reached within 8 s (--at-most). So far: damping of mo")
+    assert not session["fit"]["search"]["reached"]
+    assert 7000 <= session["recorded"] <= 8000
+    assert read_session(tmp_path / session["path"]).outcome["reason"] == session["reason"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), ("No precision is asked for", "--damping 1%")),
+        (("--damping", "much"), ("--damping much", "1% or 2:0.5%")),
+        (("--damping", "-1%"), ("more than 0",)),
+        (("--zeta", "2:1%"), ("no quantity of a mode",)),
+        (("--damping", "1%", "--at-most", "3"), ("at_most_s = 3 s", "6.5 s")),
+        (("--damping", "1%", "--scan", "0.2"), ("scan_s = 0.2 s", "fades")),
+        (("--damping", "1%", "--tip-slope", "0"), ("tip_slope_rad",)),
+    ],
+)
+def test_what_makes_no_sense_is_refused(rigd_here, options, words):
+    done = rigd_here("run", "until", "--fast", *options)
+    assert done.returncode == 2, done.stdout + done.stderr
+    for word in words:
+        assert word in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("victim", "number"),
+    [
+        ("rigd.runner.fit_process", signal.SIGKILL),
+        ("analysis.online", signal.SIGKILL),
+        pytest.param("rigd.runner.fit_process", signal.SIGSTOP, marks=pytest.mark.slow),
+    ],
+)
+def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, victim, number):
+    process = start_rigd(*LONG)
+    for line in process.stderr:
+        if ROW.match(line):
+            break
+    planner = child_running(process.pid, "rigd.runner.fit_process")
+    if victim != "rigd.runner.fit_process":
+        planner = child_running(planner, victim)
+    os.kill(planner, number)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 1, errors
+    assert "Traceback" not in errors
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] == "complete"
+    assert "The fit pro" in session["reason"]
+    assert session["scheduled"] == session["recorded"] + session["missed"]
+
+
+def test_a_stop_ends_it_at_once(start_rigd):
+    process = start_rigd(*LONG)
+    for line in process.stderr:
+        if ROW.match(line):
+            break
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 130, errors
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] == "stopped"
+    assert session["reason"] == "Stopped by the operator."
+    assert session["fit"]["modes"]
+    assert not session["fit"]["search"]["reached"]
+
+
+def test_real_time_keeps_its_books(rigd, patient, tmp_path):
+    """On a computer that stands still for long there are gaps, with which nothing can be fitted."""
+    options = ("--damping", "10%", "--at-most", "20", "--json", "--no-look", "--profile", patient)
+    run = rigd("run", "until", *options)
+    assert run.returncode in (0, 1), run.stderr
+    assert "Traceback" not in run.stderr
+    (session,) = json.loads(run.stdout)["sessions"]
+    assert session["outcome"] == "complete"
+    assert session["lost"] == 0
+    assert session["scheduled"] == session["recorded"] + session["missed"] <= 20_000
+    assert session["fit"]["search"]["reached"] == (run.returncode == 0)
+    assert len(read_session(tmp_path / session["path"]).samples) == session["recorded"]
+
+
+def test_a_chirp_is_fitted_while_it_runs(rigd, tmp_path):
+    lengths = ("--duration", "8", "--ring-down", "1", "--start-hz", "0.5")
+    run = rigd("run", "chirp", "--fast", "--json", "--no-look", "--watch-fit", *lengths)
+    assert run.returncode == 0, run.stderr
+    (session,) = json.loads(run.stdout)["sessions"]
+    assert "mode 1: 2.5" in run.stderr
+    assert "search" not in session["fit"]
+    told = whole_record(load_record(tmp_path / session["path"])).headline
+    assert told.modes[0].damping_ratio.as_json() == session["fit"]["modes"][0]["damping_ratio"]

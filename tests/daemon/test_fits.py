@@ -1,0 +1,75 @@
+"""Fits of a running session, as the daemon tells them: as events, in the status, at the end."""
+
+import json
+from pathlib import Path
+
+import pytest
+from online_fits import online_fit
+
+from rigd.daemon._protocol import parse_request
+from rigd.daemon._series import SeriesTeller, ServedSeries
+from rigd.daemon._states import fit_document
+from rigd.engine import Event, Phase
+from rigd.runner import SessionProgress, SessionResult
+
+
+def test_what_clients_are_told_of_a_fit_is_bounded():
+    fit = online_fit()
+    told = fit_document(fit)
+    assert told["modes"] == fit["modes"]
+    assert told["search"] == fit["search"]
+    assert not told.keys() & {"plant", "covariance", "noise"}
+    huge = fit | {
+        "modes": 100 * fit["modes"], "findings": 100 * ["x" * 10_000],
+        "search": fit["search"] | {"pieces": 100 * [{"name": "x" * 100}], "reason": "x" * 10_000},
+    }  # fmt: skip
+    assert len(json.dumps(fit_document(huge))) < 24_000
+    assert fit_document({}) == {}
+
+
+@pytest.fixture
+def told():
+    """A series that was started, who tells of it, and the events that were published."""
+    request = b'{"command": "start", "excitation": "chirp", "watch_fit": true}'
+    series, events = ServedSeries(1, parse_request(request), running=True), []
+    teller = SeriesTeller(series, events.append, lambda: True)
+    teller.begins(1, Path("1.mcap"))
+    return series, teller, events
+
+
+def result(**members):
+    return SessionResult(
+        path=Path("1.mcap"), outcome="complete", reason="", scheduled=9, recorded=9, missed=0,
+        late=0, lost=0, fault=False, **members,
+    )  # fmt: skip
+
+
+def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
+    series, teller, events = told
+    assert series.as_document()["fit"] is None
+    row = Event(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)
+    fits = (online_fit(6.0, 2.0), online_fit(8.0))
+    teller.update(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
+    assert [event["event"] for event in events] == ["message", "fit", "fit"]
+    assert events[0]["notable"]
+    assert [event["duration_s"] for event in events[1:]] == [6.0, 8.0]
+    assert events[1]["session"] == 1
+    assert series.as_document()["fit"] == fit_document(fits[-1])
+    # The result has nothing that was for the moment only, and says how a search ended.
+    final = online_fit(9.0, search=False) | {"search": {"reason": "Reached.", "pieces": []}}
+    del final["text"]
+    teller.ended(result(fit=final))
+    assert events[-1]["fit"]["search"] == {"reason": "Reached."}
+    document = series.as_document()
+    assert document["fit"]["text"] == fits[-1]["text"]
+    assert document["fit"]["duration_s"] == 9.0
+    assert "fit" not in document["sessions"][0]
+    teller.begins(2, Path("2.mcap"))
+    assert series.as_document()["fit"] is None
+
+
+def test_a_session_without_fits_is_told_as_before(told):
+    series, teller, events = told
+    teller.ended(result())
+    assert "fit" not in events[-1]
+    assert series.as_document()["fit"] is None

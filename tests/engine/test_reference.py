@@ -1,0 +1,146 @@
+"""References that grow while they are followed."""
+
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigd.engine._messages import SessionJob
+from rigd.engine._reference import (
+    PieceReader,
+    PieceWriter,
+    ReferenceSpec,
+    map_reference,
+    put_reference,
+)
+from rigd.engine._ring import shared_memory_fd
+from rigd.engine._shared_state import SharedState, Stop, Word
+
+
+def growing(planned=3, room=40):
+    board = SharedState.create(shared_memory_fd())
+    reference_rad = np.zeros(planned + room)
+    reference_rad[:planned] = np.arange(1, planned + 1)
+    spec = put_reference(shared_memory_fd(), reference_rad, planned)
+    return PieceWriter(spec, board), PieceReader(map_reference(spec), planned, board), board
+
+
+def test_pieces_follow_each_other_without_a_gap():
+    writer, reader, board = growing()
+    writer.append(np.array([10.0, 11.0]))
+    writer.append(np.array([20.0]))
+    assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 10, 11, 20]
+    assert board[Word.HELD] == 0
+
+
+def test_the_last_angle_is_held_until_the_next_piece():
+    writer, reader, board = growing()
+    assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 3, 3, 3]
+    assert board[Word.HELD] == 3
+    writer.append(np.array([10.0, 11.0, 12.0]))
+    assert [reader.at(tick) for tick in range(6, 10)] == [10, 11, 12, 12]
+    assert board[Word.HELD] == 4
+
+
+def test_missed_ticks_are_played_by_as_in_a_given_reference():
+    writer, reader, board = growing()
+    writer.append(np.array([10.0, 11.0, 12.0]))
+    assert [reader.at(tick) for tick in (0, 4)] == [1, 11]
+    assert reader.at(8) == 12  # three ticks after the end
+    writer.append(np.array([20.0, 21.0]))
+    assert [reader.at(tick) for tick in (9, 10)] == [20, 21]
+    assert board[Word.HELD] == 3
+
+
+def test_the_end_comes_after_all_that_is_planned():
+    writer, reader, board = growing()
+    assert reader.waits(3)
+    writer.append(np.array([10.0]))
+    assert not reader.waits(3)
+    board[Word.LAST_PIECE] = 1
+    over = []
+    for tick in range(4):
+        over.append(reader.over(tick))
+        reader.at(tick)
+    assert over == [False] * 4
+    assert reader.over(4)
+    assert not reader.waits(4)
+
+
+def test_a_piece_without_room_is_refused():
+    writer, _, board = growing(room=2)
+    with pytest.raises(ValueError, match="room for 2"):
+        writer.append(np.zeros(3))
+    assert board[Word.PLANNED] == 0
+
+
+@given(
+    pieces=st.lists(
+        st.tuples(st.integers(1, 9), st.integers(0, 20)), max_size=8
+    ),  # length, and tick at which it is appended
+    missed=st.lists(st.integers(0, 3), min_size=60, max_size=60),
+)
+def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
+    """Whatever is late: the pieces are followed, held in between, without what was missed."""
+    writer, reader, board = growing(room=100)
+    arrivals = sorted(pieces, key=lambda piece: piece[1])
+    told, tick, followed = 3, -1, []
+    for skipped in missed:
+        before = tick
+        tick += 1 + skipped
+        while arrivals and arrivals[0][1] <= before + 1:
+            length, _ = arrivals.pop(0)
+            writer.append(np.arange(told + 1, told + length + 1))
+            told += length
+        followed.append((tick, reader.at(tick)))
+        held = board[Word.HELD]
+        assert followed[-1][1] == min(tick - held + 1, told)
+    values = [value for _, value in followed]
+    assert values == sorted(values)
+    for (first, a), (then, b) in pairwise(followed):
+        assert b - a <= then - first
+    writer.close()
+
+
+def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
+    """Under the virtual clock time stands still until the next piece is there."""
+    session = make_session()
+    begun = np.zeros(400)
+    pieces_rad = [0.01 * np.sin(np.linspace(0, 2 * np.pi, 301)) ** 3, np.zeros(100)]
+    whole = np.concatenate([begun, np.zeros(2000)])
+    spec = put_reference(shared_memory_fd(), whole, begun.size)
+    writer = PieceWriter(spec, session.board)
+
+    def plan():
+        for piece_rad in pieces_rad:
+            time.sleep(0.3)
+            writer.append(piece_rad)
+        session.board[Word.LAST_PIECE] = 1
+
+    planner = threading.Thread(target=plan)
+    planner.start()
+    session.obey(SessionJob(session.profile, spec))
+    planner.join()
+    samples = session.samples
+    expected = np.concatenate([begun, *pieces_rad])
+    assert session.finished.outcome == "complete"
+    assert session.finished.counts["scheduled"] == len(samples) == expected.size
+    reference_rad = samples["angle_reference_rad"]
+    assert reference_rad - reference_rad[0] == pytest.approx(expected, abs=1e-12)
+    assert session.board[Word.HELD] == 0
+    session.assert_safe()
+
+
+def test_a_stop_ends_the_wait_for_a_piece(make_session):
+    session = make_session()
+    spec = ReferenceSpec(put_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
+    stopping = threading.Timer(0.5, lambda: session.board.__setitem__(Word.STOP, Stop.OPERATOR))
+    stopping.start()
+    session.obey(SessionJob(session.profile, spec))
+    assert session.finished.outcome == "stopped"
+    assert len(session.samples) == session.finished.counts["scheduled"] >= 300
+    session.assert_safe()

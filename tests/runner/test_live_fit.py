@@ -1,0 +1,29 @@
+"""Of which sessions the live view shows fits, and of how many modes."""
+
+from pathlib import Path
+
+import pytest
+
+from rigd.excitation import make_excitation
+from rigd.profile import load_profile
+from rigd.runner._live_view import subject_of
+from rigd.runner._request import Order
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "watch_fit", "modes"),
+    [
+        ("chirp", {}, False, None),
+        ("chirp", {}, True, 3),  # 2.57, 16.0 and 44.8 Hz, and then 88 Hz
+        ("chirp", {"start_hz": 20.0, "stop_hz": 1.0}, True, 2),
+        ("chirp", {"stop_hz": 250.0}, True, 4),
+        ("chirp", {"start_hz": 0.1, "stop_hz": 1.0}, True, 1),
+        ("hold", {}, True, 3),
+        ("until", {"targets": "damping 1%"}, False, 3),
+    ],
+)
+def test_plots_are_of_the_modes_that_are_expected_in_the_band(kind, parameters, watch_fit, modes):
+    profile = load_profile("sim")
+    excitation = make_excitation(kind, parameters, profile.rig.rate_hz)
+    order = Order(profile, excitation, Path("a.mcap"), watch_fit=watch_fit)
+    assert subject_of(order).fit_modes == modes

@@ -1,0 +1,241 @@
+"""What a search for a precision decides, estimate by estimate."""
+
+import numpy as np
+import pytest
+
+from rigd.beam import modes
+from rigd.engine import (
+    FitTold,
+    PieceTold,
+    PieceWriter,
+    SearchEnded,
+    SharedState,
+    Word,
+    put_reference,
+    shared_memory_fd,
+)
+from rigd.excitation import Forecast, Piece, parse_target, until
+from rigd.excitation._targets import Precision
+from rigd.profile import load_profile
+from rigd.runner._precision_search import Search, in_words, stated
+
+NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
+RATE_HZ = 1000
+ON_THE_WAY, CERTAIN = 0.03, 0.001
+"""Relative standard deviations of the damping: a few pieces away from 1 %, and below it."""
+
+
+@pytest.fixture(scope="module")
+def profile():
+    return load_profile("sim")
+
+
+def answer(profile, tick, share, flag=None):
+    """What the fit program answers where every number has a share of itself as its deviation."""
+    beam, damping = profile.rig.beam, profile.rig.damping
+
+    def quantity(value):
+        std = share * value
+        ends = [value - 2 * std, value + 2 * std]
+        return {"value": value, "std": std, "interval_95": ends, "flag": flag}
+
+    found = [mode for mode in modes(beam, damping, 3) if mode.frequency_hz < 50]
+    return {
+        "tick": tick,
+        "problem": "",
+        "doubt": flag,
+        "findings": ["Something struck the beam."] if flag else [],
+        "modes": [
+            {
+                "mode": number,
+                "shown": True,
+                "frequency_hz": quantity(mode.frequency_hz),
+                "damping_ratio": quantity(mode.damping_ratio),
+            }
+            for number, mode in enumerate(found, start=1)
+        ],
+        "parameters": {"zeta": quantity(damping.zeta)},
+        "plant": {
+            "beam": {
+                "length_m": beam.length_m,
+                "density_kg_per_m": beam.density_kg_per_m,
+                "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
+            },
+            "damping": {
+                "zeta": damping.zeta,
+                "alpha": damping.alpha,
+                "gamma": damping.gamma,
+                "lambda": damping.lambda_,
+            },
+            "delay_s": 0.0,
+            "tool_inertia_kg_m2": 0.0,
+        },
+        "covariance": {"names": list(NAMES), "matrix": np.eye(len(NAMES)).tolist()},
+        "noise": {"frequency_hz": [0.1, 50.0], "nm2_per_hz": [5e-8, 5e-8]},
+    }
+
+
+class Bench:
+    """A search with what it writes to, and no process."""
+
+    def __init__(self, profile, targets="damping 1%", at_most_s=60.0):
+        self.profile = profile
+        excitation = until(rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s)
+        planned = excitation.search.planned_ticks
+        spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
+        self.board = SharedState.create(shared_memory_fd())
+        self.writer = PieceWriter(spec, self.board)
+        self.search = Search(excitation.search, profile, self.writer)
+
+    def told(self, share, held=0, **more):
+        document = answer(self.profile, self.search.due + held, share, **more)
+        return list(self.search.answered(document, held))
+
+    def problem(self, text="Nothing is excited yet."):
+        return list(self.search.answered({"tick": self.search.due, "problem": text}, 0))
+
+
+@pytest.fixture
+def quick_pieces(monkeypatch):
+    """Pieces of a second of rest, in place of a design that takes its time."""
+    rest = np.zeros(RATE_HZ)
+
+    def design(estimate, angle_rad, targets, rig, time_left_s, **_):
+        k = len(estimate.names)
+        forecast = Forecast(1e4, "")
+        far = (Precision(targets[0], 1.0, 1.0, 0.1),)
+        return Piece("rest", rest, rest, estimate.names, np.eye(k), far, far, forecast, 0.0)
+
+    monkeypatch.setattr("rigd.runner._precision_search.next_piece", design)
+
+
+@pytest.fixture
+def bench(profile):
+    return Bench(profile)
+
+
+def test_a_piece_follows_where_more_is_to_be_known(bench):
+    planned = bench.writer.ticks
+    assert bench.search.due == planned - 500  # the end of the scan, not that of the pause
+    fit, piece = bench.told(ON_THE_WAY)
+    assert isinstance(fit, FitTold)
+    assert isinstance(piece, PieceTold)
+    assert bench.search.due == planned
+    assert bench.writer.ticks - planned == round(RATE_HZ * piece.document["duration_s"])
+    assert bench.board[Word.PLANNED] == bench.writer.ticks
+    assert not bench.search.may_be_last
+    heads, row = fit.document["text"]
+    assert heads.split()[:5] == ["time", "damping", "of", "mode", "1"]
+    assert row.startswith("  6.0 s 0.9")
+
+
+def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
+    """Only after a pause, and a fit of every structure, does anything count as reached."""
+    bench.told(ON_THE_WAY)
+    planned = bench.writer.ticks
+    while not bench.search.may_be_last:
+        *_, last = bench.told(CERTAIN)
+        assert bench.writer.ticks < 60 * RATE_HZ
+    assert isinstance(last, FitTold | PieceTold)
+    assert bench.search.due == bench.writer.ticks >= planned + 500
+    _, end = bench.told(CERTAIN)
+    assert isinstance(end, SearchEnded)
+    assert end.reached
+    assert end.reason.startswith("Reached: damping of mode 1 0.00")
+    assert end.segments["scan"] == (1000, 6000)
+    assert end.segments["piece_1"][0] == 6500
+    assert bench.search.due is None
+
+
+def test_a_doubted_number_is_not_reached(bench):
+    while not bench.search.may_be_last:
+        bench.told(CERTAIN)
+    fit, *more = bench.told(CERTAIN, flag="part of the record is unexplained")
+    assert not any(isinstance(message, SearchEnded) for message in more)
+    assert {target["std"] for target in fit.document["search"]["targets"]} == {None}
+
+
+def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
+    ends = []
+    while not ends:
+        told = bench.told(ON_THE_WAY, flag="part of the record is unexplained")
+        ends = [message for message in told if isinstance(message, SearchEnded)]
+        assert bench.writer.ticks < 50 * RATE_HZ
+    assert not ends[0].reached
+    assert ends[0].reason == (
+        "The record is doubtful: part of the record is unexplained. Something struck the beam."
+    )
+    assert told[0].document["text"][-1].count("doubtful") == 3
+
+
+def test_ticks_that_were_held_shift_what_follows(bench):
+    bench.told(ON_THE_WAY)
+    bench.told(ON_THE_WAY, held=300)
+    end = bench.search.ended(9000)
+    first, last = end.segments["piece_1"]
+    assert first == 6800
+    assert last > first
+    assert not end.reached
+
+
+def test_a_scan_that_told_nothing_is_repeated_and_then_given_up(bench):
+    planned = bench.writer.ticks
+    for number in (1, 2):
+        (message,) = bench.problem()
+        assert message.name == "the scan once more"
+        assert bench.writer.ticks == planned + number * 5000
+    (end,) = bench.problem()
+    assert (end.reached, end.reason) == (False, "Given up: Nothing is excited yet.")
+
+
+def test_a_record_that_cannot_be_fitted_any_more_is_given_up_at_once(bench):
+    bench.told(ON_THE_WAY)
+    (end,) = bench.problem("The angle is missing for 16 ms.")
+    assert (end.reached, end.reason) == (False, "Given up: The angle is missing for 16 ms.")
+
+
+def test_the_time_that_is_allowed_is_kept(profile, quick_pieces):
+    bench = Bench(profile, "damping 0.01%", at_most_s=12.0)
+    ends = []
+    while not ends:
+        ends = [m for m in bench.told(ON_THE_WAY) if isinstance(m, SearchEnded)]
+        assert bench.writer.ticks <= 12 * RATE_HZ
+    assert not ends[0].reached
+    assert "--at-most" in ends[0].reason
+
+
+def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces):
+    """The information grows by so little that an hour would not do: it is said, with a remedy."""
+    bench = Bench(profile, "damping 0.1%", at_most_s=60.0)
+    share, ends = ON_THE_WAY, []
+    while not ends:
+        ends = [m for m in bench.told(share) if isinstance(m, SearchEnded)]
+        share *= 0.999
+    assert ends[0].reason.startswith("Out of reach: it would take about")
+    assert bench.writer.ticks < 40 * RATE_HZ
+
+
+def test_damping_that_is_absent_cannot_be_told(profile):
+    bench = Bench(profile, "zeta 1%")
+    ends = []
+    while not ends:
+        document = answer(profile, bench.search.due, ON_THE_WAY)
+        document["plant"]["damping"] |= {"zeta": 0.0}
+        document["covariance"]["names"].remove("zeta")
+        document["parameters"] = {}
+        found = bench.search.answered(document, 0)
+        ends = [m for m in found if isinstance(m, SearchEnded)]
+    assert ends[0].reason.startswith("Out of reach: internal damping is absent")
+
+
+def test_an_absent_mode_is_not_stated(profile):
+    (found,) = stated(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
+    assert found.ratio == np.inf
+    assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
+
+
+def test_an_absolute_deviation_is_not_a_share(profile):
+    targets = [parse_target("frequency", "1:0.002Hz"), parse_target("damping", "2:1%")]
+    frequency, damping = stated(answer(profile, 1, 0.02), targets)
+    assert frequency.asked_std == 0.002
+    assert damping.ratio == pytest.approx(2.0)

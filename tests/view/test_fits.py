@@ -1,0 +1,128 @@
+"""Fits of a running session in the live view: intervals over time, and the table of the last."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from online_fits import online_fit
+
+from rigd.session import read_session
+from rigd.session._format import TIMING_DTYPE
+from rigd.view._fits import TABLE, fit_record, fit_source, fit_table
+from rigd.view._layout import FIT_TAB, TABS, blueprint
+from rigd.view._recorded import draw_session, subject_of_session
+from rigd.view._scene import Scene
+
+
+def curves(fit, modes=3):
+    """What each plot shows of a fit: low and high of what is asked, of the interval; estimate."""
+    columns = fit_source(modes, asked=True).columns(fit_record(fit, modes))
+    return {name: values[0].tolist() for name, values in columns.items()}
+
+
+def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for():
+    shown = curves(online_fit(width=2.0))
+    half = 1.96 * 2e-4
+    assert shown["damping_1_percent"] == pytest.approx(
+        [100 * (0.0091 + side) for side in (-1.96 * 9.1e-5, 1.96 * 9.1e-5, -half, half, 0.0)]
+    )
+    # Nothing is asked of its frequency.
+    assert shown["frequency_1_hz"][2:] == pytest.approx(
+        [2.5697 - 2 * half, 2.5697 + 2 * half, 2.5697]
+    )
+    assert np.isnan(shown["frequency_1_hz"][:2]).all()
+
+
+@pytest.mark.parametrize(
+    ("fit", "component"),
+    [
+        (online_fit(), "frequency_3_hz"),  # not visible yet
+        (online_fit(third="doubtful"), "damping_3_percent"),
+        ({"duration_s": 1.0, "problem": "Nothing was excited.", "text": []}, "damping_1_percent"),
+        (None, "damping_1_percent"),
+    ],
+)
+def test_what_is_not_known_is_not_plotted(fit, component):
+    assert np.isnan(curves(fit)[component]).all()
+
+
+def test_where_nothing_can_be_asked_for_there_are_estimate_and_interval():
+    plots = fit_source(2, asked=False).plots
+    assert {curve.label.split(" (")[0] for plot in plots for curve in plot.curves} == {
+        "95 % interval", "estimate",
+    }  # fmt: skip
+
+
+def test_modes_without_a_plot_are_left_to_the_table():
+    assert curves(online_fit(), modes=1).keys() == {"damping_1_percent", "frequency_1_hz"}
+
+
+def test_the_table_says_what_is_reached_and_how_long_it_takes():
+    table = fit_table(online_fit(width=2.0))
+    assert "| damping of mode 1 | 0.0091 | **0.0002 (2.2 %)** | 9.1e-05 (1 %) |" in table
+    assert "| damping of mode 3 | – | – | – |" in table
+    assert "About **12 s** more." in table
+    assert "Fit of the first 8.0 s" in table
+    assert "| 1 | 2.56970 ± 0.00078 | 0.910 ± 0.039 |" in table
+    assert "Not visible so far: mode 3." in table
+    assert "| zeta | (7.04 ± 0.39)·10⁻⁵ |" in table
+    assert "| tool inertia | (0.0 ± 1.2)·10⁻⁶ kg·m² |" in table
+    assert "A disturbance at 50 Hz was modelled." in table
+    assert "✓" not in table
+    assert "✓" in fit_table(online_fit(width=0.9))
+    ended = online_fit() | {"search": {"reason": "Reached: it is <so>.", "targets": []}}
+    assert r"**Reached: it is \<so\>.**" in fit_table(ended)
+    assert "more" not in fit_table(ended)
+    none = {"duration_s": 3.0, "problem": "Nothing was excited.", "text": []}
+    assert fit_table(none) == "**After 3.0 s:** Nothing was excited."
+    assert "doubtful: It depends" in fit_table(online_fit(third="doubtful"))
+
+
+def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode():
+    names = [tab.name for tab in blueprint().root_container.contents]
+    assert names == list(TABS)
+    layout = blueprint("Events", fit_modes=2).root_container
+    assert [tab.name for tab in layout.contents] == [TABS[0], FIT_TAB, *TABS[1:]]
+    assert layout.active_tab == len(TABS)
+    grid, table = layout.contents[1].contents
+    assert [view.name for view in grid.contents] == [
+        "Damping ratio of mode 1 (%)", "Frequency of mode 1 (Hz)",
+        "Damping ratio of mode 2 (%)", "Frequency of mode 2 (Hz)",
+    ]  # fmt: skip
+    assert table.origin == TABLE
+    (only,) = blueprint(fit_modes=0).root_container.contents[1].contents
+    assert only.origin == TABLE
+
+
+def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(subject, shown):
+    picture = Scene(replace(subject, fit_modes=2, excitation="until"))
+    assert shown(picture.frame())[TABLE].last("TextDocument:text") == "No fit yet."
+    picture.fit(online_fit(6.0, 2.0))
+    drawn = picture.fit(online_fit(8.0))
+    for drawings in (drawn, picture.frame()):
+        found = shown(drawings)
+        assert found["/fits"].times_ns["damping_2_percent"][-1] == 8_000_000_000
+        assert found["/fits"].values["damping_2_percent"][-1][-1] == pytest.approx(0.416)
+        assert "Fit of the first 8.0 s" in found[TABLE].last("TextDocument:text")
+    low, high = (np.array(found["/fits"].values["damping_2_percent"])[:, k] for k in (2, 3))
+    # From nothing known over a wide interval to a narrow one.
+    assert np.isnan(low[0])
+    assert (high - low)[1:] == pytest.approx([2 * 2 * 1.96 * 3e-3, 2 * 1.96 * 3e-3])
+
+
+def test_a_session_that_is_not_fitted_draws_none(subject, shown):
+    picture = Scene(subject)
+    assert picture.fit(online_fit()) == []
+    assert TABLE not in shown(picture.frame())
+
+
+def test_a_recorded_session_shows_the_fit_in_its_file(touch_file, shown):
+    timings = np.empty(0, TIMING_DTYPE)
+    recorded = read_session(touch_file.path)
+    assert subject_of_session(recorded).fit_modes is None
+    fit = online_fit(1.5) | {"search": {"reason": "Reached.", "pieces": []}}
+    session = replace(recorded, outcome={"fit": json.dumps(fit)})
+    found = shown([lambda stream: draw_session(stream, session, timings)])
+    assert found[TABLE].last("TextDocument:text").startswith("**Reached.**")
+    assert "/fits" not in found
