@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _SIZE = 8  # bytes of a double
+_AT_REST_RAD = 1e-4
+"""Largest angle at either end of a piece: an encoder step or two."""
+_FULL_TURN_RAD = 6.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +104,13 @@ class PieceWriter:
         Raises
         ------
         ValueError
-            If there is no room for it.
+            If there is no room for it, or it does not begin and end at the start angle.
         """
         size = int(reference_rad.size)
+        ends_rad = abs(reference_rad[0]), abs(reference_rad[-1])
+        # Also if one of them is not a number: the loop follows whatever stands here.
+        if not (max(ends_rad) <= _AT_REST_RAD and abs(reference_rad).max() < _FULL_TURN_RAD):
+            raise ValueError(f"a piece from {reference_rad[0]} rad to {reference_rad[-1]} rad")
         if size > self.room:
             raise ValueError(f"a piece of {size} ticks; there is room for {self.room}")
         start = _SIZE * self.ticks

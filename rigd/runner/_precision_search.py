@@ -254,7 +254,7 @@ class Search:
         try:
             self._uniform = uniform_beam(document) or self._uniform
             yield from self._go_on(self._uniform, found, held, doubt)
-        except (RigdError, ArithmeticError, np.linalg.LinAlgError) as error:
+        except (RigdError, ArithmeticError, ValueError) as error:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
 

@@ -20,13 +20,27 @@ from rigd.engine._reference import (
 from rigd.engine._ring import shared_memory_fd
 from rigd.engine._shared_state import SharedState, Stop, Word
 
+UNIT_RAD = 1e-7
+"""Unit of the angles here: pieces begin and end at rest."""
+
+
+class InUnits:
+    """Writer and reader of angles that are whole numbers of `UNIT_RAD`."""
+
+    def __init__(self, writer, reader):
+        self.append = lambda angles: writer.append(angles * UNIT_RAD)
+        self.at = lambda tick: round(reader.at(tick) / UNIT_RAD)
+        self.close, self.waits, self.over = writer.close, reader.waits, reader.over
+
 
 def growing(planned=3, room=40):
     board = SharedState.create(shared_memory_fd())
     reference_rad = np.zeros(planned + room)
-    reference_rad[:planned] = np.arange(1, planned + 1)
+    reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
     spec = put_reference(shared_memory_fd(), reference_rad, planned)
-    return PieceWriter(spec, board), PieceReader(map_reference(spec), planned, board), board
+    reader = PieceReader(map_reference(spec), planned, board)
+    both = InUnits(PieceWriter(spec, board), reader)
+    return both, both, board
 
 
 def test_pieces_follow_each_other_without_a_gap():
@@ -75,6 +89,17 @@ def test_a_piece_without_room_is_refused():
     writer, _, board = growing(room=2)
     with pytest.raises(ValueError, match="room for 2"):
         writer.append(np.zeros(3))
+    assert board[Word.PLANNED] == 0
+
+
+@pytest.mark.parametrize(
+    "piece_rad",
+    [[0.01, 0.0], [0.0, 0.01], [0.0, np.nan, 0.0], [np.nan, 0.0], [0.0, np.inf], [0.0, 7.0, 0.0]],
+)
+def test_a_piece_that_does_not_begin_and_end_at_rest_is_refused(piece_rad):
+    writer, _, board = growing()
+    with pytest.raises(ValueError, match="a piece from"):
+        writer.append(np.array(piece_rad) / UNIT_RAD)
     assert board[Word.PLANNED] == 0
 
 
