@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rigd.engine import FitTold, PieceTold, PieceWriter, SearchEnded
 from rigd.errors import RigdError
 from rigd.excitation import (
+    BAND_HZ,
     PAUSE_S,
     SHORTEST_S,
     BeamEstimate,
@@ -93,7 +94,9 @@ def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
     if key is None:
         yield _read(target, target.name, document.get("parameters", {}).get(target.quantity))
         return
-    modes = [m for m in document["modes"] if target.mode in (None, m["mode"])]
+    # A fit tells of modes above its band as well, which no piece drives.
+    inside = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
+    modes = [m for m in inside if target.mode in (None, m["mode"])]
     for mode in modes:
         number = int(mode["mode"])
         found = replace(

@@ -234,6 +234,14 @@ def test_an_absent_mode_is_not_stated(profile):
     assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
 
 
+def test_modes_above_the_band_are_not_asked_for(profile):
+    document = answer(profile, 1, CERTAIN)
+    document["modes"][2]["frequency_hz"]["value"] = 51.0
+    document["modes"][2]["shown"] = False
+    found = stated(document, [parse_target("damping", "1%")])
+    assert [each.mode for each in found] == [1, 2]
+
+
 def test_an_absolute_deviation_is_not_a_share(profile):
     targets = [parse_target("frequency", "1:0.002Hz"), parse_target("damping", "2:1%")]
     frequency, damping = stated(answer(profile, 1, 0.02), targets)
