@@ -41,6 +41,7 @@ _HOPELESS: Final = 2.0
 """Forecast over the time that is left from which on a search is out of reach."""
 _SAID: Final = 3
 """Decisions in a row that have to find so before the search is given up."""
+_NOT_UNIFORM: Final = ("modes free", "tip mass")
 _NOT_SEEN: Final = "not visible yet"
 _DOUBTED: Final = 4
 """Fits of all structures in a row of which no number is to be believed, before it is given up."""
@@ -86,7 +87,26 @@ def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[State
     targets
         What is asked for; of modes without a number, it is asked of each one in the band.
     """
-    return [each for target in targets for each in _stated(document, target)]
+    found = [each for target in targets for each in _stated(document, target)]
+    doubt = of_another_beam(document)
+    return [replace(each, std=inf, doubt=doubt) for each in found] if doubt else found
+
+
+def of_another_beam(document: Mapping[str, Any]) -> str:
+    """Say why what narrow bands tell of a beam is not to be believed; empty if it is uniform.
+
+    Between the modes, where no piece goes, a mass at the tip and modes with stiffnesses of their
+    own differ; at the modes one imitates the other, with other dampings.
+
+    Parameters
+    ----------
+    document
+        Answer of the fit program.
+    """
+    kind = document.get("type") or ""
+    if not any(other in kind for other in _NOT_UNIFORM):
+        return ""
+    return f"the beam is not uniform (type {kind}), of which narrow bands tell too little"
 
 
 def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
@@ -242,7 +262,7 @@ class Search:
         found = stated(document, self._targets)
         time_s = document["tick"] / self._rate_hz
         self._course.note(time_s, max(each.ratio for each in found))
-        doubt = document["doubt"]
+        doubt = document["doubt"] or of_another_beam(document)
         # Doubts of a uniform beam alone are looked into first.
         yield self._told(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
         if self.may_be_last and all(each.ratio <= 1.0 for each in found):
@@ -252,7 +272,8 @@ class Search:
             self._doubtful = self._doubtful + 1 if doubt else 0
         if self._doubtful >= _DOUBTED:
             findings = " ".join(document["findings"])
-            yield self._end(f"The record is doubtful: {doubt}. {findings}".strip(), reached=False)
+            reason = f"The record is doubtful: {doubt}. {findings} Take a chirp."
+            yield self._end(reason.replace("  ", " "), reached=False)
             return
         try:
             self._uniform = uniform_beam(document) or self._uniform

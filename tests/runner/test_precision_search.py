@@ -163,7 +163,8 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
         assert bench.writer.ticks < 50 * RATE_HZ
     assert not ends[0].reached
     assert ends[0].reason == (
-        "The record is doubtful: part of the record is unexplained. Something struck the beam."
+        "The record is doubtful: part of the record is unexplained. Something struck the beam. "
+        "Take a chirp."
     )
     assert told[0].document["text"][-1].count("doubtful") == 3
 
@@ -232,6 +233,14 @@ def test_an_absent_mode_is_not_stated(profile):
     (found,) = stated(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
     assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
+
+
+@pytest.mark.parametrize("kind", ["VI, tip mass", "IV, modes free"])
+def test_a_beam_that_is_not_uniform_is_not_told_by_narrow_bands(profile, kind):
+    document = answer(profile, 1, CERTAIN) | {"type": kind}
+    for found in stated(document, [parse_target("damping", "1%")]):
+        assert found.ratio == np.inf
+        assert kind in found.doubt
 
 
 def test_modes_above_the_band_are_not_asked_for(profile):
