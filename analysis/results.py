@@ -281,10 +281,13 @@ def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
     """
     from numpy import generic
 
-    if isinstance(value, dict):
-        return {str(key).rstrip("_"): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    def copy(value: Any) -> Any:  # noqa: ANN401
+        if isinstance(value, dict):
+            return {str(key).rstrip("_"): copy(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [copy(item) for item in value]
+        if isinstance(value, generic):
+            value = value.item()
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return copy(value)

@@ -86,6 +86,22 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
     return f"{scale * value:.{digits}f} ± {half:.{digits}f}"
 
 
+def with_share(std: float, value: float) -> str:
+    """Write a standard deviation, with its share of the value unless that is 0.
+
+    Parameters
+    ----------
+    std, value
+        In one unit.
+
+    Examples
+    --------
+    >>> print(with_share(6.5e-5, 0.0091), with_share(0.1, 0.0), sep=", ")
+    6.5e-05 (0.71 %), 0.1
+    """
+    return f"{std:.2g} ({100.0 * std / abs(value):.2g} %)" if value else f"{std:.2g}"
+
+
 def decimals(uncertainty: float) -> int:
     """Return how many decimals show a number to the second digit of its uncertainty.
 

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +119,18 @@ class Child:
             code = self._process.wait()
             how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
             raise ChildError(f"The {self.name} process was {how}.") from None
+
+    def messages(self, timeout_s: float) -> Iterator[object]:
+        """Yield the messages that are there, waiting for the first only.
+
+        Raises
+        ------
+        ChildError
+            If the child has ended.
+        """
+        while (message := self.poll(timeout_s)) is not None:
+            yield message
+            timeout_s = 0.0
 
     def wake(self) -> None:
         """Have it go on if somebody suspended it: it may have something to bring to an end."""

@@ -119,10 +119,6 @@ class PieceWriter:
         self.room -= size
         self._board[Word.PLANNED] = self.ticks
 
-    def close(self) -> None:
-        """Unmap the memory; the descriptor stays open."""
-        self._memory.close()
-
 
 class PieceReader:
     """Follows a reference that grows, tick by tick; holds the last angle while there is no more.

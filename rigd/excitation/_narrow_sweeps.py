@@ -23,6 +23,7 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
 from rigd.excitation._signals import (
+    SHARE_OF_LIMITS,
     Excitation,
     ExcitationError,
     assemble,
@@ -35,9 +36,6 @@ from rigd.runtime import open_plain_file
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-SHARE_OF_LIMITS: Final = 0.9
-"""Share that the sweeps are predicted to take; the rest is for a beam unlike the profile's."""
 
 _EASINGS: Final = 8
 _CLOSE_ENOUGH: Final = 1.005

@@ -23,13 +23,10 @@ from rigd.excitation._fisher_information import (
 )
 from rigd.excitation._moves import quintic
 from rigd.excitation._shortest_move import MovePlant
-from rigd.excitation._signals import ExcitationError
+from rigd.excitation._signals import SHARE_OF_LIMITS, ExcitationError
 from rigd.excitation._targets import Precision, Quantities
 
 Real = NDArray[np.float64]
-
-SHARE_OF_LIMITS: Final = 0.9
-"""Share of every limit, and of the range of small slopes, that a session is predicted to take."""
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
 """Durations of pieces."""
@@ -285,8 +282,8 @@ class PieceSearch:
             self.swing,
             0.0,
         )
-        through = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
-        quiet = {number: self.quieted(nothing, number, through) for number in through}
+        at_modes = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
+        quiet = {number: self.quieted(nothing, number, at_modes) for number in at_modes}
         found = max(
             (
                 self.added(start, 1.0, band, basis, turn)
@@ -319,10 +316,10 @@ class PieceSearch:
         return round(time_s * self.model.sample_hz)
 
     def quieted(
-        self, start: _Candidate, number: int, through: dict[int, tuple[_Sweep, _Sweep]]
+        self, start: _Candidate, number: int, at_modes: dict[int, tuple[_Sweep, _Sweep]]
     ) -> _Candidate:
         """Bring all modes but one to rest by the end of the piece, as far as the limits allow."""
-        sweeps = [sweep for other, basis in through.items() if other != number for sweep in basis]
+        sweeps = [sweep for other, basis in at_modes.items() if other != number for sweep in basis]
         if not sweeps:
             return start
         first = self.model_samples(start.duration_s)

@@ -26,6 +26,7 @@ from rigd.excitation._moves import (
     zero_rows,
 )
 from rigd.excitation._signals import (
+    SHARE_OF_LIMITS,
     Excitation,
     ExcitationError,
     assemble,
@@ -36,9 +37,6 @@ from rigd.excitation._signals import (
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
-
-SHARE_OF_LIMITS: Final = 0.9
-"""Share of torque, speed, tracking error and sensor that a move may take."""
 
 LONGEST_S: Final = 60.0
 """A move that would take longer is refused."""

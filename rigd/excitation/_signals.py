@@ -19,6 +19,10 @@ FloatArray = NDArray[np.float64]
 SAMPLES_PER_PERIOD = 4
 """Fewest samples in a period of the reference: with less it is not a sine any more."""
 
+SHARE_OF_LIMITS = 0.9
+"""Share of every limit that an excitation made for a rig is predicted to take; the rest is for a
+beam unlike the one it was made with."""
+
 MAX_TICKS = 7_200_000
 """Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
 

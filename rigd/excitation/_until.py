@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD
 from rigd.excitation._moves import quintic
-from rigd.excitation._narrow_sweeps import SHARE_OF_LIMITS
 from rigd.excitation._signals import (
+    SHARE_OF_LIMITS,
     Excitation,
     ExcitationError,
     frequency,

@@ -1,7 +1,7 @@
 """Fits of a running session: what its fit process tells, and what follows for the session."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.engine import (
@@ -20,7 +20,7 @@ from rigd.engine import (
     Stop,
     Word,
 )
-from rigd.runner._precision_search import in_words, stated, targets_json
+from rigd.runner._precision_search import Stated, in_words, stated, targets_json
 
 if TYPE_CHECKING:
     from rigd.engine import ReferenceSpec
@@ -62,8 +62,6 @@ class OnlineFit:
 
     Attributes
     ----------
-    segments
-        Segments of the record that were planned while it ran.
     shortcoming
         What is missing of the precision that was asked for, once the record is fitted; empty if
         nothing is.
@@ -88,7 +86,7 @@ class OnlineFit:
         self._ready = self._begun = False
         self._lost = ""
         self._pulse = Pulse()
-        self.segments: Mapping[str, tuple[int, int]] = {}
+        self._segments: Mapping[str, tuple[int, int]] = {}
         self.shortcoming = ""
         first = crew.channels.samples.written
         job = FitJob(crew.channels.specs, first, profile, reference, search, realtime)
@@ -160,29 +158,42 @@ class OnlineFit:
         told = {} if self._told is None else self._told.document
         document = {key: told[key] for key in _KEPT if key in told}
         if self._search is not None:
-            self.shortcoming = self._judge(document)
+            targets = self._search.targets
+            found = stated(document, targets) if "modes" in document else []
+            self.shortcoming = self._judge(found)
             document["search"] = {
-                "asked": [str(target) for target in self._search.targets],
-                "targets": targets_json(stated(document, self._search.targets))
-                if "modes" in document
-                else [],
+                "asked": [str(target) for target in targets],
+                "targets": targets_json(found),
                 "reached": not self.shortcoming,
                 "reason": self.shortcoming or self._reason,
                 "pieces": self._pieces,
             }
         return document
 
+    def played(self, ticks: int) -> dict[str, tuple[int, int]]:
+        """Return the segments that were planned while the record ran, as far as it goes.
+
+        Parameters
+        ----------
+        ticks
+            Ticks that were scheduled.
+        """
+        return {
+            name: (first, min(end, ticks))
+            for name, (first, end) in self._segments.items()
+            if first < ticks
+        }
+
     @property
     def _reason(self) -> str:
         """Why a search for a precision ended, a sentence; empty if it was stopped."""
         return self._ended.reason if self._ended is not None else self._lost
 
-    def _judge(self, document: Mapping[str, Any]) -> str:
+    def _judge(self, found: Sequence[Stated]) -> str:
         """Say what is missing of what was asked for; empty if the whole record has all of it."""
-        assert self._search is not None
         if self._told is None:
             return self._reason or "Nothing was fitted."
-        short = [each for each in stated(document, self._search.targets) if each.ratio > 1.0]
+        short = [each for each in found if each.ratio > 1.0]
         if self._told.final and not short:
             return ""
         reason = self._reason
@@ -207,9 +218,8 @@ class OnlineFit:
         if self._lost:
             return
         try:
-            while (message := self._crew[FIT].poll(patience_s)) is not None:
+            for message in self._crew[FIT].messages(patience_s):
                 self._take(message)
-                patience_s = 0.0
         except ChildError as error:
             self._lose(str(error))
 
@@ -225,7 +235,7 @@ class OnlineFit:
                 self._pieces.append({"name": name, **document})
                 self._events.append(Event(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
-                self._ended, self.segments = message, segments
+                self._ended, self._segments = message, segments
                 self._board[Word.LAST_PIECE] = 1
                 self._events.append(Event(0, "info", reason, notable=True))
             case Failed(reason):

@@ -29,7 +29,7 @@ from rigd.excitation import (
 )
 from rigd.profile import Profile
 from rigd.runner._planning import LoopPreview
-from rigd.units import with_half_width
+from rigd.units import with_half_width, with_share
 
 Real = NDArray[np.float64]
 
@@ -381,18 +381,21 @@ class Search:
         quietly: bool,
     ) -> FitTold:
         """Return an estimate with a row of the table of what is asked for."""
+        state = {"left_s": self._course.left_s, "targets": targets_json(found)}
+        text = [] if quietly else self._rows(found, time_s)
+        return FitTold({**document, "search": state, "text": text})
+
+    def _rows(self, found: Sequence[Stated], time_s: float) -> list[str]:
+        """Return the next row of the table, with its heads where these are new."""
+        rows = []
         columns = [each.name for each in found]
-        lines = []
-        if columns != self._columns and not quietly:
+        if columns != self._columns:
             self._columns = columns
-            heads = (f"{name:<{_WIDTH}}" for name in columns)
-            lines.append(f"  time  {''.join(heads)}left   (± one standard deviation)")
+            heads = "".join(f"{name:<{_WIDTH}}" for name in columns)
+            rows.append(f"  time  {heads}left   (± one standard deviation)")
         left_s = self._course.left_s
-        state = {"left_s": left_s, **self.state(document)}
-        cells = (f"{_cell(each):<{_WIDTH}}" for each in found)
-        left = "" if left_s is None else f"{left_s:.0f} s"
-        lines.append(f"{time_s:5.1f} s {''.join(cells)}{left}")
-        return FitTold({**document, "search": state, "text": [] if quietly else lines})
+        cells = "".join(f"{_cell(each):<{_WIDTH}}" for each in found)
+        return [*rows, f"{time_s:5.1f} s {cells}{'' if left_s is None else f'{left_s:.0f} s'}"]
 
     def state(self, document: Mapping[str, Any]) -> dict[str, Any]:
         """Return what an estimate states of what is asked for, as JSON documents have it.
@@ -511,5 +514,4 @@ def in_words(found: Sequence[Stated]) -> str:
 def _one_in_words(each: Stated) -> str:
     if each.value is None or each.doubt:
         return f"{each.name}: {each.doubt}"
-    share = f" ({100 * each.std / abs(each.value):.2g} %)" if each.value else ""
-    return f"{each.name} {each.value:.5g}, standard deviation {each.std:.2g}{share}"
+    return f"{each.name} {each.value:.5g}, standard deviation {with_share(each.std, each.value)}"

@@ -513,11 +513,15 @@ class Session:
             touches = self._touches.finish(self._board[Word.TOUCHES], self._report)
             outcome["touches"] = json.dumps(touches)
             self._report()
-        fit, segments = self._finish_fit(finished)
-        if fit is not None:
+        fit: dict[str, Any] | None = None
+        segments: dict[str, tuple[int, int]] = {}
+        if self._fit is not None:
+            fit = self._fit.finish(finished.counts["scheduled"], self._report)
+            segments = self._fit.played(finished.counts["scheduled"])
+            self._report()
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
-                outcome["reason"] = self._fit.shortcoming if self._fit is not None else ""
+                outcome["reason"] = self._fit.shortcoming
         self._crew.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
         self._crew.recorder.send(Close(outcome, packed, segments))
@@ -544,22 +548,6 @@ class Session:
             touches=None if touches is None else tuple(touches),
             fit=fit,
         )
-
-    def _finish_fit(
-        self, finished: Finished
-    ) -> tuple[dict[str, Any] | None, dict[str, tuple[int, int]]]:
-        """Return the fit of the whole record, and the segments that were planned on the way."""
-        if self._fit is None:
-            return None, {}
-        ticks = finished.counts["scheduled"]
-        fit = self._fit.finish(ticks, self._report)
-        self._report()
-        played = {
-            name: (first, min(end, ticks))
-            for name, (first, end) in self._fit.segments.items()
-            if first < ticks
-        }
-        return fit, played
 
 
 def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:

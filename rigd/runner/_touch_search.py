@@ -203,11 +203,10 @@ class TouchEstimates:
         if self._lost:
             return
         try:
-            while (message := self._crew[TOUCH].poll(patience_s)) is not None:
+            for message in self._crew[TOUCH].messages(patience_s):
                 if isinstance(message, TouchTold):
                     self._told[message.number] = message
                     self._note(message)
-                patience_s = 0.0
         except ChildError as error:
             self._lose(str(error))
 

@@ -34,6 +34,7 @@ from rigd.runner._precision_search import Search
 from rigd.runtime import SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import (
+    SAMPLE_SIZE,
     EstimateRequest,
     StreamStart,
     decode_samples,
@@ -194,7 +195,7 @@ class _Follower:
         if not block:
             return False
         write_samples(self._program.input, block)
-        self._ticks = int(decode_samples(block)["tick"][-1]) + 1
+        self._ticks = int(decode_samples(block[-SAMPLE_SIZE:])["tick"][0]) + 1
         return True
 
     def _ask(self, *, drained: bool) -> None:
@@ -218,23 +219,23 @@ class _Follower:
 
     def _answered(self, answer: dict[str, Any]) -> bool:
         """Tell of an estimate, and plan by it; say whether it is of the whole record."""
-        # The last one of a search is of the record that the one before was of.
-        answer["text"] = estimate_lines(answer, None if self._search else self._before)
-        self._before = answer
         asked, search = self._asked, self._search
-        if asked is not None and asked.id == answer["id"]:
+        answers = asked is not None and asked.id == answer["id"]
+        final = answers and asked is not None and asked.tick == self._ended_after
+        if answers:
             self._asked = None
-            if asked.tick == self._ended_after:
-                if search is not None:
-                    answer["search"] = search.state(answer)
-                self._parent.send(FitTold(answer, final=True))
-                return True
+        if search is not None and not final:
+            if self._ended_after is None:
+                for message in search.answered(answer, self._board[Word.HELD]):
+                    self._parent.send(message)
+            return False
+        answer["text"] = estimate_lines(answer, self._before)
         if search is None:
-            self._parent.send(FitTold(answer))
-        elif self._ended_after is None:
-            for message in search.answered(answer, self._board[Word.HELD]):
-                self._parent.send(message)
-        return False
+            self._before = answer
+        else:
+            answer["search"] = search.state(answer)
+        self._parent.send(FitTold(answer, final=final))
+        return final
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.units import suffix_of, unit_of, with_half_width
+from rigd.units import suffix_of, unit_of, with_half_width, with_share
 from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
 from rigd.view._session_info import plain
 
@@ -183,18 +183,14 @@ def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
     if value is None:
         return plain(target["name"]), "–", "–", "–"
     if std is None:
-        return plain(target["name"]), f"{value:.4g}", "doubtful", _std(asked_std, value)
+        return plain(target["name"]), f"{value:.4g}", "doubtful", with_share(asked_std, value)
     reached = " ✓" if std <= asked_std else ""
     return (
         plain(target["name"]),
         f"{value:.4g}",
-        f"**{_std(std, value)}**{reached}",
-        _std(asked_std, value),
+        f"**{with_share(std, value)}**{reached}",
+        with_share(asked_std, value),
     )
-
-
-def _std(std: float, value: float) -> str:
-    return f"{std:.2g} ({100.0 * std / abs(value):.2g} %)" if value else f"{std:.2g}"
 
 
 def _mode_row(mode: Mapping[str, Any]) -> tuple[str, ...]:

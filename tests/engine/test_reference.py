@@ -30,7 +30,7 @@ class InUnits:
     def __init__(self, writer, reader):
         self.append = lambda angles: writer.append(angles * UNIT_RAD)
         self.at = lambda tick: round(reader.at(tick) / UNIT_RAD)
-        self.close, self.waits, self.over = writer.close, reader.waits, reader.over
+        self.waits, self.over = reader.waits, reader.over
 
 
 def growing(planned=3, room=40):
@@ -128,7 +128,6 @@ def test_every_angle_of_a_piece_comes_in_its_order(pieces, missed):
     assert values == sorted(values)
     for (first, a), (then, b) in pairwise(followed):
         assert b - a <= then - first
-    writer.close()
 
 
 def test_a_session_follows_pieces_that_come_while_it_runs(make_session):

@@ -134,6 +134,18 @@ def test_one_mode_asked_for_is_the_one_that_is_driven(rig):
     assert power[np.abs(hz - 44.8) < 4].sum() > 0.5 * power.sum()
 
 
+def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, scanned):
+    names = [
+        next_piece(ESTIMATE, scanned, DAMPING, rig, 10.0, through=through).name
+        for through in ((), (1,), (2,), (3,))
+    ]
+    driven = [name.partition(",")[0].split() for name in names]
+    for number, modes in enumerate(driven[1:], start=1):
+        assert str(number) in modes
+    # Not for the reason that all are driven anyway.
+    assert any(str(number) not in driven[0] for number in (1, 2, 3))
+
+
 def test_the_largest_factor_is_that_of_the_first_limit_met():
     before = np.array([[0.5, -0.2, 1.2], [0.0, 0.9, 0.0]])
     unit = np.array([[0.1, -0.4, 0.0], [0.01, 0.05, 0.0]])
