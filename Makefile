@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # test can have one. So it has processes of its own, a file of tests in each.
 BROWSER := -n 2 --dist loadfile tests/web
 
-.PHONY: demo test test-all test-fast check bench fuzz chaos endurance clean
+.PHONY: demo test test-further test-all test-fast check bench fuzz chaos endurance clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -17,15 +17,21 @@ demo: $(VENV)/ready
 	$(BIN)/analyze demo/*.mcap --report demo/report
 	@echo "The operator's page on the simulated rig: $(BIN)/rigd serve --profile sim --web --output demo"
 
+# Five minutes on two processors: every behaviour once.
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser"
-	$(BIN)/python -m pytest $(BROWSER) -m "browser and not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not further and not slow and not browser"
+	$(BIN)/python -m pytest $(BROWSER) -m "browser and not further and not slow"
+
+# What is shown once more: over another transport, with other values, at more length.
+test-further: $(VENV)/ready
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "further and not slow and not browser"
+	$(BIN)/python -m pytest $(BROWSER) -m "browser and further and not slow"
 
 # Without what starts processes or fits models: a minute, for every edit.
 test-fast: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser and not process and not fit"
 
-# With what is shown once more at full length, or over another transport.
+# All tests, also what is shown once more at full length.
 test-all: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not browser"
 	$(BIN)/python -m pytest $(BROWSER) -m browser

@@ -77,6 +77,7 @@ def test_peaks_of_the_response_are_found(session, tmp_path):
         assert values(r"  ([\d.]+) Hz, ", part)[:2] == pytest.approx(undamped, rel=0.02)
 
 
+@pytest.mark.further  # as in tests/identify
 def test_structures_are_fitted_and_one_is_selected(session, tmp_path):
     printed = run("fit_and_select", tmp_path, session)
     fits = re.findall(r"^type (\w+), cost [\d.]+$", printed, re.MULTILINE)
@@ -86,6 +87,7 @@ def test_structures_are_fitted_and_one_is_selected(session, tmp_path):
     assert values(r"lambda = ([\d.]+) ", printed) == pytest.approx([0.594], abs=0.03)
 
 
+@pytest.mark.further  # as in tests/campaigns
 def test_sessions_are_pooled(made, tmp_path):
     printed = run("campaign", tmp_path, *made[1])
     assert "2 sessions\n" in printed

@@ -32,13 +32,13 @@ def is_private(module):
     )
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_private_modules_are_imported_in_their_own_folder_only(path):
-    folder = name_of(path.parent / "__init__.py")
+@pytest.mark.parametrize("room", sorted({path.parent for path in SOURCES}), ids=name_of)
+def test_private_modules_are_imported_in_their_own_folder_only(room):
     foreign = {
-        module
+        (path.name, module)
+        for path in room.glob("*.py")
         for module in imported_modules(path)
-        if is_private(module) and module.split("._")[0] != folder
+        if is_private(module) and module.split("._")[0] != name_of(room)
     }
     assert not foreign
 

@@ -24,6 +24,7 @@ def record(workspace):
     return api.load(str(workspace / "session.mcap"))
 
 
+@pytest.mark.further  # each of its steps is tested below
 def test_the_document_s_example_runs_as_written(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     blocks = re.findall(r"^```python\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)

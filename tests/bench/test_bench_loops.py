@@ -29,6 +29,7 @@ def precedence():
     return policy, os.getpriority(os.PRIO_PROCESS, 0), os.sched_getaffinity(0)
 
 
+@pytest.mark.further  # as one with a file
 def test_the_loop_alone_is_measured_without_a_file(profile):
     looks = []
     before = precedence()

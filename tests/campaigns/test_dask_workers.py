@@ -98,6 +98,7 @@ def test_without_dask_it_is_said_what_to_install(monkeypatch):
         pass
 
 
+@pytest.mark.further  # as test_workers.py
 def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
     with (
         dask.config.set(ONE_DEATH_IS_ENOUGH),

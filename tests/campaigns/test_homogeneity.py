@@ -145,6 +145,7 @@ def mixture(
         return campaign(paths, replace(settings, types=("I",)), structures=("III", "IV"))
 
 
+@pytest.mark.further  # as made by hand above
 def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     stated, differing, where, structure, *_ = mixture.verdict.sentences
     assert "2 different specimens: beam_length_m 0.98 m in 4 files (0.mcap, 1.mcap" in stated
@@ -159,6 +160,7 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     assert campaign_text(mixture).startswith("The files state 2 different specimens")
 
 
+@pytest.mark.further  # as made by hand above
 def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
     """Frequencies go with the root of the stiffness: the truth, not the estimate, is the peer."""
     link, _ = truth
@@ -175,6 +177,7 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
     assert frequency.own_stds > 10
 
 
+@pytest.mark.further  # as made by hand above
 def test_what_agrees_is_not_marked_as_a_mixture(mixture):
     """Both beams are damped alike; their stiffness is not the same."""
     rows = [row for row in json_rows(all_tables(mixture)["pooled"]) if row["type"] == "III"]
@@ -189,6 +192,7 @@ def test_what_agrees_is_not_marked_as_a_mixture(mixture):
     assert {title.split(" ")[0] for title in titles} >= {"ρ/EI‡", "ζ", "γ"}
 
 
+@pytest.mark.further  # as made by hand above
 def test_page_and_json_tell_it_too(mixture):
     content = campaign_document(mixture)
     assert content["one_specimen"] is False
@@ -202,6 +206,7 @@ def test_page_and_json_tell_it_too(mixture):
         assert content[name]
 
 
+@pytest.mark.further  # as made by hand above
 def test_a_structure_that_none_selects_nor_determines_has_its_row(mixture):
     """Type IV has no external damping: the internal one is driven to the edge of its range."""
     rows = {each.name: each for each in mixture.structures}

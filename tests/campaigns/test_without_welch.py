@@ -43,6 +43,7 @@ def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
         assert session.warnings[-1].startswith("Welch fits left out: a multisine")
 
 
+@pytest.mark.further  # as what is pooled
 def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     write_campaign(found, tmp_path)
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}

@@ -3,6 +3,7 @@ import os
 import time
 
 import pytest
+from cases import further
 
 from analysis.campaigns import CampaignError
 from analysis.campaigns._workers import Lost, process_pool
@@ -44,7 +45,7 @@ def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
     assert "memory" in lost.reason
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [further(1), 2])
 def test_the_first_task_of_all_may_be_the_one(jobs):
     with process_pool(jobs) as pool:
         lost, *others = pool.run(ends_at_zero, [(n,) for n in (0, 1, 2)])
@@ -52,6 +53,7 @@ def test_the_first_task_of_all_may_be_the_one(jobs):
     assert others == [1, 2]
 
 
+@pytest.mark.further  # as one that dies after others are done
 def test_a_second_worker_that_dies_before_anything_is_done_ends_all():
     with process_pool(1) as pool, pytest.raises(CampaignError, match="worker processes ended"):
         pool.run(ends_at_zero, [(0,), (0,), (1,)])

@@ -26,7 +26,8 @@ def rig():
 @pytest.mark.parametrize(
     ("victim", "how", "moment_s", "others"),
     [
-        ("all", signal.SIGKILL, 0.6, {"analysed": True}),
+        # Each by itself is killed in tests/cli/test_run.py.
+        pytest.param("all", signal.SIGKILL, 0.6, {"analysed": True}, marks=pytest.mark.further),
         # The others have to go on by themselves, for the drive's sake and for the file's.
         pytest.param(
             *("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}), marks=pytest.mark.slow

@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 
 import pytest
+from cases import further
 
 from rigd.checks._devices import inspect_devices
 from rigd.checks._rows import Verdict, overall
@@ -21,7 +22,7 @@ sys.exit(run_simulator(load_profile(sys.argv[1]).rig, SimulatorOptions(lock_step
 """
 
 
-@pytest.fixture(params=["antenna_can", "antenna_serial"])
+@pytest.fixture(params=["antenna_can", further("antenna_serial")])
 def profile(request, can_profile, serial_profile):
     profile = {"antenna_can": can_profile, "antenna_serial": serial_profile}[request.param]
     process = subprocess.Popen(

@@ -167,6 +167,7 @@ def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkey
     assert said.count("The live view of sim has restarted.") == 2
 
 
+@pytest.mark.further  # as through its files
 def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(
     rigd, rigd_here, start_rigd, runtime_folder
 ):
@@ -197,6 +198,7 @@ def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
     assert "rigd live --wait" in done.stderr
 
 
+@pytest.mark.further  # as one whose view is about to begin
 def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd):
     serve = start_rigd("serve", "--profile", "sim", "--fast")
     assert eventually(lambda: rigd_here("status").returncode == 0)

@@ -4,6 +4,7 @@ import re
 import shutil
 
 import pytest
+from cases import further
 from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text, without
 from typer.testing import CliRunner
 
@@ -34,7 +35,7 @@ def asked(tmp_path, monkeypatch):
     return asked
 
 
-@pytest.mark.parametrize("start_from", ["antenna_can", "antenna_serial"])
+@pytest.mark.parametrize("start_from", ["antenna_can", further("antenna_serial")])
 @pytest.mark.parametrize("name", WITH_TORQUE)
 def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
     done = new(eds_path(name), "--from", start_from)
@@ -50,7 +51,7 @@ def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
     assert settings.accept_without == ()
 
 
-@pytest.mark.parametrize("name", WITH_TORQUE)
+@pytest.mark.parametrize("name", [WITH_TORQUE[0], *map(further, WITH_TORQUE[1:])])
 def test_it_gets_past_loading_in_a_check(new, rigd_here, monkeypatch, name):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)
     monkeypatch.setattr("rigd.checks._rig.inspect_devices", lambda _: [])

@@ -422,6 +422,7 @@ def test_a_start_after_all_times_is_told(short):
         subject_of_session(late)
 
 
+@pytest.mark.further  # as the full disk of a session is
 def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
     def little_room():
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
@@ -458,6 +459,7 @@ def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypat
     assert "--save" not in recording.stderr
 
 
+@pytest.mark.further  # as that of a live view
 def test_a_window_that_cannot_be_opened_is_told(rerun_program, short, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
     environment |= {"DISPLAY": ":48123", "TMPDIR": str(tmp_path)}
@@ -496,6 +498,7 @@ def served(rerun_program, short, tmp_path):
     process.communicate()
 
 
+@pytest.mark.further  # as tests/live/test_live_page.py
 def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
     process, address = served
     assert address.startswith("http://127.0.0.1:"), process.stderr.read()
@@ -518,6 +521,7 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
     assert eventually(lambda: has_ended(server))
 
 
+@pytest.mark.further  # as that of a live view
 def test_a_server_that_dies_is_told(served, tmp_path):
     process, _ = served
     (server,) = children(process.pid)
@@ -558,6 +562,7 @@ def unseen(viewer, colors: dict) -> list:
     return sorted(missing)
 
 
+@pytest.mark.further  # as the live view's
 def test_a_port_that_somebody_takes_first_is_not_insisted_on(
     rerun_program, recording, tmp_path, monkeypatch
 ):
@@ -571,6 +576,7 @@ def test_a_port_that_somebody_takes_first_is_not_insisted_on(
             assert page.address.grpc_port == page.program.grpc_port
 
 
+@pytest.mark.further  # as tests/live/test_live_window.py
 @pytest.mark.parametrize("way", ["window", "browser"])
 def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""

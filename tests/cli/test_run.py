@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 from processes import child_running, eventually, has_ended, ignored, ignores
 
 from rigd.beam import pressing_force_n
@@ -68,13 +69,13 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
 @pytest.mark.parametrize(
     ("arguments", "ticks"),
     [
-        (("hold", "--duration", "1", "--rest", "0.5"), 1500),
+        further(("hold", "--duration", "1", "--rest", "0.5"), 1500),
         pytest.param(  # runs in tests/docs/test_readme.py as well
             ("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"),
             2000,
             marks=pytest.mark.slow,
         ),
-        (
+        further(
             ("multisine", "--amplitude", "0.01", "--period", "1", "--duration", "2", "--start-hz",
              "1", "--stop-hz", "20", "--rest", "0.5", "--ring-down", "0.5"),
             3000,
@@ -88,6 +89,7 @@ def test_every_excitation_runs(rigd, tmp_path, arguments, ticks):
     assert record.metadata["excitation"] == arguments[0]
 
 
+@pytest.mark.further  # as tests/runner/test_quick_looks.py
 def test_each_session_gets_a_quick_look(rigd, tmp_path, brief_looks):
     (tmp_path / "analysis").mkdir()
     (tmp_path / "analysis" / "__init__.py").write_text("raise SystemExit('the wrong one')")
@@ -120,6 +122,7 @@ def finished(process):
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
+@pytest.mark.further  # as tests/excitation and the engine
 def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     (tmp_path / "reference.csv").write_text(
         "time_s,angle_rad\n" + "".join(f"{t / 100},{0.01 * (t / 100)}\n" for t in range(201))
@@ -132,6 +135,7 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
 
 
+@pytest.mark.further  # as test_touch.py has it
 def test_an_obstacle_is_met_and_stands_in_the_file(rigd, tmp_path):
     options = ("step", "--amplitude", "0.05", "--duration", "1", "--rest", "0.2", "--fast")
     obstacle = "x=0.62,angle=0.02,stiffness=3000"
@@ -153,6 +157,7 @@ def test_an_obstacle_is_met_and_stands_in_the_file(rigd, tmp_path):
     assert abs(free.samples["fy_n"][-300:].mean()) < 0.2 * force_n
 
 
+@pytest.mark.further  # as in the engine
 def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):
     def series():
         options = ("--seed", "5", "--repeat", "2", "--note", "a series", *SHORT)
@@ -211,8 +216,9 @@ def recorded(folder, size=50_000, timeout_s=60.0):
 @pytest.mark.parametrize(
     ("send", "interrupts"),
     [
-        (to_all, ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")),
-        (to_one, ("SIGINT", "SIGTERM")),
+        (to_all, ("SIGINT", "SIGHUP")),
+        further(to_all, ("SIGTERM", "SIGQUIT", "SIGTSTP")),
+        pytest.param(to_one, ("SIGINT", "SIGTERM"), marks=pytest.mark.further),
         pytest.param(to_one, ("SIGHUP", "SIGQUIT", "SIGTSTP"), marks=pytest.mark.slow),
     ],
 )
@@ -248,6 +254,7 @@ def test_every_stop_leaves_the_torque_off_and_a_complete_file(
         assert not list(folder.glob("sessions/*.part"))
 
 
+@pytest.mark.further  # as tests/engine, without processes
 def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_path):
     running = []
     for number in range(5):
@@ -273,6 +280,7 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
                 assert session["scheduled"] == 0
 
 
+@pytest.mark.further  # as in tests/runner
 def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
     assert eventually(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
@@ -338,6 +346,7 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path,
         assert "recorder process was killed" in output + errors
 
 
+@pytest.mark.further  # as where its folder goes
 def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, tmp_path):
     options = ("--json", "--duration", "2", "--rest", "0", "--repeat", "30", "--profile", patient)
     process = start_rigd("run", "hold", *options)
@@ -376,6 +385,7 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
     assert "Traceback" not in errors
 
 
+@pytest.mark.further  # as names that are taken
 def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path):
     options = ("hold", "--duration", "1", "--fast", "--json")
     processes = [start_rigd("run", *options) for _ in range(2)]
@@ -388,6 +398,7 @@ def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path
     assert {f"sessions/{path.name}" for path in tmp_path.glob("sessions/*")} == paths
 
 
+@pytest.mark.further  # as tests/session
 def test_a_file_s_name_that_is_no_text_is_written_as_well_as_it_can_be(rigd, tmp_path):
     name = os.fsdecode(b"f\xff.csv")
     (tmp_path / name).write_text("angle_rad\n" + "0.0\n" * 100)
@@ -409,6 +420,7 @@ def test_closed_descriptors_are_no_obstacle(tmp_path):
     assert len(list(tmp_path.glob("out/*.mcap"))) == 1
 
 
+@pytest.mark.further  # as tests/daemon/test_log.py
 def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_path):
     master, slave = os.openpty()
     process = subprocess.Popen(

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from cases import further
 
 from rigd.runtime import SINGLE_THREADED
 
@@ -30,8 +31,8 @@ importlib.import_module("{module}").main()
     ("module", "arguments"),
     [
         ("rigd.__main__", ["run", "chirp", "--fast", "--profile", "sim", "--amplitude", "9"]),
-        ("rigd.__main__", ["serve", "--profile", "sim", "--output", "/dev/null/nowhere"]),
-        ("rigd.__main__", ["check", "--profile", "sim"]),
+        further("rigd.__main__", ["serve", "--profile", "sim", "--output", "/dev/null/nowhere"]),
+        further("rigd.__main__", ["check", "--profile", "sim"]),
         ("analysis.__main__", ["/dev/null"]),
     ],
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.session import TOUCH_KINDS, Status, read_session, read_touches
 
@@ -90,12 +91,14 @@ def test_the_operator_is_told(touched):
     assert f"Touch 2: {x['value']:.3f}"[:13] in said
 
 
+@pytest.mark.further  # as the detector of tests/touch
 def test_where_nothing_stands_nothing_is_found(rigd):
     command = ("run", "touch", "0.4", "--speed", "2", "--fast", "--json", "--no-look")
     _, touches = touches_of(rigd(*command, *QUICK))
     assert touches == []
 
 
+@pytest.mark.further  # as in tests/engine
 def test_an_obstacle_that_appears_on_the_way_back_stops_the_session(rigd, tmp_path):
     # The way back begins after some 0.5 + 0.3 + 0.6 + 0.4 s of record, and half a second of holding
     # before; the obstacle stops a beam that turns in the negative direction.
@@ -110,6 +113,7 @@ def test_an_obstacle_that_appears_on_the_way_back_stops_the_session(rigd, tmp_pa
     assert samples["status"][-1] & Status.TORQUE_OFF
 
 
+@pytest.mark.further  # as in tests/engine, without processes
 def test_too_great_a_force_is_a_fault(rigd):
     command = ("run", "touch", "0.6", "--speed", "2", "--fast", "--json", "--no-look", *QUICK)
     done = rigd(*command, "--force-limit", "0.3", "--obstacle", OBSTACLE)
@@ -122,10 +126,10 @@ def test_too_great_a_force_is_a_fault(rigd):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("0", "--fast"), "angle_rad = 0 rad is where the motor stands"),
-        (("0.5", "--speed", "0"), "speed_rad_s = 0 rad/s must be more than 0 rad/s"),
-        (("0.5", "--hold", "0.001"), "ends before the motor has stopped"),
-        (("1.8",), "limits.angle_rad"),
+        further(("0", "--fast"), "angle_rad = 0 rad is where the motor stands"),
+        further(("0.5", "--speed", "0"), "speed_rad_s = 0 rad/s must be more than 0 rad/s"),
+        further(("0.5", "--hold", "0.001"), "ends before the motor has stopped"),
+        further(("1.8",), "limits.angle_rad"),
         (("0.5", "--model", "none.json"), "none.json"),
     ],
 )

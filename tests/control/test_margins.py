@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -93,7 +94,7 @@ def test_the_command_carries_what_both_readings_carry(loop_model):
     np.testing.assert_allclose(one, both, atol=1e-4)
 
 
-@pytest.mark.parametrize("pole_rad_s", [40.0, 80.0, 100.0])
+@pytest.mark.parametrize("pole_rad_s", [further(40.0), 80.0, further(100.0)])
 @pytest.mark.parametrize("change", [lambda model: model, slower], ids=["sim", "slower"])
 def test_a_gain_or_delay_beyond_its_margin_is_unstable(loop_model, change, pole_rad_s):
     model = change(loop_model)
@@ -138,6 +139,7 @@ def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
             assert margins.modulus <= 1.001 * np.min(distance)
 
 
+@pytest.mark.further  # and beyond them none
 @settings(max_examples=6)
 @given(
     pole_rad_s=st.floats(50.0, 110.0),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from processes import eventually
 
 from rigd.daemon import background
@@ -137,6 +138,7 @@ def test_a_check_is_for_a_rig_without_a_session(operated):
     assert "without a running session" in str(told[0])
 
 
+@pytest.mark.further  # as a connected one
 def test_an_unconnected_rig_can_be_checked(operate):
     rows = {row["what"]: row for row in operate().ask("check")["rows"]}
     assert rows["devices: connection"]["status"] == "skipped"

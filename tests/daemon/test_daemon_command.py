@@ -18,7 +18,7 @@ from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "1", "--rest", "0.2", "--ring-down", "0")
-LONG = ("--duration", "600", "--rest", "0.2")
+LONG = ("--duration", "100", "--rest", "0.2")
 
 
 @pytest.fixture
@@ -193,6 +193,7 @@ def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
     assert not socket_path("sim").exists()
 
 
+@pytest.mark.further  # as tests/runner/test_quick_looks.py
 def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, brief_looks):
     daemon = serve("--fast")
     assert request("status")["daemon"]["quick_looks"] is True
@@ -208,6 +209,7 @@ def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, brief_looks):
     assert f"INFO {look['text'][0]}" in said
 
 
+@pytest.mark.further  # as test_fits.py
 def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
     serve("--fast")
     swept = ("--start-hz", "0.5", "--duration", "5", "--rest", "0.5", "--ring-down", "1")
@@ -223,7 +225,7 @@ def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
     assert told["text"][0] in out
 
 
-def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, rigd):
+def test_a_session_survives_its_client_and_ends_by_a_stop(serve, ask, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
     until(recording, daemon)
@@ -241,6 +243,10 @@ def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, ri
     assert session["path"] in out
     assert read_session(Path(session["path"])).outcome["outcome"] == "stopped"
 
+
+@pytest.mark.further  # as by a stop that is waited for
+def test_a_session_ends_by_every_other_way_of_stopping_it(serve, ask, rigd):
+    daemon = serve()
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
     code, out, _ = ask("stop", "--no-wait")
@@ -265,6 +271,9 @@ def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, ri
     assert client.returncode == 130
     assert "Stopped:" in err
 
+
+def test_ctrl_c_ends_daemon_and_session(serve, rigd):
+    daemon = serve()
     client = rigd("start", "hold", *LONG, "--json")
     until(recording, daemon)
     control = control_process()
@@ -295,6 +304,7 @@ while True:
 """
 
 
+@pytest.mark.further  # as test_control_socket.py
 def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask):
     daemon = serve()
     client = rigd("start", "hold", *LONG)

@@ -1,6 +1,7 @@
 """No sequence of commands and faults reaches torque without an enabled, healthy session."""
 
 import pytest
+from cases import further
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
@@ -176,11 +177,12 @@ def make_machine(operate):
     return Daemon
 
 
-def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(operate):
+@pytest.mark.parametrize("sequences", [10, further(25)])
+def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(operate, sequences):
     run_state_machine_as_test(
         make_machine(operate),
         settings=settings(
-            max_examples=25,
+            max_examples=sequences,
             stateful_step_count=12,
             suppress_health_check=list(HealthCheck),
         ),

@@ -111,6 +111,7 @@ def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
     assert len(ran) == 7 + 5
 
 
+@pytest.mark.further  # as test_page_server.py
 def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, caplog):
     monkeypatch.setattr(_page, "_MOST_STARTS", 1)
     with socket.create_server(("127.0.0.1", 0)) as taken:

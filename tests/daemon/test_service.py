@@ -3,6 +3,7 @@
 import asyncio
 
 import pytest
+from cases import further
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._protocol import CommandError
@@ -91,6 +92,7 @@ def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
     assert refused.wrong_use
 
 
+@pytest.mark.further  # as tests/excitation/test_move_sessions.py
 def test_a_move_starts_where_the_motor_stands_and_stays_where_it_went(operated):
     brief = {"rest_s": 0.1, "ring_down_s": 0.1}
     reply = operated.ask("start", excitation="move", parameters={"angle_rad": 0.05, **brief})
@@ -215,7 +217,7 @@ def slip(drive):
     drive.offset_rad = 8000 * 7e-5
 
 
-@pytest.mark.parametrize("when", ["ready", "session"])
+@pytest.mark.parametrize("when", ["ready", further("session")])
 def test_an_encoder_that_jumps_makes_the_zero_void(operated, when):
     """And the limits with it: nothing is started until there is another zero."""
     operated.ask("zero")

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 
 import pytest
+from cases import further
 
 from rigd.devices._registry import open_devices
 from rigd.profile import load_profile
@@ -11,7 +12,7 @@ from rigd.profile import load_profile
 HARDWARE = "RIGD_HARDWARE"
 
 
-@pytest.fixture(params=["direct", "can", "serial", "previous_tick", "hardware"])
+@pytest.fixture(params=["direct", "can", further("serial"), further("previous_tick"), "hardware"])
 def devices(request, start_simulator, monkeypatch):
     """Drive and sensor: simulated directly, through the wire in lock-step, or the real ones."""
     # How long a simulated drive takes to answer while it is set up is the machine's affair.

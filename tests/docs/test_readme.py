@@ -47,7 +47,13 @@ exec "FOLDER/${0##*/}" "$@"
 that everything is fitted."""
 
 
-@pytest.fixture(params=["short sessions", pytest.param("as it stands", marks=pytest.mark.slow)])
+# That the programs understand all commands is in test_documents.py.
+@pytest.fixture(
+    params=[
+        pytest.param("short sessions", marks=pytest.mark.further),
+        pytest.param("as it stands", marks=pytest.mark.slow),
+    ]
+)
 def start(request, tmp_path, runtime_folder):
     """Start a command in the folder of an operator."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

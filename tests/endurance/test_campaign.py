@@ -31,6 +31,7 @@ def campaign():
     del sys.modules[spec.name]
 
 
+@pytest.mark.further  # at length
 def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     profile = load_profile("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)

@@ -51,6 +51,7 @@ def foreign_files(simulated, tmp_path):
     return angle, torque
 
 
+@pytest.mark.further  # parsed in tests/docs
 def test_every_example_runs_as_written(analyze, foreign_files, tmp_path, monkeypatch, capsys):
     angle, torque = foreign_files
     (profile,), shells, (python,) = blocks("toml"), blocks("sh"), blocks("python")

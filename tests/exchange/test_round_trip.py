@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy  # whose parts come on first use
+from cases import further
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -56,7 +57,7 @@ def regular(length):
 )
 @example(samples=regular(40), rate_hz=333.3)  # of which six digits of the period tell too little
 @given(samples=sessions(), rate_hz=st.sampled_from([1000.0, 1024.0, 333.3, 5e4]))
-@pytest.mark.parametrize("suffix", [".csv", ".mat", ".uff"])
+@pytest.mark.parametrize("suffix", [".csv", further(".mat"), further(".uff")])
 def test_what_was_exported_is_imported_as_it_was(make_session, tmp_path, suffix, samples, rate_hz):
     if suffix == ".uff":
         pytest.importorskip("pyuff", reason="UFF58 needs pyuff")

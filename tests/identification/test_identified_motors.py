@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.control import PidController, design_pid
 from rigd.devices._registry import open_devices
@@ -170,7 +171,7 @@ def random_case(number):
     return motor, replace(profile, rig=replace(profile.rig, motor=wrong))
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1, further(2), pytest.param(10, marks=pytest.mark.slow)])
 def test_random_motors_are_found_within_three_deviations(count):
     all_errors = []
     for number in range(count):
@@ -200,6 +201,7 @@ def without_antenna(rig):
     return replace(rig, beam=beam)
 
 
+@pytest.mark.further  # as test_motor_estimate.py
 def test_without_an_antenna_the_scale_is_not_told():
     profile = load_profile("sim")
     motor = Motor(1.6e-3, 0.025, 0.02, 1.1, 1.3e-3)
@@ -219,6 +221,7 @@ def test_without_an_antenna_the_scale_is_not_told():
         assert quantity.std < 0.03 * quantity.value
 
 
+@pytest.mark.further  # as test_motor_estimate.py
 def test_readings_of_different_ages():
     profile = load_profile("sim")
     rig = replace(

@@ -25,6 +25,7 @@ def pasted(text, toml):
     return "\n".join(lines)
 
 
+@pytest.mark.further  # as test_identified_motors.py, without processes
 def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
     done = rigd("identify", "motor", "--profile", "sim", "--fast", "--json", "--output", "out")
     assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy  # whose parts come on first use
+from cases import further
 
 from rigd.identification._estimate import (
     EstimateError,
@@ -124,8 +125,10 @@ def errors_of(estimate, truth):
 @pytest.mark.parametrize(
     "truth",
     [
-        Truth(),
-        Truth(actuation_delay_s=0.4e-3, torque_scale=1.2, inertia_kg_m2=4e-3, coulomb_nm=0.0),
+        further(Truth()),
+        further(
+            Truth(actuation_delay_s=0.4e-3, torque_scale=1.2, inertia_kg_m2=4e-3, coulomb_nm=0.0)
+        ),
         Truth(angle_delay_s=0.6e-3, torque_delay_s=1.2e-3, actuation_delay_s=1.0e-3),
     ],
     ids=["light", "heavy", "old readings"],

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import further
 
 HERE = Path(__file__).parent
 
@@ -60,7 +61,8 @@ def test_session_fault_reset_session(trial, eds_file):
 @pytest.mark.parametrize(
     ("without", "accepted"),
     [
-        pytest.param((*SPARSE, "6072"), ["torque_limit"], id="sparse"),
+        # As tests/devices/cia402 has it of a drive by script.
+        further((*SPARSE, "6072"), ["torque_limit"], id="sparse"),
         pytest.param(
             *(("1016",), []), id="deadline of the RPDO for a heartbeat", marks=pytest.mark.slow
         ),
@@ -99,7 +101,7 @@ def test_a_drive_that_cannot_be_used_is_refused_by_the_object(trial, eds_file, c
     assert "operation enabled" not in states
 
 
-@pytest.mark.parametrize("how", ["abort", "keeps on", "ignored"])
+@pytest.mark.parametrize("how", [further("abort"), further("keeps on"), "ignored"])
 def test_reset_switches_off_a_drive_that_a_killed_host_left_on(trial, eds_file, how):
     result = trial.play_left_on(eds_file(), how, None)
     assert result.startswith("ok: off"), result
@@ -163,6 +165,7 @@ def test_the_node_enforces_the_rules_of_pdos(trial, eds_file):
             network.disconnect()
 
 
+@pytest.mark.further  # as its other rules
 def test_a_silent_master_costs_the_torque(trial, eds_file):
     """1016 and 6007 of the node act by themselves, on the time that is written there."""
     import canopen

@@ -96,6 +96,7 @@ def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
     assert producer.refused == 0
 
 
+@pytest.mark.further  # as in tests/view
 def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publisher, save):
     publisher.show("fitted", fit_modes=2, excitation="until")
     saver = save(publisher.address)
@@ -117,6 +118,7 @@ def test_fits_are_drawn_where_their_samples_end_and_told_among_the_events(publis
     assert [fit["text"][0] in [text for (text,) in lines] for fit in fits] == [True, True]
 
 
+@pytest.mark.further  # as a fit is
 def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
     publisher.show("looked at", folder=tmp_path)
     saver = save(publisher.address)
@@ -133,7 +135,7 @@ def test_the_quick_look_is_added_to_the_events(publisher, save, tmp_path):
     assert lines.tolist()[-2:] == [["Quick look at it"], ["  mode 1?[31m"]]
 
 
-@pytest.mark.parametrize("at_once", [False, True])
+@pytest.mark.parametrize("at_once", [pytest.param(False, marks=pytest.mark.further), True])
 def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, at_once):
     own = publisher.ports
     # The port was free when it was looked at, and taken a moment later.
@@ -181,6 +183,7 @@ def test_a_killed_publisher_leaves_no_server(publisher):
     assert eventually(lambda: has_ended(server))
 
 
+@pytest.mark.further  # as when killed
 def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
     middle = subprocess.Popen(
         [
@@ -205,6 +208,7 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
     assert find("orphan") is None, "what it left behind is told from a live view"
 
 
+@pytest.mark.further  # as a publisher that stands still
 def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(producer, first=IMPATIENT)
@@ -304,7 +308,9 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     ("script", "mode", "sentence"),
     [
         ("#!/bin/sh\necho no such option >&2\nexit 2\n", 0o755, "ended: no such option."),
-        ("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."),
+        pytest.param(
+            *("#!/bin/sh\n", 0o644, "cannot be run: Permission denied."), marks=pytest.mark.further
+        ),
     ],
 )
 def test_a_server_that_does_not_start_is_told_in_a_sentence(

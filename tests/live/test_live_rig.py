@@ -102,6 +102,7 @@ def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
     assert told.startswith("The live view is still starting")
 
 
+@pytest.mark.further  # as test_live_backlog.py
 def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
     board = rig._crew.channels.board
@@ -110,6 +111,7 @@ def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     assert board[Word.GO] == 0
 
 
+@pytest.mark.further  # as a fault in test_live_state.py
 def test_how_a_session_ended_is_shown(rig, run, save):
     stop_at = StopRequest()
 
@@ -132,6 +134,7 @@ def test_how_a_session_ended_is_shown(rig, run, save):
     ]
 
 
+@pytest.mark.further  # as a fault in test_live_state.py
 def test_a_full_disk_is_shown_as_a_fault_with_its_reason(rig, run, save):
     run("before", 0.5)
     saver = save(rig.status().live_view)

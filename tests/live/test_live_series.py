@@ -32,6 +32,7 @@ def threads(pid: int) -> int:
     return len(list(Path(f"/proc/{pid}/task").iterdir()))
 
 
+@pytest.mark.further  # as of a rig's series
 def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive):
     publisher = unhurried
     received = receive(publisher)
@@ -46,6 +47,7 @@ def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive):
         assert (ticks[1:] - ticks[:-1] == 1).all()
 
 
+@pytest.mark.further  # at length
 def test_sessions_leave_nothing_behind(publisher):
     publisher.finish()
     for number in range(4):  # what is made once, and kept

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
@@ -110,7 +111,7 @@ def test_running_and_fault_are_shown_within_a_second(publisher, producer, receiv
     assert "The drive was lost." in texts[-1][0]
 
 
-@pytest.mark.parametrize("off", [True, False])
+@pytest.mark.parametrize("off", [further(True), False])
 def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
     producer, start_publisher, save, off
 ):

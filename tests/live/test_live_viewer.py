@@ -91,6 +91,7 @@ def test_a_computer_without_vulkan_is_told_which_package_it_lacks(tmp_path, monk
     assert "mesa-vulkan-drivers" in window.fault
 
 
+@pytest.mark.further  # as a server that is killed
 def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
     publisher, viewer, shown_s, monkeypatch
 ):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.session import describe, read_session, read_timings, recover
 from rigd.session._recovery import _increasing
@@ -17,6 +18,7 @@ def hostile(load_script):
     return load_script("fuzz_hostile")
 
 
+@pytest.mark.further  # the worst kinds are below
 def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
     """In a separate process, which forks for each command: this one is large, and has threads."""
     script = Path(hostile.__file__)
@@ -48,9 +50,9 @@ sys.exit("".join(wrong) or 0)
 @pytest.mark.parametrize(
     ("kinds", "scale", "megabytes"),
     [
-        ("digits long_key control_characters log_flood permuted", 1.0, 500),
+        further("digits long_key control_characters log_flood permuted", 1.0, 500),
         # A chunk of these has 50 MB, for which there is no room if it is held as a whole.
-        ("wide_chunks other_topic", 0.2, 80),
+        further("wide_chunks other_topic", 0.2, 80),
         pytest.param("wide_chunks other_topic in_turn", 1.0, 500, marks=pytest.mark.slow),
     ],
     ids=["full", "long chunks", "longest chunks"],

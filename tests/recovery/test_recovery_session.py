@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from rigd.session import read_session, recover
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -18,6 +20,7 @@ def limit_files():
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
 
 
+@pytest.mark.further  # as test_recovery_disk.py
 def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
     result = subprocess.run(
         [RIGD, "run", "chirp", "--fast", "--json", "--output", tmp_path],

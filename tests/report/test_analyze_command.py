@@ -86,7 +86,8 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     named = session.rename(tmp_path / "ζ.mcap")
     result = run(
         named.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
-        "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch", cwd=tmp_path,
+        "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch",
+        "--figures", "png", cwd=tmp_path,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert result.stdout.isascii()  # whatever the stream's encoding is
@@ -100,6 +101,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert (tmp_path / "out" / "figures" / "welch_signals.png").exists()
 
 
+@pytest.mark.further  # as in a campaign
 def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     shutil.copy(session, tmp_path / "other.mcap")
     before = tmp_path / "session.report"
@@ -335,6 +337,7 @@ def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
     assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
 
 
+@pytest.mark.further  # as test_folder.py
 def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):
     look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
     assert analyze_here(*look, *QUICK).returncode == 0

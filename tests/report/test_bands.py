@@ -53,6 +53,7 @@ def test_response_band_is_what_draws_scatter(fit):
     np.testing.assert_allclose(inside.mean(axis=0), 0.95, atol=0.016)
 
 
+@pytest.mark.further  # as the response's
 def test_loss_factor_bands_are_what_draws_scatter(fit):
     factors = loss_factors(fit, FREQUENCY_HZ)
     s = 2j * np.pi * FREQUENCY_HZ

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 from matplotlib.text import Text
 from PIL import Image
 
@@ -31,7 +32,7 @@ def count(image, colour):
     ("draw", "colours"),
     [
         (signals_figure, (style.ORANGE, style.BLUE, style.GREEN)),
-        (frf_figure, (style.BLUE, style.VERMILION, style.GREY)),
+        further(frf_figure, (style.BLUE, style.VERMILION, style.GREY)),
         (torque_figure, (style.BLUE, style.VERMILION, style.GREY)),
     ],
 )
@@ -82,8 +83,8 @@ def test_one_panel_a_type(paper_analysis):
     ("types", "weightings", "estimator"),
     [
         (("VI",), ("omega^-2",), "h1"),
-        (("I", "II", "III", "IV", "V", "VI", "VII"), ("const", "omega^0.5"), "hv"),
-        (("I", "III"), ("const",), "fft"),
+        further(("I", "II", "III", "IV", "V", "VI", "VII"), ("const", "omega^0.5"), "hv"),
+        further(("I", "III"), ("const",), "fft"),
     ],
 )
 def test_any_choice_of_types_and_weightings_can_be_drawn(
@@ -116,7 +117,7 @@ def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
 
 
 @pytest.mark.parametrize(
-    ("kind", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF-1.")]
+    ("kind", "start"), [("png", b"\x89PNG"), further("svg", b"<?xml"), further("pdf", b"%PDF-1.")]
 )
 def test_a_figure_is_the_same_each_time_in_every_format(tmp_path, kind, start):
     def drawn(name):

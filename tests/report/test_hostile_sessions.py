@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zstandard
+from cases import further
 
 from analysis.record import RecordError, load_record
 from rigd.session import SessionError
@@ -113,10 +114,16 @@ def in_turn(count):
     ("parts", "message_", "share"),
     [
         (lambda: [chunk(message(1), claimed=10 << 30)], "claims 10737418240 bytes", 1),
-        (lambda: repeated(channel(1), 10_000_000, 4), "made of so many small parts", 1),
-        (lambda: repeated(metadata(b"x", {}), 10_000_000, 4), "declares channels, schemas, m", 1),
-        (lambda: repeated(message(1), 8_000_000, 8), "more than the 2400000 messages of /rig/s", 1),
-        (lambda: in_turn(2_000_000), "made of so many small parts", 10),
+        further(lambda: repeated(channel(1), 10_000_000, 4), "made of so many small parts", 1),
+        further(
+            lambda: repeated(metadata(b"x", {}), 10_000_000, 4), "declares channels, schemas, m", 1
+        ),
+        further(
+            lambda: repeated(message(1), 8_000_000, 8),
+            "more than the 2400000 messages of /rig/s",
+            1,
+        ),
+        further(lambda: in_turn(2_000_000), "made of so many small parts", 10),
         pytest.param(
             lambda: in_turn(20_000_000), "made of so many small parts", 1, marks=pytest.mark.slow
         ),

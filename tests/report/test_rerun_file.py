@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
@@ -102,7 +103,7 @@ def degrees(values):
     return np.degrees(np.angle(values * -1j)) + 90.0
 
 
-@pytest.mark.parametrize("kind", ["I", "III", "VI"])
+@pytest.mark.parametrize("kind", [further("I"), further("III"), "VI"])
 def test_each_model_and_its_residual_lie_over_the_measured_response(paper_analysis, written, kind):
     chunks, _ = written
     grid_hz, measured = paper_analysis.response.frequency_hz, paper_analysis.response.response
@@ -202,6 +203,7 @@ def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
         assert_on_curve(chunks, entity, name, grid_hz, expected, tolerance)
 
 
+@pytest.mark.further  # as the response's
 def test_torque_model_and_residual_run_over_the_session(record_result, of_record):
     chunks, _ = of_record
     record = record_result.record

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import further
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is always full")
@@ -61,6 +62,7 @@ def unread():
     os.close(writing)
 
 
+@pytest.mark.further  # as on a full disk
 def test_a_stream_that_is_not_utf_8_gets_question_marks_and_the_file_everything(
     short_file, tmp_path
 ):
@@ -90,7 +92,7 @@ def test_a_full_disk_behind_a_stream_is_told_and_what_is_written_is_kept(short_f
 
 
 @needs_full
-@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+@pytest.mark.parametrize("stream", ["stdout", further("stderr")])
 def test_help_and_errors_on_a_full_disk_end_without_a_traceback(stream):
     with FULL.open("w") as full:
         both = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: full}
@@ -104,6 +106,7 @@ def test_help_and_errors_on_a_full_disk_end_without_a_traceback(stream):
         assert result.stderr == "Error: the output cannot be written (No space left on device).\n"
 
 
+@pytest.mark.further  # as with a full disk behind the stream
 def test_the_work_is_done_and_counts_though_nobody_reads(short_file, tmp_path, unread):
     result = analyze(
         short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",

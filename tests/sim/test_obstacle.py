@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import further
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -129,7 +130,7 @@ other_solution = cache(OtherSolution)
 
 
 @pytest.mark.parametrize("stiffness", [100.0, 3000.0, 100_000.0])
-@pytest.mark.parametrize("at_m", [0.1, 0.4, 0.7, 0.97])
+@pytest.mark.parametrize("at_m", [further(0.1), 0.4, further(0.7), further(0.97)])
 def test_force_torque_and_shear_of_a_touch(at_m, stiffness):
     force, torque, shear = other_solution(at_m).meet(stiffness)
     record = started(f"x={at_m},angle={TOUCH_RAD},stiffness={stiffness}")
@@ -170,7 +171,7 @@ def test_an_obstacle_on_the_other_side_is_the_mirror_image():
 
 
 @pytest.mark.parametrize("stiffness", ["300", "100000", "rigid"])
-@pytest.mark.parametrize("at_m", [0.2, 0.62, 0.97])
+@pytest.mark.parametrize("at_m", [further(0.2), 0.62, further(0.97)])
 def test_rest_against_an_obstacle(at_m, stiffness):
     # Stiff damping, so that it rests soon; the heavy motor is at rest wherever it was brought.
     rig = rig_with(
@@ -190,8 +191,8 @@ def test_rest_against_an_obstacle(at_m, stiffness):
     assert record.sensed_shear[-1] == pytest.approx(record.shear[-1])
 
 
-@pytest.mark.parametrize("stiffness", ["300", "30000", "rigid"])
-@pytest.mark.parametrize("damping", [Damping(), DAMPING], ids=["undamped", "paper"])
+@pytest.mark.parametrize("stiffness", [further("300"), further("30000"), "rigid"])
+@pytest.mark.parametrize("damping", [further(Damping()), DAMPING], ids=["undamped", "paper"])
 def test_no_touch_makes_energy(damping, stiffness):
     # A motor without friction drives the beam from one wall to the other and back, then tries to
     # get out all there is.
@@ -324,7 +325,7 @@ def test_far_from_an_obstacle_nothing_changes():
     assert (record.forces == 0).all()
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.3e-3, 1.4e-3])
+@pytest.mark.parametrize("delay_s", [further(0.0), 0.3e-3, further(1.4e-3)])
 def test_the_sensor_sees_a_touch_as_late_as_it_is(delay_s):
     prompt = started(f"x=0.6,angle={TOUCH_RAD},stiffness=300")
     late = started(

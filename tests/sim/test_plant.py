@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import Beam, Damping, RealisationError
 from rigd.devices.parameters import (
@@ -82,8 +83,8 @@ def noise(n, level=0.1, seed=0):
 # torque delays are chosen so as not to look at a jump.)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.3e-3, 1e-3, 2.7e-3])
-@pytest.mark.parametrize("angle_delay", [0.0, 0.4e-3, 2e-3, 3.3e-3])
+@pytest.mark.parametrize("delay", [further(0.0), 0.3e-3, further(1e-3), 2.7e-3])
+@pytest.mark.parametrize("angle_delay", [0.0, further(0.4e-3), 2e-3, further(3.3e-3)])
 @pytest.mark.parametrize("torque_delay", [0.1e-3, 0.8e-3, 2.2e-3])
 def test_delays(delay, angle_delay, torque_delay):
     torques = noise(300)

@@ -66,6 +66,7 @@ def averaged():
     )
 
 
+@pytest.mark.further  # as one without a filter is
 def test_a_touch_seen_through_a_mean_is_told_right(averaged, model):
     sensor_filter = SensorFilter(weights=(1 / 3,) * 3, spacing_s=1e-3)
     assert sensor_filter.weights_delay_s == 1e-3

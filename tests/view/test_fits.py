@@ -117,6 +117,7 @@ def test_a_session_that_is_not_fitted_draws_none(subject, shown):
     assert TABLE not in shown(picture.frame())
 
 
+@pytest.mark.further  # as one that runs
 def test_a_recorded_session_shows_the_fit_in_its_file(touch_file, shown):
     timings = np.empty(0, TIMING_DTYPE)
     recorded = read_session(touch_file.path)

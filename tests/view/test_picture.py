@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.models import PAPER_BAND_HZ, WelchSettings
 from analysis.paper._estimate import estimate
@@ -88,6 +89,7 @@ def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, reco
     assert np.quantile(error / abs(expected.response), 0.99) < 0.01
 
 
+@pytest.mark.further  # charts: test_response_charts.py
 def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, shown):
     picture = Scene(subject_of(record))
     for block in blocks(read_session(path).samples):
@@ -195,10 +197,10 @@ def test_a_recorded_session_shows_its_touches(touch_file, drawn, tmp_path):
     "changes",
     [
         {"sweep": (1000, 1000)},
-        {"sweep": (1000, 1003)},
-        {"rate_hz": 100.0, "ticks": 3000, "sweep": (0, 3000)},
+        further({"sweep": (1000, 1003)}),
+        further({"rate_hz": 100.0, "ticks": 3000, "sweep": (0, 3000)}),
         {"damping": None},
-        {"ticks": 0, "sweep": (0, 0)},
+        further({"ticks": 0, "sweep": (0, 0)}),
     ],
 )
 def test_any_session_can_be_shown(subject, make_samples, shown, changes):

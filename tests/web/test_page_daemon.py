@@ -8,6 +8,7 @@ import signal
 import time
 
 import pytest
+from cases import further
 from playwright.sync_api import expect
 from processes import child_running
 from web_daemon import rig_with_page
@@ -130,7 +131,7 @@ def test_a_session_in_real_time_is_watched_and_stopped_and_what_fails_is_told(op
 @pytest.mark.parametrize(
     ("options", "reports"),
     [
-        pytest.param(("--fast",), False, id="fast"),
+        further(("--fast",), False, id="fast"),
         # Reports and campaigns take longer than all else.
         pytest.param(("--fast",), True, id="fast-reports", marks=pytest.mark.slow),
         pytest.param((), True, id="real-time", marks=pytest.mark.slow),

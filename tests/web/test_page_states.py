@@ -3,6 +3,7 @@
 import re
 
 import pytest
+from cases import further
 from fake_web_server import STATIC, TOKEN, UTC_NS, fake_web_server, gauges, progress, status, strip
 from playwright.sync_api import expect
 from processes import eventually
@@ -43,12 +44,14 @@ FULL_DISK = "Free space on the session's disk 12 MB below limit 50 MB."
     ("message", "word", "reason", "tone"),
     [
         (change("ready", "running", "chirp was started"), "RUNNING", "Chirp was", "running"),
-        (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
-        (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
+        further(
+            change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"
+        ),
+        further(change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
         (change("running", "fault", FULL_DISK), "FAULT", "Free space", "alarm"),
         ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
-        (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
-        (status(zero_lost=True), "READY", "The zero is lost", "ready"),
+        further(status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
+        further(status(zero_lost=True), "READY", "The zero is lost", "ready"),
     ],
     ids=["running", "stopping", "stopped", "full-disk", "lost-daemon", "connecting", "zero-lost"],
 )
@@ -60,6 +63,7 @@ def test_the_state_is_told_within_a_second(server, page, message, word, reason, 
     assert page.is_visible("#fault") == (word == "FAULT")
 
 
+@pytest.mark.further
 def test_a_lost_server_is_told_and_found_again(server, page):
     server.hang_up()
     says(page, "#state-word", "OFFLINE")
@@ -68,6 +72,7 @@ def test_a_lost_server_is_told_and_found_again(server, page):
     assert page.is_enabled("#start-button")
 
 
+@pytest.mark.further
 def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
     server.tell(status("running"), progress(0.1))
     says(page, "#state-word", "RUNNING")
@@ -76,6 +81,7 @@ def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
     says(page, "#state-word", "RUNNING")
 
 
+@pytest.mark.further
 def test_a_fault_names_its_reason_and_the_way_out(server, page):
     reason = "Angle 0.51 rad exceeds limit 0.5 rad. " + "Turn it back. " * 20
     server.tell(status("fault", reason=reason))
@@ -86,6 +92,7 @@ def test_a_fault_names_its_reason_and_the_way_out(server, page):
     assert server.asked == [("reset", True)]
 
 
+@pytest.mark.further
 def test_progress_tells_time_left_phase_and_frequency(server, page):
     controller = {"pid": 812, "uid": 1000, "user": "ada"}
     server.tell(
@@ -103,7 +110,7 @@ def test_progress_tells_time_left_phase_and_frequency(server, page):
     says(page, "#time-left", "25 %")
 
 
-@pytest.mark.parametrize("token", ["", f"#token={TOKEN}"], ids=["no-token", "token"])
+@pytest.mark.parametrize("token", ["", further(f"#token={TOKEN}")], ids=["no-token", "token"])
 def test_stop_is_for_everybody_and_says_what_came_of_it(server, open_page, token):
     page = open_page(server.address + token)
     server.replies["stop"] = {"stopping": True}
@@ -122,6 +129,7 @@ def test_a_stop_that_fails_says_what_to_do(server, page):
     assert page.inner_text("#state-word") == "READY"
 
 
+@pytest.mark.further
 def test_a_stop_does_not_wait_behind_downloads(server, page):
     server.replies["stop"] = {"stopping": True}
     page.evaluate("() => { for (let k = 0; k < 8; k++) fetch(`/api/sessions/${k}/file.mat`); }")
@@ -132,6 +140,7 @@ def test_a_stop_does_not_wait_behind_downloads(server, page):
     assert ("stop", False) in server.asked
 
 
+@pytest.mark.further
 def test_a_stop_that_is_not_answered_in_time_is_told(server, page):
     server.replies["stop"] = None
     page.click("#stop")
@@ -162,6 +171,7 @@ def test_without_the_token_the_page_is_read_only_and_says_how_to_act(server, ope
         assert page.is_enabled(free)
 
 
+@pytest.mark.further
 def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
     assert TOKEN not in page.url
     page.reload()
@@ -169,6 +179,7 @@ def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
     assert page.is_enabled("#start-button")
 
 
+@pytest.mark.further
 @pytest.mark.parametrize("width", [360, 390, 1280])
 def test_nothing_jumps_or_overflows_when_a_session_runs(server, open_page, width):
     page = open_page(f"{server.address}#token={TOKEN}", width=width)
@@ -191,6 +202,7 @@ def test_nothing_jumps_or_overflows_when_a_session_runs(server, open_page, width
     assert bar.evaluate("bar => bar.scrollHeight - bar.clientHeight") <= 1
 
 
+@pytest.mark.further
 def test_the_page_is_there_within_a_second(server, open_page):
     loaded_s = []
     for _ in range(3):  # of which the computer may have been elsewhere for one or two

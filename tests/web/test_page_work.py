@@ -88,6 +88,7 @@ def test_a_start_sends_what_the_form_says(server, page):
     assert not page.is_checked("#force")  # it is asked for again
 
 
+@pytest.mark.further
 def test_each_excitation_has_its_own_parameters_with_units(page):
     assert "Amplitude" in page.inner_text("#parameters")
     assert "rad" in page.inner_text("#parameters")
@@ -96,6 +97,7 @@ def test_each_excitation_has_its_own_parameters_with_units(page):
     assert page.input_value("#parameter-duration_s") == "10"
 
 
+@pytest.mark.further
 def test_a_precision_is_asked_for_in_words(server, page):
     page.select_option("#excitation", "until")
     assert not page.is_visible("#watch-fit")  # it is fitted anyway
@@ -110,6 +112,7 @@ def test_a_precision_is_asked_for_in_words(server, page):
     assert "watch_fit" not in server.requests[0]
 
 
+@pytest.mark.further
 def test_the_record_of_any_excitation_can_be_fitted(server, page):
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.check("#watch-fit")
@@ -131,6 +134,7 @@ def width(page, cell):
     return page.locator(f"{cell} .fill").bounding_box()["width"]
 
 
+@pytest.mark.further
 def test_modes_and_what_is_asked_for_are_shown_as_fits_come(server, page):
     assert not page.is_visible("#fit")
     server.tell(status("running", series=series(None)))
@@ -159,6 +163,7 @@ def test_modes_and_what_is_asked_for_are_shown_as_fits_come(server, page):
     expect(page.locator("#fit")).to_be_hidden()
 
 
+@pytest.mark.further
 def test_a_value_that_is_no_number_is_told_and_not_sent(server, page):
     page.fill("#parameter-amplitude_rad", "much")
     page.click("#start-button")
@@ -178,6 +183,7 @@ def test_a_refusal_is_told_in_the_daemon_s_words(server, page):
     page.wait_for_selector("#start-button:enabled")
 
 
+@pytest.mark.further
 def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(server, page):
     refused = "The predicted peak speed of 11 rad/s exceeds 10 rad/s."
     plan = PLAN | {"peak_velocity_rad_s": 11.0, "refused": refused}
@@ -202,6 +208,7 @@ def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(ser
 # Rig
 
 
+@pytest.mark.further
 def test_zero_tare_and_check_tell_their_results(server, page):
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     server.replies |= {
@@ -247,6 +254,7 @@ def test_buttons_wait_for_their_state(server, page):
 # Live
 
 
+@pytest.mark.further
 def test_gauges_are_per_cent_of_limits_and_coloured_near_them(server, page):
     told = gauges(0.5)
     told["angle"] |= {"value": 0.4, "fraction": 0.8}
@@ -261,6 +269,7 @@ def test_gauges_are_per_cent_of_limits_and_coloured_near_them(server, page):
     says(page, "#gauge-i2t", "0.100 N·m")
 
 
+@pytest.mark.further
 def test_strips_show_the_last_ten_seconds(server, page):
     before = drawn(page, "#strip-angle")
     server.tell(strip(0.0, 300))
@@ -277,6 +286,7 @@ def test_strips_show_the_last_ten_seconds(server, page):
     assert 0 < drawn(page, "#strip-angle") < 0.6 * full
 
 
+@pytest.mark.further
 def test_the_response_grows_over_model_and_last_session(server, page):
     before = drawn(page, "#response-plot")
     server.tell(response("nominal"), response("last", specimen="antenna 3"))
@@ -294,6 +304,7 @@ def test_the_response_grows_over_model_and_last_session(server, page):
     expect(page.locator("#response-keys")).to_have_text("nominal model")
 
 
+@pytest.mark.further
 def test_rerun_is_linked_where_there_is_a_live_view(server, page):
     assert page.is_hidden("#rerun")
     told = status()
@@ -306,6 +317,7 @@ def test_rerun_is_linked_where_there_is_a_live_view(server, page):
 # Sessions
 
 
+@pytest.mark.further
 def test_sessions_are_filtered_and_looked_at(server, page):
     server.sessions = [session(0), session(1, outcome="stopped", specimen="antenna 4")]
     page.select_option("[name=outcome]", "stopped")
@@ -321,6 +333,7 @@ def test_sessions_are_filtered_and_looked_at(server, page):
     assert "Temperature\n21.4 °C" in told
 
 
+@pytest.mark.further
 def test_files_and_report_of_a_session(server, page):
     server.sessions = [session(0), session(1, report="/somewhere/report.html")]
     page.fill("[name=text]", "x")
@@ -343,6 +356,7 @@ def test_files_and_report_of_a_session(server, page):
     says(page, "#sessions-result", "The report was not made: no space.")
 
 
+@pytest.mark.further
 def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
     assert page.is_disabled("#overlay")
     for row in (1, 3):
@@ -357,6 +371,7 @@ def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
     assert server.asked == [("/api/campaign", True)]
 
 
+@pytest.mark.further
 def test_what_others_wrote_stays_text(server, page):
     evil = "<img src=x onerror=\"document.title='broken'\">"
     server.sessions = [session(0, specimen=evil, operator=evil, note=evil, modes=MODES)]
@@ -374,6 +389,7 @@ def test_what_others_wrote_stays_text(server, page):
 # Events
 
 
+@pytest.mark.further
 def test_events_are_listed_once_newest_first(server, page):
     for second, level in ((1, "info"), (3, "warning"), (2, "error")):
         server.tell({

@@ -12,6 +12,7 @@ from rigd.sim.wire._simulator import inject
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1, "duration_s": 0.5}
 
 
+@pytest.mark.further  # as test_injected_faults.py has it of another drive
 def test_a_drive_with_torque_mode_runs_fails_is_reset_and_runs_again(
     quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
 ):
@@ -49,6 +50,7 @@ def test_the_profile_s_own_file_makes_the_drive(quiet_profile, start_simulator, 
     assert "drive: pilz_prbt.eds" in told
 
 
+@pytest.mark.further  # as rigd check --eds has it
 def test_a_file_that_is_none_ends_the_command(rigd, quiet_profile, runtime_folder, tmp_path):
     done = rigd("simulate", "--profile", quiet_profile("antenna_can"), "--eds", tmp_path / "no.eds")
     assert done.returncode == 1

@@ -101,6 +101,14 @@ AGAIN = {
     "wrench lost",
 }
 """What the loop does then another row shows as well, or the same fault of the other device."""
+FURTHER = {"controller off the bus", "emergency message", "serial line cut"}
+"""Lost devices and faults of drives, as other rows have them by other ways."""
+
+
+def marks(row):
+    """Marks of the tests that are not run each time."""
+    again = [pytest.mark.slow] * (row.name in AGAIN)
+    return again + [pytest.mark.further] * (row.name in FURTHER)
 
 
 def named(row):
@@ -113,10 +121,7 @@ def test_every_row_has_its_message():
 
 @pytest.mark.parametrize(
     "row",
-    [
-        pytest.param(row, marks=[pytest.mark.slow] * (row.name in AGAIN), id=named(row))
-        for row in rows(FATAL)
-    ],
+    [pytest.param(row, marks=marks(row), id=named(row)) for row in rows(FATAL)],
 )
 def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
@@ -175,6 +180,7 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     assert round((off["t_s"] - begun["t_s"]) * 1000) <= ticks
 
 
+@pytest.mark.further  # as in tests/engine and tests/devices
 @pytest.mark.parametrize(
     "name", ["antenna_can", pytest.param("antenna_serial", marks=pytest.mark.slow)]
 )
@@ -209,9 +215,13 @@ def test_passing_faults_are_flagged_and_borne(
             assert not here.any(), row.name
 
 
+@pytest.mark.further  # as in tests/devices/ati and canbus
 @pytest.mark.parametrize(
     ("name", "sender", "ms"),
-    [("antenna_can", "drive,id=0x181", 1), ("antenna_serial", "sensor", 3)],
+    [
+        ("antenna_can", "drive,id=0x181", 1),
+        ("antenna_serial", "sensor", 3),
+    ],
 )
 def test_readings_that_stay_late_are_warned_of_where_nothing_can_tell_them_from_lost_ones(
     name, sender, ms, quiet_profile, start_simulator, run_order, load
@@ -227,6 +237,7 @@ def test_readings_that_stay_late_are_warned_of_where_nothing_can_tell_them_from_
     assert (told.level, told.t_ns > 0) == ("warning", True)
 
 
+@pytest.mark.further  # as lost ones do
 def test_polls_that_are_answered_late_for_good_end_the_session(
     quiet_profile, start_simulator, run_order, load
 ):

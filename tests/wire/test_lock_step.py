@@ -17,6 +17,7 @@ from rigd.sim.wire._simulator import inject
 # Of the devices alone all of these are compared in tests/sim/wire/process: of whole sessions those
 # in which the loop itself does something else, or another line is read.
 AGAIN = pytest.mark.slow
+FURTHER = pytest.mark.further
 
 
 @pytest.mark.parametrize(
@@ -37,9 +38,10 @@ AGAIN = pytest.mark.slow
                 "sensor.delay_s": "1.0e-3",
             },
             id="previous_tick",
+            marks=FURTHER,
         ),
         pytest.param("antenna_can", {"cia402.direction": "-1"}, id="turned_round", marks=AGAIN),
-        pytest.param("antenna_serial", {}, id="serial"),
+        pytest.param("antenna_serial", {}, id="serial", marks=FURTHER),
         pytest.param(
             "antenna_serial",
             {"ati_serial.filter": '"triangle"', "sensor.delay_s": "9.6e-4"},

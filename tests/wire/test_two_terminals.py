@@ -55,6 +55,7 @@ def _undisturbed(session) -> np.ndarray:
     return error[: first if began_at_rest else 0]
 
 
+@pytest.mark.further  # as in lock-step
 @pytest.mark.parametrize(
     "name", [pytest.param("antenna_can", marks=pytest.mark.slow), "antenna_serial"]
 )
@@ -101,6 +102,7 @@ def test_a_chirp_through_the_wires_is_recorded_whole(
     assert not said.of("emergency")
 
 
+@pytest.mark.further  # as faults do in test_injected_faults.py
 def test_ctrl_c_stops_the_motor_over_the_wire(
     quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
 ):
@@ -149,6 +151,7 @@ def test_real_time_cannot_be_skipped_unless_in_lock_step(
     assert "--seed: the noise of rigd simulate" in done.stderr
 
 
+@pytest.mark.further  # as in test_injected_faults.py
 @pytest.mark.parametrize(
     "how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
 )

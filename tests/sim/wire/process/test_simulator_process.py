@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import serial
+from cases import further
 
 from rigd.devices._simulator import find_simulator
 
@@ -187,7 +188,7 @@ def connect():
         host.close()
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGTERM, further(signal.SIGINT)])
 def test_it_says_where_it_is_and_ends_without_a_trace(simulate, runtime, how):
     simulator = simulate()
     address = simulator.address
@@ -235,6 +236,7 @@ def test_a_host_drives_the_motor(simulate, connect):
     assert 0.1 < (counts - start) * 7e-5 < 0.5
 
 
+@pytest.mark.further  # as test_lock_step.py
 def test_in_lock_step_everything_can_be_repeated(simulate, connect):
     logs, replies = [], []
     for pause_s in (0.0, 0.002):
@@ -322,6 +324,7 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
     ]
 
 
+@pytest.mark.further  # as test_world.py
 def test_obstacles_may_be_there_from_the_start_and_come_later(simulate, rigd_here):
     simulate("antenna_can", "--lock-step", "--obstacle", "x=0.6,angle=0.3")
     address = find_simulator("antenna_can")

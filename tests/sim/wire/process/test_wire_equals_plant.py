@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.devices._registry import open_devices
 from rigd.devices._simulator import find_simulator
@@ -155,8 +156,8 @@ def bare(rig, ticks):
     ("name", "changes"),
     [
         ("antenna_can", {}),
-        ("antenna_can", {"direction": "-1", "torque_delivery": '"on_arrival"'}),
-        (
+        further("antenna_can", {"direction": "-1", "torque_delivery": '"on_arrival"'}),
+        further(
             "antenna_can",
             {
                 "mode": '"previous_tick"',
@@ -165,7 +166,7 @@ def bare(rig, ticks):
                 "actuation:delay_s": "1.4e-3",
             },
         ),
-        ("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
+        further("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
         ("antenna_serial", {}),
         ("antenna_can", {"seed": AND_AN_OBSTACLE}),
         ("antenna_serial", {"seed": AND_AN_OBSTACLE}),
