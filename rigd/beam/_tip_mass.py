@@ -14,8 +14,9 @@ sin z cosh z) / (1 + cos z cosh z)``::
     q F' = (F + U + F²) / 4,    q U' = U/2 + z² B/2 + U F/4
 """
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +30,24 @@ Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 _POWERS = (-4.0) ** np.arange(10)
-_D = np.array([_POWERS[k] / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
+_D = np.array([_POWERS[k] / math.factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
 _N = np.array(
     [
-        [scale * _POWERS[k] / factorial(4 * k + last) for k in range(10)]
+        [scale * _POWERS[k] / math.factorial(4 * k + last) for k in range(10)]
         for scale, last in ((4.0, 3), (4.0, 2), (2.0, 1))
     ]
 )
 """Power series in q of ``1 + cos z cosh z`` and of the numerators of F, U and z² B over q."""
 
 _HOMOTOPY_STEPS = 12
+_SHARE_A_STEP = 0.02
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-13
+_FARTHEST = 10.0
+"""By how much a pole may move in one step of the way to the whole mass."""
 _ASIDE = 1e-7
+_NEXT_TO_POLE = 1e-8
+"""Relative distance from a pole: the root of what rounding leaves of G's size there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,15 +121,84 @@ class LoadedBeam:
         response = self.at(s).response
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
+    def transfer_and_gradient(self, s: Complex, wrt: Sequence[str]) -> tuple[Complex, Complex]:
+        """Differentiate the same with respect to parameters.
+
+        Parameters
+        ----------
+        s
+            As for `transfer`.
+        wrt
+            Names of `rigd.beam.PARAMETERS`, ``tip_mass_kg`` and ``root_compliance_rad_per_nm``.
+
+        Returns
+        -------
+        transfer : complex ndarray, shape of `s`
+        gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
+        """
+        at = self.at(s)
+        share = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
+        by = self._by_parameter(s, at)
+        gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
+        return at.response * share, gradient * share * share
+
+    def pole_gradient(self, pole_rad_s: complex, wrt: Sequence[str]) -> Complex:
+        """Differentiate a pole with respect to parameters; shape (len(wrt),).
+
+        As that of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is infinite,
+        but next to it the ratios of its derivatives are already as they should be.
+
+        Parameters
+        ----------
+        pole_rad_s
+            The pole, as of `poles`.
+        wrt
+            Names as of `transfer_and_gradient`; what does not move a pole gives 0.
+        """
+        aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
+        s = np.array([pole_rad_s * (1 - aside)], dtype=np.complex128)
+        at = self.at(s)
+        by, slope = self._by_parameter(s, at), self.slope(s, at)
+        moved = [-(by[name]() / slope)[0] if name in by else 0.0 for name in wrt]
+        return np.array(moved, dtype=np.complex128)
+
+    def _by_parameter(self, s: Complex, at: LoadedResponse) -> dict[str, Callable[[], Complex]]:
+        """Give the derivatives of G on a rigid clamp, that by its compliance at 0."""
+        damping, log_s = self.damping, np.log(s)
+        s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
+        s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
+        inertia = self.beam.density_over_stiffness * s * s
+        return {
+            "zeta": lambda: at.by_elastic * s_alpha,
+            "alpha": lambda: at.by_elastic * (damping.zeta * log_s * s_alpha),
+            "gamma": lambda: at.by_inertial * s_lambda,
+            "lambda": lambda: at.by_inertial * (damping.gamma * log_s * s_lambda),
+            "ln_density_over_stiffness": lambda: at.by_inertial * inertia,
+            "ln_stiffness": lambda: at.response - self.tip_mass_kg * at.by_mass,
+            "tip_mass_kg": lambda: at.by_mass,
+            "root_compliance_rad_per_nm": lambda: -at.response * at.response,
+        }
+
+    def tip_slope(self, s: Complex) -> Complex:
+        """Slope of the tip against the root per motor angle, of the shape of `s`."""
+        grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
+        slope = grid.per_angle(tip, 1) - 1
+        if self.tip_mass_kg:
+            slope = slope + grid.per_force(tip, tip, 1) * self._push(s, grid)
+        return slope / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+
+    def _push(self, s: Complex, grid: PointForceGrid) -> Complex:
+        """Force on the tip, per angle of the root, of what accelerates the mass there."""
+        tip, load = self.beam.length_m, self.tip_mass_kg * s * s
+        push: Complex = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
+        return push
+
     def shear(self, s: Complex) -> Complex:
         """Force of the motor on the beam per motor angle in N/rad, of the shape of `s`."""
         grid = PointForceGrid(s, self.beam, self.damping)
         shear = grid.shear_per_angle()
         if self.tip_mass_kg:
-            # The tip is pushed by what accelerates the mass.
-            tip, load = self.beam.length_m, self.tip_mass_kg * s * s
-            push = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
-            shear = shear + grid.shear_per_force(tip) * push
+            shear = shear + grid.shear_per_force(self.beam.length_m) * self._push(s, grid)
         if self.root_compliance_rad_per_nm:
             shear = shear / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
         return shear
@@ -193,7 +268,12 @@ class LoadedBeam:
             return found
         known = ~np.isnan(found[:, 0])
         here = found[known].ravel() * (1 - _ASIDE)  # G is infinite at an undamped pole
-        for fraction in np.arange(1, _HOMOTOPY_STEPS + 1) / _HOMOTOPY_STEPS:
+        # As shares of the beam's own: what moves the poles by a few percent needs no small steps.
+        share = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
+        turned = self.beam.bending_stiffness_n_m2 / self.beam.length_m
+        share = max(share, self.root_compliance_rad_per_nm * turned)
+        steps = min(max(math.ceil(share / _SHARE_A_STEP), 2), _HOMOTOPY_STEPS)
+        for fraction in np.arange(1, steps + 1) / steps:
             partly = LoadedBeam(
                 self.beam,
                 self.damping,
@@ -206,6 +286,7 @@ class LoadedBeam:
 
     def _newton(self, s: Complex, *, zeros: bool) -> Complex:
         """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found."""
+        start = s
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
                 at = self.at(s)
@@ -213,8 +294,10 @@ class LoadedBeam:
                 step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
                 s = s + step
                 if not np.nanmax(np.abs(step / s), initial=0.0) > _CONVERGED:
-                    return s
-            return np.where(np.abs(step) < 1e-9 * np.abs(s), s, np.nan + 0j)
+                    break
+            # Far away every step is a short one.
+            found = (np.abs(step) < 1e-9 * np.abs(s)) & (np.abs(s) < _FARTHEST * np.abs(start))
+            return np.where(found, s, np.nan + 0j)
 
 
 def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:

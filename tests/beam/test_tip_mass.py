@@ -1,5 +1,7 @@
 """Tip mass and elastic clamp: the textbook's closed form, its poles, and their realisation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,10 +16,18 @@ ENDS = [(0.0, 0.0), (5e-5, 0.0), (0.0, 0.01), (5e-4, 0.05)]
 
 
 def textbook(s, damping, tip_mass_kg, compliance):
-    """Solve ``EI c y'''' = -p y`` with y(0) = 0, y'(0) = 1, y''(L) = 0, EI c y'''(L) = m s² y."""
+    """Torque per angle of the beam as `solved` has it."""
+    return solved(s, damping, tip_mass_kg, compliance)[0]
+
+
+def solved(s, damping, tip_mass_kg, compliance):
+    """Solve ``EI c y'''' = -p y``, y(0) = 0, y'(0) = 1, y''(L) = 0, EI c y'''(L) = m s² y.
+
+    The torque on the root and the slope of the tip against it, both per motor angle.
+    """
     c = 1 + damping.zeta * s**damping.alpha
     p = BEAM.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
-    found = []
+    found, slopes = [], []
     for place in range(s.size):
         stiffness = BEAM.bending_stiffness_n_m2 * c[place]
         roots = (-p[place] / c[place] + 0j) ** 0.25 * np.array([1, 1j, -1, -1j])
@@ -32,8 +42,10 @@ def textbook(s, damping, tip_mass_kg, compliance):
         )
         amplitudes = np.linalg.solve(matrix, np.array([0, 1, 0, 0]))
         found.append(-stiffness * (amplitudes @ roots**2))
+        slopes.append(amplitudes @ (roots * waves) - 1)
     rigid = np.array(found)
-    return rigid / (1 + compliance * rigid)
+    share = 1 / (1 + compliance * rigid)
+    return rigid * share, np.array(slopes) * share
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)
@@ -44,6 +56,68 @@ def test_the_closed_form_solves_the_boundary_value_problem(name, mass, complianc
     assert loaded.transfer(s) == pytest.approx(
         textbook(s, DAMPINGS[name], mass, compliance), rel=1e-7
     )
+
+
+@pytest.mark.parametrize(("mass", "compliance"), ENDS)
+def test_the_slope_of_the_tip_is_that_of_the_boundary_value_problem(mass, compliance):
+    s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 60)
+    loaded = LoadedBeam(BEAM, DAMPINGS["fractional"], mass, compliance)
+    exact = solved(s, DAMPINGS["fractional"], mass, compliance)[1]
+    assert loaded.tip_slope(s) == pytest.approx(exact, rel=1e-6)
+
+
+STEPS = {
+    "zeta": 1e-9, "alpha": 1e-6, "gamma": 1e-7, "lambda": 1e-6, "ln_density_over_stiffness": 1e-6,
+    "ln_stiffness": 1e-6, "tip_mass_kg": 1e-9, "root_compliance_rad_per_nm": 1e-7,
+}  # fmt: skip
+
+
+def changed(loaded, name, step):
+    """The beam with one parameter changed."""
+    beam, damping = loaded.beam, loaded.damping
+    match name:
+        case "ln_density_over_stiffness":
+            denser = replace(beam, density_kg_per_m=beam.density_kg_per_m * np.exp(step))
+            return replace(loaded, beam=denser)
+        case "ln_stiffness":
+            grown = np.exp(step)
+            stiffer = replace(
+                beam,
+                density_kg_per_m=beam.density_kg_per_m * grown,
+                bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * grown,
+            )
+            return replace(loaded, beam=stiffer)
+        case "tip_mass_kg" | "root_compliance_rad_per_nm":
+            return replace(loaded, **{name: getattr(loaded, name) + step})
+    key = "lambda_" if name == "lambda" else name
+    return replace(loaded, damping=replace(damping, **{key: getattr(damping, key) + step}))
+
+
+@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize(("mass", "compliance"), [(5e-5, 0.002), (5e-4, 0.05)])
+def test_the_derivatives_are_those_of_differences(mass, compliance, name):
+    s = 0.5 + 2j * np.pi * np.geomspace(0.5, 60, 40)
+    loaded = LoadedBeam(BEAM, DAMPINGS["fractional"], mass, compliance)
+    step, z = STEPS[name], clamped_free_eigenvalues(3)
+    above, below = changed(loaded, name, step), changed(loaded, name, -step)
+    found, (gradient,) = loaded.transfer_and_gradient(s, [name])
+    assert found == pytest.approx(loaded.transfer(s), rel=1e-12)
+    differences = (above.transfer(s) - below.transfer(s)) / (2 * step)
+    assert np.abs(gradient - differences).max() < 1e-4 * np.abs(differences).max()
+    for before, after, pole in zip(below.poles(z), above.poles(z), loaded.poles(z), strict=True):
+        moved = (after[0] - before[0]) / (2 * step)
+        assert loaded.pole_gradient(pole[0], [name])[0] == pytest.approx(moved, rel=1e-3)
+
+
+@pytest.mark.parametrize("mass", [0.0, 5e-5])
+def test_next_to_the_pole_on_a_rigid_clamp_the_derivatives_are_those_of_differences(mass):
+    loaded, z = LoadedBeam(BEAM, DAMPINGS["fractional"], mass), clamped_free_eigenvalues(3)
+    for name in ("zeta", "ln_density_over_stiffness", "tip_mass_kg"):
+        step = STEPS[name]
+        later = changed(loaded, name, step).poles(z)
+        for after, pole in zip(later, loaded.poles(z), strict=True):
+            moved = (after[0] - pole[0]) / step
+            assert loaded.pole_gradient(pole[0], [name])[0] == pytest.approx(moved, rel=5e-3)
 
 
 def test_without_either_it_is_the_bare_beam():
