@@ -30,7 +30,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import Finding, Headline, OrderVerdict, RecordAnalysis, RecordFit
+    from analysis.identify import (
+        Finding,
+        Headline,
+        OrderVerdict,
+        Plant,
+        RecordAnalysis,
+        RecordFit,
+    )
     from analysis.record import Record
     from rigd.session import StreamStart
 
@@ -101,7 +108,9 @@ class OnlineEstimate:
         """The fit to predict the next excitation's answer with; None if there was no fit.
 
         It has both dampings. One that does not show, or whose order is not identifiable and which
-        may thus be a stiffness or an inertia in truth, has order 1.
+        may thus be a stiffness or an inertia in truth, has order 1. Modes with stiffnesses of their
+        own are stood for by the likeliest tip mass or clamp, if one was tried: by a few parameters
+        the torque between the modes is known as well.
         """
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
@@ -109,17 +118,26 @@ class OnlineEstimate:
         told, analysis = self.headline, self.analysis
         if told is None or analysis is None:
             return None
+        fit = told.with_both
+        if fit.plant.stiffness_offsets:
+            others = [
+                each
+                for each in analysis.fits
+                if any(each.plant.extras.values()) and not each.plant.stiffness_offsets
+            ]
+            return min(others, key=lambda each: each.cost, default=fit)
         untold = {name for name in COEFFICIENT_OF if name in told.flags}
-        if not untold or told.with_both is not told.fit:
-            return told.with_both
+        if not untold or fit is not told.fit:
+            return fit
+        at_ends = _named(fit.plant)
         simple = (
-            fit
-            for fit in analysis.fits
-            if fit.structure is INTEGER
-            and not fit.plant.stiffness_offsets
-            and not any(fit.plant.extras.values())
+            each
+            for each in analysis.fits
+            if each.structure is INTEGER
+            and not each.plant.stiffness_offsets
+            and _named(each.plant) == at_ends
         )
-        return next(simple, told.fit)
+        return next(simple, fit)
 
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it (docs/online_fit.md)."""
@@ -150,6 +168,11 @@ class OnlineEstimate:
             }
             del content["file"]
         return dict(finite(content))
+
+
+def _named(plant: Plant) -> set[str]:
+    """Names of what a rig has beside the beam."""
+    return {name for name, size in plant.extras.items() if size}
 
 
 def _noise(analysis: RecordAnalysis) -> dict[str, Any]:
@@ -199,6 +222,7 @@ class OnlineFit:
         self._path = Path(name)
         self._blocks: list[NDArray[np.void]] = []
         self._count = 0
+        self._found: Plant | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
         """Take the next samples.
@@ -292,13 +316,18 @@ class OnlineFit:
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                told, found, analysis = freest_alone(measurement, band_hz)
+                told, found, analysis = freest_alone(measurement, band_hz, self._found)
         except (SessionError, RecordError, MeasurementError) as error:
             problem = str(error).removeprefix(f"{self._path}: ")
             took_s = time.monotonic() - began_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
+        except (ArithmeticError, ValueError) as error:
+            # A running session is told, and goes on; later samples may do.
+            problem = f"The record so far cannot be fitted ({error!r})."
+            took_s = time.monotonic() - began_s
+            return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
         shows = bool(told.visible_modes)
-        return OnlineEstimate(
+        estimate = OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
             whole=whole,
@@ -312,6 +341,10 @@ class OnlineFit:
             warnings=record.warnings,
             problem="" if shows else "No mode has been excited enough yet.",
         )
+        if whole:
+            fit = estimate.predicting
+            self._found = fit.plant if fit is not None and _named(fit.plant) else None
+        return estimate
 
 
 # The program
@@ -391,13 +424,15 @@ def main() -> None:
     killed_first()
     use_one_thread()
     try:
-        start = read_start(sys.stdin.buffer)
+        # Not `sys.stdin`: the interpreter would wait at its end for who reads from that, and abort.
+        stream = open(0, "rb", closefd=False)  # noqa: SIM115
+        start = read_start(stream)
         if start.every_s is None:
             os.setpriority(os.PRIO_PROCESS, 0, _NICE)
         else:
             give_way()  # nobody waits
         with suppress(BrokenPipeError):  # nobody reads any more
-            serve(start, read_frames(sys.stdin.buffer))
+            serve(start, read_frames(stream))
     except SessionError as error:
         sys.exit(f"Error: {error}")
 

@@ -11,6 +11,7 @@ import numpy as np
 from analysis.identify._candidate import Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._fit import fit_record
+from analysis.identify._knock import knock_in, with_knock
 from analysis.identify._leakage import without_leakage
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
@@ -18,6 +19,7 @@ from analysis.identify._problem import Comparison
 from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._rivals import with_extras
+from analysis.identify._search import RENEWALS
 from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
@@ -115,13 +117,19 @@ class CandidateSet:
         field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
         field = field._without_leakage()
         likeliest = field.likeliest
+        if not field.all_but_white(likeliest):
+            found = knock_in(field) if not measurement.knocks else None
+            if found is not None and found.obvious:
+                struck = cls.of(with_knock(measurement, found), fixed, band_hz)
+                if struck.all_but_white(struck.likeliest):
+                    return struck
         if len(visible_modes(field.comparison, field.noise, likeliest)) > 1:
             field = (
                 field._with_modes_free(likeliest)
                 if field.all_but_white(likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
-        return with_extras(field.cross_checked())
+        return with_extras(field.cross_checked()._renewed())._renewed()
 
     @classmethod
     def of_freest(
@@ -266,6 +274,25 @@ class CandidateSet:
             max_evaluations=max_evaluations,
         )
 
+    def _renewed(self) -> CandidateSet:
+        """Tell anew, with the best beam, what followed the reference; `self` if that is settled."""
+        field = self
+        for _ in range(RENEWALS):
+            best = field.best
+            comparison = field.comparison.renewed(best.fit.plant, field.noise)
+            if comparison is field.comparison:
+                break
+            alone = replace(field, comparison=comparison, candidates=(best,))
+            noise = alone.refit(best, FEW).noise_here()
+            alone = replace(alone, noise=noise)
+            field = replace(alone, candidates=(alone.refit(best, FEW).candidate(),))
+        if field is self:
+            return self
+        # The others from where they were: they have seen their best's noise only.
+        others = (c for c in self.candidates if c is not self.best)
+        every = (field.refit(c).candidate() for c in others)
+        return field.ranked((*field.candidates, *every)).cross_checked()
+
     def _without_leakage(self) -> CandidateSet:
         """Leave out the bins that a disturbance beyond the band leaks into."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
@@ -352,6 +379,23 @@ class CandidateSet:
             unknowns = self.unknowns(structure, uniform=True)
             found.append(self.descent(unknowns, unknowns.vector(fit.plant), MANY).candidate())
         field = self.ranked((*self.candidates, *found)).cross_checked()
+        return field.led_by(field.freest)
+
+    def with_kind_of(self, plant: Plant) -> CandidateSet:
+        """Fit the freest structure on the kind of rig of a plant as well, from there.
+
+        Parameters
+        ----------
+        plant : Plant
+            As the judgement of an earlier part of the record has found it.
+        """
+        extras = tuple(name for name, size in plant.extras.items() if size)
+        unknowns = self.unknowns(_FREEST, not plant.stiffness_offsets, extras)
+        refit = self.descent(unknowns, unknowns.vector(plant), MANY)
+        field = self.ranked((*self.candidates, refit.candidate()))
+        if field.best.kind != _PLAIN and field.best.bic < self.best.bic - _DISMISSED:
+            # What the plain beam does not explain counted as noise.
+            field = field.under(refit.noise_here())._renewed()
         return field.led_by(field.freest)
 
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:

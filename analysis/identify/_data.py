@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 # Measurement
 
+_SAME_INSTANT_S: Final = 1e-7
+
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
 """Longest gap of the angle that is bridged, in periods of the band's upper end."""
 
@@ -41,6 +43,93 @@ MAX_TORQUE_GAP_S: Final = 1.0
 
 class MeasurementError(ValueError):
     """A record that the whole-record estimator cannot use; the message says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Knock:
+    """A knock on the beam: any torque for as long as it lasts, and from its beginning free decays.
+
+    Attributes
+    ----------
+    first_s, last_s : float
+        Its first instant, and the first one after it, since the record's first tick.
+    resolution_s : float
+        By how much the first may be off.
+    poles_rad_s : tuple of complex
+        Poles of the modes that rang on: of a conjugate pair the upper, or a real one.
+    sizes : tuple of float
+        Size of each column (`columns`), as well as it is known.
+    largest_nm : float
+        Largest torque within a second.
+    """
+
+    first_s: float
+    last_s: float
+    resolution_s: float
+    poles_rad_s: tuple[complex, ...]
+    sizes: tuple[float, ...] = ()
+    largest_nm: float = 0.0
+
+    def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Decays of all modes, and the same times the time since the knock, shape (d, n).
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Since the record's first tick.
+        """
+        since_s = time_s - self.first_s
+        later = since_s > -_SAME_INSTANT_S
+        since_s = np.where(later, since_s, 0.0)
+        rows = []
+        for pole in self.poles_rad_s:
+            decay = np.where(later, np.exp(pole * since_s), 0.0)
+            for part in (decay.real, decay.imag)[: 1 + (pole.imag != 0)]:
+                rows += [part, part * since_s]
+        return np.array(rows).reshape(len(rows), time_s.size)
+
+    def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
+        """Torque by each unknown size: decays, then single samples for as long as it lasts.
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Instants of samples, since the record's first tick.
+        rate_hz : float
+            Their rate.
+
+        Returns
+        -------
+        ndarray, shape (c, n)
+        """
+        half_s = 0.5 / rate_hz
+        touched = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
+        places = np.flatnonzero(touched)
+        single = np.zeros((places.size, time_s.size))
+        single[np.arange(places.size), places] = 1.0
+        return np.concatenate([self.decays(time_s), single])
+
+    def torque(
+        self, time_s: NDArray[np.float64], grid_s: NDArray[np.float64], rate_hz: float
+    ) -> NDArray[np.float64]:
+        """Torque at some instants as well as it is known, shape (n,).
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Since the record's first tick.
+        grid_s : ndarray, shape (m,)
+            Instants of the samples that `sizes` belongs to.
+        rate_hz : float
+            Their rate.
+        """
+        if not self.sizes:
+            return np.zeros(time_s.size)
+        decays = self.decays(time_s)
+        sizes = np.array(self.sizes)
+        single = sizes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
+        torque: NDArray[np.float64] = sizes[: len(decays)] @ decays
+        return torque + np.interp(time_s, grid_s, single)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +160,8 @@ class Measurement:
     reference_rad : ndarray, shape (n,), or None
         Angle that a controller was asked for, if one held the motor: what of the angle does not
         follow it is taken to be the noise's doing.
+    knocks : tuple of Knock
+        What is known to have struck the beam. Their sizes stay free.
     """
 
     name: str
@@ -86,6 +177,7 @@ class Measurement:
     reference_rad: NDArray[np.float64] | None = None
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
+    knocks: tuple[Knock, ...] = ()
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:

@@ -30,6 +30,7 @@ Kind = Literal[
     "drifting gain",
     "clipping",
     "play",
+    "knock",
     "stop",
     "implausible",
     "unexplained",
@@ -63,7 +64,17 @@ class Finding:
 
 
 SEEN: Final[frozenset[Kind]] = frozenset(
-    {"hum", "sensor drift", "sign", "unit", "clipping", "stop", "implausible", "unexplained"}
+    {
+        "hum",
+        "sensor drift",
+        "sign",
+        "unit",
+        "clipping",
+        "stop",
+        "knock",
+        "implausible",
+        "unexplained",
+    }
 )
 """What is seen in the record itself, whatever model is laid over it."""
 

@@ -111,15 +111,32 @@ def fit_record(
         searches = [
             Search.of(Objective(comparison, search.unknowns), coarse) for search in searches
         ]
+    noise, descents = _under_its_noise(searches, closest, reference)
+    for _ in range(_REPEATS):
+        closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
+        reference = descents[closest].renewed(noise, _BEFORE_LINES)
+        if reference is descents[closest]:
+            break
+        # What was apart from the reference hid the beam, or stood for noise.
+        comparison = reference.objective.comparison
+        searches = [search.on(comparison) for search in searches]
+        noise, descents = _under_its_noise(searches, closest, reference)
+    fits = (summary(descent.objective, descent.x, noise) for descent in descents)
+    return RecordAnalysis.of(fits, noise, comparison)
+
+
+def _under_its_noise(
+    searches: list[Search], closest: int, reference: Descent
+) -> tuple[Noise, list[Descent]]:
+    """Descend with all structures under the noise that the closest one leaves."""
     # Lines are looked for once, in what a fit to every bin leaves.
     noise = reference.noise(with_lines=True)
-    noise = replace(noise, lines=(*noise.lines, *(hum.line for hum in comparison.hum)))
-    descents = [
+    hum = reference.objective.comparison.hum
+    noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
+    return noise, [
         search.under(noise, reference if i == closest else None).to_minimum(noise, _TOLERANCE)
         for i, search in enumerate(searches)
     ]
-    fits = (summary(descent.objective, descent.x, noise) for descent in descents)
-    return RecordAnalysis.of(fits, noise, comparison)
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:

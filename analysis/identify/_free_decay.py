@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 
 _HARDLY: Final = 1e-6
-_ASIDE: Final = 1e-8
-"""Relative distance from a pole: the root of what rounding leaves of G's size there."""
 
 _OF_ENDS: Final = frozenset({"tip_mass_kg", "root_compliance_rad_per_nm"})
 """Extras that move poles."""
@@ -81,35 +79,16 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
 
 
 def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
-    """Compute the same with a tip mass or an elastic clamp, on a uniform beam.
-
-    The derivatives are those of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
-    is infinite, but next to it the ratios of its derivatives are already as they should be.
-    """
-    damping, ratio = plant.damping, plant.beam.density_over_stiffness
-    loaded = LoadedBeam(plant.beam, damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm)
-    found = []
-    for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1):
-        if np.isnan(pair).any():
-            continue
-        for pole in pair[: 1 if pair[0].imag else 2]:
-            s = np.array([pole if plant.root_compliance_rad_per_nm else pole * (1 - _ASIDE)])
-            at, log_s = loaded.at(s), np.log(s)
-            s_alpha, s_lambda = np.exp(damping.alpha * log_s), np.exp(damping.lambda_ * log_s)
-            by: dict[str, NDArray[np.complex128]] = {
-                "zeta": at.by_elastic * s_alpha,
-                "alpha": at.by_elastic * damping.zeta * log_s * s_alpha,
-                "gamma": at.by_inertial * s_lambda,
-                "lambda": at.by_inertial * damping.gamma * log_s * s_lambda,
-                "ln_density_over_stiffness": at.by_inertial * ratio * s * s,
-                "ln_stiffness": at.response - plant.tip_mass_kg * at.by_mass,
-                "tip_mass_kg": at.by_mass,
-                "root_compliance_rad_per_nm": -at.response * at.response,
-            }
-            slope = loaded.slope(s, at)
-            moved = [-(by[name] / slope)[0] if name in by else 0.0 for name in wrt]
-            found.append(Pole(mode, complex(pole), np.array(moved, dtype=np.complex128)))
-    return tuple(found)
+    """Compute the same with a tip mass or an elastic clamp, on a uniform beam."""
+    loaded = LoadedBeam(
+        plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
+    )
+    return tuple(
+        Pole(mode, complex(pole), loaded.pole_gradient(complex(pole), wrt))
+        for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1)
+        if not np.isnan(pair).any()
+        for pole in pair[: 1 if pair[0].imag else 2]
+    )
 
 
 def _pole_derivative(

@@ -11,17 +11,24 @@ import math
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import ln_stiffness_with_tip
 from analysis.identify._plant import EXTRAS
 from analysis.identify._refit import FEW, MANY
 from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._parametrization import Unknowns
     from analysis.identify._refit import Refit
+    from analysis.identify._result import ModeEstimate
 
 _STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("VI", "VII", "III"))
 _PROMISING: Final = 10.0
@@ -44,6 +51,9 @@ _FARTHER_CLOCKS: Final = (2.0, -2.0, 6.0, -6.0, 12.0, -12.0)
 """Differences of the clocks, in units of 1e-5, from which it starts as well if what is left is not
 noise."""
 
+_AT_ENDS: Final = ("root_compliance_rad_per_nm", "tip_mass_kg")
+_POLISHED: Final = 4
+_STEP: Final = 1e-5
 _HALVINGS: Final = 20
 
 _QUIETER: Final = 0.98
@@ -122,7 +132,49 @@ def _begun(field: CandidateSet, lead: Candidate, name: str, size: float) -> Refi
     unknowns = field.unknowns(STRUCTURES["VI"], uniform=True, extras=(name,))
     x = unknowns.vector(lead.fit.plant)
     x[-1] += size
+    if lead.fit.plant.stiffness_offsets and name in _AT_ENDS:
+        x = _at_its_modes(unknowns, x, lead.fit.modes)
     return field.descent(unknowns, x, 1)
+
+
+def _at_its_modes(
+    unknowns: Unknowns, start: NDArray[np.float64], modes: Sequence[ModeEstimate]
+) -> NDArray[np.float64]:
+    """Bring the modes to where a beam with free modes has them, by rho/EI and the extra, (k,).
+
+    No descent would find a resonance that is off by more than it is wide. The start itself where
+    that does not succeed.
+    """
+    wanted = {mode.number: mode.frequency_hz for mode in modes if mode.frequency_hz > 0}
+    if "density_over_stiffness" not in unknowns.free or not wanted:
+        return start
+    places = [unknowns.names.index("density_over_stiffness"), start.size - 1]
+
+    def missed(x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        poles = {pole.mode: pole for pole in mode_poles(unknowns.plant(x), max(wanted), ())}
+        if not wanted.keys() <= poles.keys():
+            return None
+        return np.array(
+            [math.log(poles[n].at_rad_s.imag / (2 * math.pi * hz)) for n, hz in wanted.items()]
+        )
+
+    x = start.copy()
+    lower, upper = unknowns.bounds
+    for _ in range(_POLISHED):
+        here = missed(x)
+        if here is None:
+            return start
+        slopes = []
+        for place in places:
+            aside = x.copy()
+            aside[place] += _STEP
+            there = missed(aside)
+            if there is None:
+                return start
+            slopes.append((there - here) / _STEP)
+        x[places] -= np.linalg.lstsq(np.array(slopes).T, here)[0]
+        x = np.clip(x, lower, upper)
+    return x
 
 
 def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> Iterator[Candidate]:

@@ -208,6 +208,9 @@ _CLEARLY: Final = 0.9
 """Cost, relative to where a descent has ended, that makes another coarse minimum worth a look."""
 
 _MOST_MINIMA: Final = 4
+RENEWALS: Final = 4
+"""How often it is told anew at most what followed the reference."""
+
 _LOOKS: Final = 3
 """Number of searches for hum: the first fit attributed part of it to the beam."""
 
@@ -231,6 +234,22 @@ class Descent:
             self.x, noise.weight, region, relative_tolerance=tolerance
         )
         return Descent(objective, minimum.x)
+
+    def cost(self, noise: Noise) -> float:
+        """Sum of squares here under a noise spectrum."""
+        return self.objective.normal_equations(self.x, noise.weight).cost
+
+    def renewed(self, noise: Noise, tolerance: float) -> Descent:
+        """Tell anew what followed the reference, until that is settled; `self` if it is."""
+        here = self
+        for _ in range(RENEWALS):
+            comparison = here.objective.comparison.renewed(here.plant, noise)
+            if comparison is here.objective.comparison:
+                break
+            here = Descent(Objective(comparison, here.objective.unknowns), here.x)
+            noise = here.noise()
+            here = here.to_minimum(noise, tolerance)
+        return here
 
     def hum(self) -> tuple[Hum, ...]:
         """Search for narrow-band disturbances near the modes of the beam found so far."""
@@ -344,4 +363,4 @@ class Search:
         if len(rivals) == 1:
             return rivals[0]
         ends = [rival.to_minimum(noise, _BETWEEN_RIVALS) for rival in rivals]
-        return min(ends, key=lambda end: end.objective.normal_equations(end.x, noise.weight).cost)
+        return min(ends, key=lambda end: end.cost(noise))

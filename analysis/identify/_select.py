@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import wrong_scale
@@ -18,6 +18,7 @@ from analysis.identify._drag import damping_with_amplitude, with_air_drag
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, ONE_MODE, UNEXPLAINED, Headline, headline, of_fit
+from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._problem import Comparison
 from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
@@ -47,13 +48,13 @@ from analysis.statistics import NORMAL_95
 from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Quantity, Simpler
-    from analysis.identify._plant import Setting
+    from analysis.identify._plant import Plant, Setting
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
@@ -69,6 +70,8 @@ no valleys there, and no damping that is a stiffness or an inertia in truth."""
 
 _BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
+"""What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
 """All that is said where the record contradicts its file."""
 
@@ -114,7 +117,8 @@ def select(
     The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of
     the air along the beam makes the lowest lower, all are fitted with it. If restoring forces that
     are not linear, or a change along the record, save far more than chance would, all are fitted
-    again with these beside the beam.
+    again with these beside the beam. Where all that leaves more than noise, a knock on the beam is
+    looked for; if it explains the rest, all is done again with it.
 
     Parameters
     ----------
@@ -130,7 +134,58 @@ def select(
     ValueError
         There is no such setting.
     """
-    linear = CandidateSet.of(measurement, tuple(fixed), band_hz)
+    fixed = tuple(fixed)
+    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz)).said
+
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class _Told(Generic[_T]):
+    """What is said of a record, and what it rests on.
+
+    Attributes
+    ----------
+    said : _T
+    field : CandidateSet
+        Led by the candidate that the numbers are of.
+    explained : bool
+        Whether that leaves nothing but noise.
+    kinds : collection of str
+        Kinds of what was found.
+    """
+
+    said: _T
+    field: CandidateSet
+    explained: bool
+    kinds: Collection[str]
+
+
+def _with_knocks(measurement: Measurement, tell: Callable[[Measurement], _Told[_T]]) -> _Told[_T]:
+    """Judge a record; where all leaves more than noise, with the knocks that explain it."""
+    told = tell(measurement)
+    for _ in range(MOST_KNOCKS):
+        if told.explained or not _NOT_SEARCHED.isdisjoint(told.kinds):
+            break
+        better = None
+        for found in knocks_in(told.field):
+            again = tell(with_knock(told.field.comparison.measurement, found))
+            if again.explained or found.evident:
+                better = again
+            if again.explained:
+                break
+        if better is None:
+            break
+        told = better
+    return told
+
+
+def _selected(
+    measurement: Measurement, fixed: tuple[Setting, ...], band_hz: tuple[float, float]
+) -> _Told[Selection]:
+    """Choose the structure with what is known to have struck the beam."""
+    linear = CandidateSet.of(measurement, fixed, band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (
         (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
@@ -155,7 +210,10 @@ def select(
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        found = (
+            *of_knocks(field.comparison.measurement.knocks, explained=explained),
+            *_as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained),
+        )
         if not explained:
             found = (*found, unexplained(white, related, told.best.fit.modes))
         alone = doubt is None and not field.other_kinds(STRONG)
@@ -163,7 +221,7 @@ def select(
         advice = experiments(field, orders, visible, found, close)
     advice += [each.remedy for each in found if each.remedy]
     best = field.best
-    return Selection(
+    selection = Selection(
         candidates=field.candidates,
         headline=numbers,
         analysis=RecordAnalysis.of(
@@ -189,12 +247,13 @@ def select(
             damping_with_amplitude=damping_with_amplitude(told),
         ),
     )
+    return _Told(selection, told, explained, kinds)
 
 
 def freest_alone(
-    measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ
+    measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ, like: Plant | None = None
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
-    """Fit the freest structure on a uniform beam and no other rig, in a quarter of `select`'s time.
+    """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
 
     The modes are those of `select` where that selects such a beam with all orders free. Where it
     selects anything else (modes free, drag, forces that are not linear), the residual shows it, and
@@ -205,6 +264,9 @@ def freest_alone(
     ----------
     measurement : Measurement
     band_hz : tuple of float
+    like : Plant, optional
+        Plant that `select` found of an earlier part of the record: its kind of rig is fitted as
+        well.
 
     Returns
     -------
@@ -219,11 +281,19 @@ def freest_alone(
     MeasurementError
         The record cannot be used.
     """
+    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz, like)).said
+
+
+def _freest_alone(
+    measurement: Measurement, band_hz: tuple[float, float], like: Plant | None
+) -> _Told[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
+    """Fit the freest structure alone with what is known to have struck the beam."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
     beside = () if misread else (INTEGER,)
     field = replace(CandidateSet.of_freest(measurement, (), band_hz, beside), misread=misread)
     if not misread:
         field = field.with_special_cases()
+        field = field if like is None else field.with_kind_of(like)
     visible = visible_modes(field.comparison, field.noise, field.best.fit)
     white, related, multiples = _tests(field, band_hz)
     found = findings(field, (), multiples, visible)
@@ -234,7 +304,10 @@ def freest_alone(
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         doubt = wrong or _doubt((), clipped="clipping" in kinds)
-        found = _as_sure(found, (), wrong, doubt, explained=explained)
+        found = (
+            *of_knocks(field.comparison.measurement.knocks, explained=explained),
+            *_as_sure(found, (), wrong, doubt, explained=explained),
+        )
         if not explained:
             found = (*found, unexplained(white, related, field.best.fit.modes))
     told = of_fit(
@@ -258,7 +331,8 @@ def freest_alone(
             },
         )
     others = (each.fit for each in field.candidates if each.structure is INTEGER)
-    return told, found, RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
+    analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
+    return _Told((told, found, analysis), field, explained, kinds)
 
 
 def _untold_orders(field: CandidateSet, visible: tuple[int, ...]) -> dict[str, str]:

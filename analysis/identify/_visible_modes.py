@@ -44,7 +44,8 @@ def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple
     Near each mode, the torque is compared with the best response to the angle that is smooth
     there. What that leaves is noise alone, with chi-square of known mean and scatter, unless there
     is a resonance: its energy against the noise is the evidence. Nothing is said of where exactly
-    in the window it lies, so a beam that is not uniform shows its modes as well.
+    in the window it lies, so a beam that is not uniform shows its modes as well. What the fit
+    explains better than the smooth response is evidence as well, in a long record of weaker ones.
 
     Parameters
     ----------
@@ -68,7 +69,10 @@ def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple
             torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
-        if left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom:
+        stands_out = left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom
+        # In many bins a resonance need not stand out of the noise, where the fit knows where it is.
+        own = float(np.vdot(fit.residual[near], fit.residual[near]).real)
+        if stands_out or left - own > _EVIDENCE:
             found.append(mode.number)
     return tuple(found)
 

@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify import Measurement, freest_alone
 from analysis.online import OnlineFit
 from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, LoadedBeam
 from rigd.session import (
     SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
@@ -26,7 +27,7 @@ from rigd.session import (
     write_samples,
     write_start,
 )
-from rigd.testing import PAPER_BEAM, chirp_signals
+from rigd.testing import PAPER_BEAM, PAPER_DAMPING, chirp_signals
 
 MODAL = ("frequency_hz", "damping_ratio")
 
@@ -68,6 +69,7 @@ def scan(**others):
     )
 
 
+@pytest.mark.further  # as in tests/cli/test_until.py
 def test_the_last_estimate_is_that_of_the_file(session):
     live = fed(session).estimate(whole=True)
     selection = whole_record(load_record(session.path)).selection
@@ -102,12 +104,12 @@ def test_an_estimate_depends_on_what_was_before_its_tick_alone(session):
     ("tick", "problem"),
     [
         (0, "Nothing is excited yet"),
-        (500, "Nothing is excited yet"),
+        further(500, "Nothing is excited yet"),
         (1000, "are too short for the band"),
         (1600, "No mode has been excited enough yet"),
     ],
 )
-@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("whole", [False, further(True)])
 def test_what_cannot_be_fitted_yet_says_why(session, tick, problem, whole):
     estimate = fed(session).estimate(tick, whole=whole)
     assert problem in estimate.problem
@@ -115,6 +117,41 @@ def test_what_cannot_be_fitted_yet_says_why(session, tick, problem, whole):
     assert estimate.doubt == estimate.problem
     assert estimate.headline is None
     json.dumps(estimate.as_json(), allow_nan=False)
+
+
+def test_a_fit_that_fails_is_a_problem_of_this_estimate_alone(session, monkeypatch):
+    fit = fed(session)
+
+    def fails(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("analysis.identify.freest_alone", fails)
+        estimate = fit.estimate()
+    assert estimate.problem.startswith("The record so far cannot be fitted")
+    assert "Singular matrix" in estimate.problem
+    assert fit.estimate().problem == ""
+
+
+def test_a_quick_estimate_fits_the_rig_that_the_judgement_has_found(session):
+    """A beam with a mass at its tip, of which a uniform one explains nothing."""
+    tip_kg, signals = 1.8e-4, scan()
+    n = signals.angle_rad.size
+    decay = np.exp(-6.0 * np.arange(n) / n)
+    s = 6.0 * 1000 / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1e-3)
+    more = LoadedBeam(PAPER_BEAM, PAPER_DAMPING, tip_kg).transfer(s)
+    more -= LoadedBeam(PAPER_BEAM, PAPER_DAMPING).transfer(s)
+    spectrum = np.fft.rfft(signals.angle_rad * decay, 4 * n) * np.where(s.imag < 600.0, more, 0.0)
+    torque_nm = signals.torque_nm + np.fft.irfft(spectrum, 4 * n)[:n] / decay
+    fit = fed_with(replace(signals, torque_nm=torque_nm), session)
+    assert fit.estimate().doubt == "part of the record is unexplained"
+    whole = fit.estimate(whole=True)
+    assert "tip mass" in whole.as_json()["type"]
+    quick = fit.estimate()
+    assert quick.doubt is None
+    assert quick.as_json()["plant"]["tip_mass_kg"] == pytest.approx(tip_kg, rel=0.05)
+    for one, other in zip(quick.headline.modes, whole.headline.modes, strict=True):
+        assert one.frequency_hz.value == pytest.approx(other.frequency_hz.value, rel=1e-3)
 
 
 def test_what_still_runs_was_not_cut_short(session):
@@ -144,7 +181,7 @@ def test_a_hum_is_named_and_a_blow_makes_all_doubtful(session):
     assert struck.doubt == "part of the record is unexplained"
 
 
-@pytest.mark.parametrize(("density", "stiffness"), [(1.2, 0.8), (0.8, 1.2)])
+@pytest.mark.parametrize(("density", "stiffness"), [(1.2, 0.8), further(0.8, 1.2)])
 def test_a_beam_20_percent_off_its_data_is_found(session, density, stiffness):
     beam = Beam(0.98, density * 4.7e-3, stiffness * 0.090275)
     told = fed_with(scan(beam=beam), session).estimate().headline

@@ -114,7 +114,8 @@ def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_her
         tmp_path / "slow.mcap", slow_signals, metadata={"rate_hz": "100.0", "duration_s": "20.0"},
         t_ns=ticks * 10_000_000,
     )  # fmt: skip
-    result = analyze_here("slow.mcap", "--json", "slow.json", "--report", "r")
+    brief = ("--types", "I", "--weights", "const", "--figures", "png")
+    result = analyze_here("slow.mcap", "--json", "slow.json", "--report", "r", *brief)
     assert result.returncode == 0, result.stderr
     content = json.loads((tmp_path / "slow.json").read_text())
     (record,) = content["records"]
@@ -130,6 +131,7 @@ def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_her
     assert json.loads((tmp_path / "b.json").read_text())["records"][0]["band_hz"] == [1.0, 20.0]
 
 
+@pytest.mark.further  # what suits a step is decided above
 def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
     write_session, make_signals, analyze_here, tmp_path
 ):

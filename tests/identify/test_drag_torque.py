@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify import Measurement, Plant
 from analysis.identify._drag_torque import DragError, DragLaw, DragResponse
@@ -46,7 +47,7 @@ def deviation(one, other):
     return np.linalg.norm(one - other) / np.linalg.norm(other)
 
 
-@pytest.mark.parametrize("law", [DragLaw(2.3e-3), WHITE])
+@pytest.mark.parametrize("law", [further(DragLaw(2.3e-3)), WHITE])
 def test_the_torque_is_that_of_steps_in_time(brake, law):
     angle_rad = swept(16.0, 20.0)
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
@@ -97,10 +98,10 @@ def test_derivatives_by_the_law(short, place):
     ("name", "value", "step", "tolerance"),
     [
         ("zeta", 5.4e-5, 2e-6, 5e-3),
-        ("gamma", 0.02, 1e-3, 5e-3),
+        further("gamma", 0.02, 1e-3, 5e-3),
         ("density", 4.7e-3, 4.7e-8, 1e-3),
-        ("offset", 0.0, 1e-5, 1e-3),
-        ("delay_s", 0.0, 1e-5, 1e-4),
+        further("offset", 0.0, 1e-5, 1e-3),
+        further("delay_s", 0.0, 1e-5, 1e-4),
     ],
 )
 def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, tolerance):

@@ -5,15 +5,17 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import further
 
-from analysis.identify import fit_record
+from analysis.identify import Measurement, Plant, fit_record, select
 from analysis.identify._problem import Comparison, following
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, transfer
+from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, transfer
 
 RATE_HZ = 1000.0
 NOISE_NM = 1e-2
 CLAMP = 1e-5
+DAMPED = Damping(zeta=2e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 
 
@@ -78,6 +80,7 @@ def test_nothing_follows_a_reference_that_stands_still():
     assert not following(np.ones(500), np.zeros(500), 125.0).any()
 
 
+@pytest.mark.further  # as a hum that does
 def test_noise_that_moves_the_motor_is_no_response(sessions, controlled):
     """Against the same noise in the torque alone, which leaves nothing to chance."""
     session = sessions("III", tool_inertia_kg_m2=CLAMP)
@@ -142,7 +145,7 @@ def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_p
             assert abs(deviates(seventh, name, value)) < 3.0, name
 
 
-@pytest.mark.parametrize("hum", [(16.011, 5e-3), (16.08, 2e-2)])
+@pytest.mark.parametrize("hum", [(16.011, 5e-3), further((16.08, 2e-2))])
 def test_a_hum_on_a_mode_that_moves_the_motor_is_no_response(controlled, hum):
     quiet = fit(controlled("VI", 5), "VI")
     analysis = fit_record(controlled("VI", 5, hum=hum), [STRUCTURES["VI"]])
@@ -151,3 +154,74 @@ def test_a_hum_on_a_mode_that_moves_the_motor_is_no_response(controlled, hum):
     assert line.amplitude_nm == pytest.approx(hum[1], abs=3e-4)
     for name in quiet.determined:
         assert abs(found.parameters[name] - quiet.parameters[name]) < quiet.std[name], name
+
+
+@pytest.fixture(scope="module")
+def in_narrow_bands():
+    """Beam with a mass at its tip, which moves the motor as it rings, driven at its modes alone."""
+    loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
+    n = 30_000
+    t = np.arange(n) / RATE_HZ
+    reference = np.zeros(n)
+    for number, pole in enumerate(loaded.poles(clamped_free_eigenvalues(3))[:, 0]):
+        for begins in (1.0 + 3.0 * number, 11.0 + 6.0 * number):
+            window = np.clip(np.sin(np.pi * (t - begins) / 5.0), 0.0, 1.0) ** 2
+            window[(t < begins) | (t > begins + 5.0)] = 0.0
+            reference += 0.008 * window * np.sin(pole.imag * (t - begins))
+    # A first look at all modes, too short to tell them from those of another beam.
+    sweep = np.sin(2 * np.pi * (0.5 * t + 5.0 * t**2)) * np.clip(np.sin(np.pi * t / 5.0), 0.0, 1.0)
+    reference += 0.02 * np.where(t < 5.0, sweep, 0.0)
+    s = 6.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
+    g = loaded.transfer(s)
+    decay = np.exp(-6.0 * np.arange(n) / n)
+    turned = -100 * s * (s + 310) / (s + 80) ** 4 * np.exp(-s / RATE_HZ)
+    spectrum = np.fft.rfft(reference * decay, 4 * n) / (1 - turned * g)
+    angle, torque = (np.fft.irfft(each, 4 * n)[:n] / decay for each in (spectrum, spectrum * g))
+    torque += np.random.default_rng(11).normal(scale=4e-3, size=n)
+    known = np.ones(n, dtype=bool)
+    return Measurement(
+        "narrow", angle, torque, RATE_HZ, LINK, known, known, 0.0, reference_rad=reference
+    )
+
+
+def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow_bands):
+    """What rings turns the motor in far narrower bands than its following is smoothed over."""
+    found = select(in_narrow_bands)
+    assert found.verdict.adequate
+    mass = found.headline.fit
+    assert mass.plant.tip_mass_kg == pytest.approx(1.8e-4, abs=4 * mass.std["tip_mass_kg"])
+    poles = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4).poles(clamped_free_eigenvalues(3))[:, 0]
+    for mode, pole in zip(mass.modes, poles, strict=True):
+        assert abs(mode.frequency_hz - pole.imag / (2 * np.pi)) < 4 * mode.frequency_std_hz
+        assert abs(mode.damping_ratio + pole.real / abs(pole)) < 4 * mode.damping_ratio_std
+
+
+def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
+    unknown = np.arange(30_000, 30_050)
+    measured = controlled("III", 1, unknown_torque=unknown)
+    comparison = Comparison.of(measured, (0.0, 50.0))
+    found = fit_record(measured, [STRUCTURES["III"]])
+    plant = found.fits[0].plant
+    first = comparison.following_reference(plant)
+    assert first.renewed(plant, found.noise) is first
+    other = first.renewed(
+        replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
+    ).renewed(plant, found.noise)
+    assert other.angle_rad + other.rest_rad == pytest.approx(first.angle_rad + first.rest_rad)
+    for each in (first, other):
+        kept = each.torque_nm[each.kept] + each.rest_nm
+        assert kept == pytest.approx(comparison.torque_nm[comparison.kept])
+    # Nothing was taken out there.
+    assert comparison.renewed(plant, found.noise) is comparison
+
+
+def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
+    loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
+    plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
+    first = Comparison.of(in_narrow_bands, (0.0, 50.0)).following_reference(plant)
+    noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise
+    wrong = first.renewed(Plant(LINK, DAMPED), noise)
+    told = wrong.renewed(plant, noise)
+    assert loaded.tip_mass_kg == plant.tip_mass_kg
+    rest, told_rest = (np.std(each.rest_rad[each.kept]) for each in (first, told))
+    assert told_rest < 0.2 * rest

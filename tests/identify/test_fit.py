@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
 from analysis.identify._parametrization import Steps, Unknowns
@@ -32,14 +33,14 @@ def assert_within(found, expected, errors=4.0):
         assert abs(found.parameters[name] - expected[name]) <= errors * std, name
 
 
-@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+@pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
 def test_without_noise_the_plant_itself(sessions, true_parameters, name):
     found = fit(sessions(name).measured(), name)
     assert_exact(found, true_parameters(name))
     assert found.parameters["tool_inertia_kg_m2"] == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+@pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
 def test_without_noise_beam_delay_and_clamp_that_nobody_declared(sessions, true_parameters, name):
     undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
     found = fit(sessions(name, **undeclared).measured(), name)
@@ -47,7 +48,7 @@ def test_without_noise_beam_delay_and_clamp_that_nobody_declared(sessions, true_
     assert found.plant.beam.density_kg_per_m == pytest.approx(OTHER.density_kg_per_m)
 
 
-@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+@pytest.mark.parametrize("name", ["VI", "III", further("IV")])
 def test_with_noise_within_its_own_error(sessions, true_parameters, name):
     undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
     found = fit(sessions(name, **undeclared).measured(noise_nm=1e-2, seed=31), name)
@@ -66,7 +67,7 @@ def test_a_far_wrong_beam_is_found(sessions, true_parameters):
     assert_within(found, true_parameters("VI"))
 
 
-@pytest.mark.parametrize("plant", ["like springs", "like masses"])
+@pytest.mark.parametrize("plant", ["like springs", further("like masses")])
 def test_strong_damping_of_orders_far_from_1(sessions, true_parameters, plant):
     nominal = Beam(0.98, 4.7e-3 * 0.93, 0.090275 * 1.05)
     measurement = sessions(plant, delay_s=2e-4).measured(noise_nm=1e-2, seed=6, beam=nominal)
@@ -94,7 +95,7 @@ def test_errors_that_are_held_fixed_are_read_as_damping(sessions):
     assert abs(found.parameters["alpha"] - 0.996) > 0.1
 
 
-@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+@pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
 def test_a_beam_that_rings_from_the_start(sessions, true_parameters, name):
     shaken = sessions(name, shaken=True).cut(5000)
     assert_exact(fit(shaken.measured(), name), true_parameters(name), relative=2e-5)
@@ -166,8 +167,8 @@ def test_a_hum_is_named_and_moves_nothing(sessions):
         assert difference < 0.7 * without.std[name]
 
 
-@pytest.mark.parametrize(("hz", "amplitude_nm"), [(49.0, 0.05), (16.7, 0.02)])
-@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+@pytest.mark.parametrize(("hz", "amplitude_nm"), [further(49.0, 0.05), (16.7, 0.02)])
+@pytest.mark.parametrize("name", ["VI", further("III"), further("IV")])
 def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
     for shaken in (False, True):
         session = sessions(name, shaken=shaken)
@@ -187,7 +188,7 @@ def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
             assert max(ringing.amplitude_nm) < 3e-3 < amplitude_nm
 
 
-@pytest.mark.parametrize("seed", [4, 7, 9])
+@pytest.mark.parametrize("seed", [further(4), 7, further(9)])
 def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
     """Its skirts reach over the resonance, which lies at 16.03 Hz and is compared all the same."""
     session = sessions("IV")
@@ -203,7 +204,7 @@ def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
         assert abs(found.parameters[name] - quiet.parameters[name]) < 2 * quiet.std[name]
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", [0, 1, *map(further, range(2, 10))])
 def test_no_hum_is_found_where_there_is_none(sessions, seed):
     """What a rough start leaves at a sharp mode once passed for one, and stayed unfitted."""
     session = sessions("IV", shaken=True).cut(5000)
@@ -257,7 +258,7 @@ def test_the_wrong_structures_are_far_off(all_seven):
     assert all_seven["VII"].cost < all_seven["VI"].cost + 20  # alpha = 0.996
 
 
-@pytest.mark.parametrize("name", ["IV", "V", "VI", "VII"])
+@pytest.mark.parametrize("name", [further("IV"), further("V"), "VI", further("VII")])
 def test_no_descent_from_elsewhere_ends_lower(sessions, name):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=9)
     analysis = fit_record(measurement, [STRUCTURES[name]])

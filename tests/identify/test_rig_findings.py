@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify import Measurement, select
 from analysis.identify._candidates import CandidateSet
@@ -64,8 +65,8 @@ def judged(measurement):
     ("more", "kind", "true"),
     [
         ({"clamp_nm_per_rad": 30.0}, "elastic clamp", 30.0),
-        ({"filter_hz": 120.0}, "torque filter", 120.0),
-        ({"clock": 1e-5}, "clock rate difference", 1e-5),
+        further({"filter_hz": 120.0}, "torque filter", 120.0),
+        further({"clock": 1e-5}, "clock rate difference", 1e-5),
     ],
 )
 def test_a_rig_that_is_otherwise_is_named_with_its_size(more, kind, true):
@@ -153,6 +154,7 @@ def test_a_motor_that_stands_still_when_asked_to_move():
     assert not any(stops(asked))
 
 
+@pytest.mark.further  # as other residuals
 def test_a_drifting_zero_is_no_hum():
     made = record()
     t = np.linspace(-1, 1, TICKS)

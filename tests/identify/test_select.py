@@ -207,6 +207,7 @@ def test_what_cannot_be_told_apart_is_said(one_mode):
     assert "does not separate internal from external damping" in verdict.sentences[0]
 
 
+@pytest.mark.further  # as each alone
 def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, stiffening):
     made = sessions("III")
     t = np.arange(made.torque_nm.size) / 1000
@@ -241,6 +242,7 @@ def test_a_beam_that_is_not_uniform_is_no_fractional_order(field):
     assert fit.parameters["stiffness_offset_3"] == pytest.approx(-0.013, abs=1e-3)
 
 
+@pytest.mark.further  # each by itself is above
 def test_a_fractional_order_on_a_beam_that_is_not_uniform(sessions):
     made = sessions("IV", offsets=(0.006, -0.013))
     verdict = select(made.measured(noise_nm=NOISE_NM, seed=47)).verdict

@@ -1,0 +1,398 @@
+"""Knocks: the beam was struck or touched once during the record, and rang on by itself.
+
+While it is touched the torque is anybody's guess; from then on it is the free decay of the beam's
+modes. So a knock adds to the torque one unknown value at each sample for as long as it lasts, and a
+decay of unknown amplitude and phase of each mode. Each decay may have a pole slightly off the
+model's, to first order (a column that grows with the time in front of the decay): a blow that bends
+the beam farther than the excitation does, or poles that are not known well yet, bias nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._data import Knock, MeasurementError
+from analysis.identify._finding import Finding
+from analysis.identify._fit import fit_record
+from analysis.identify._free_decay import mode_poles
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._refit import FEW, Refit, unexplained_part
+from analysis.identify._residual_tests import largest_of, whiteness
+from analysis.models import STRUCTURES
+from analysis.statistics import chi_square_deviate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import CandidateSet
+    from analysis.identify._data import Measurement
+    from analysis.identify._problem import Comparison
+
+_FREEST: Final = STRUCTURES["VI"]
+
+MOST_KNOCKS: Final = 3
+"""In one record: more of them are not looked for."""
+
+_WINDOWS_S: Final = (0.08, 0.5)
+"""To either side of the instant that a scan finds: a blow lies within the first, a touch within the
+second."""
+
+_APART_S: Final = 0.1
+_AT_ONCE_S: Final = 0.4
+_RISES: Final = 0.5
+"""Largest power of the residual in that time before a knock, and so far apart from it, relative to
+that after it."""
+
+_ROUNDS: Final = 2
+"""Each finds the poles and the noise anew, with the knock out of both."""
+
+_MOST: Final = 0.8
+"""Least share of what is unexplained that a knock has to explain."""
+
+_WORTH: Final = 0.5
+"""Least share with which it is worth to look whether nothing else is in the record."""
+
+_ALL: Final = 0.95
+"""Share with which it is the explanation before any other has been looked for."""
+
+_RINGS: Final = 0.5
+"""Least share of the squares that a knock saves by the decays after it, not while it lasts."""
+
+_QUIET_S: Final = 2.0
+_LOUDER: Final = 1.5
+"""Largest power of the residual in that time before a knock, relative to the noise's."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundKnock:
+    """A knock, and how much of a record it explains.
+
+    Attributes
+    ----------
+    knock : Knock
+    share : float
+        Share of what was unexplained that it explains.
+    before : float
+        Power of what is left in the two seconds before it, relative to the noise's.
+    """
+
+    knock: Knock
+    share: float
+    before: float
+
+    @property
+    def evident(self) -> bool:
+        """Whether it is the most of what is unexplained, and began at once."""
+        return self.share > _MOST and self.before < _LOUDER
+
+    @property
+    def obvious(self) -> bool:
+        """Whether nothing else has to be looked for first."""
+        return self.share > _ALL and self.before < _LOUDER
+
+
+def knocks_in(field: CandidateSet) -> Iterator[FoundKnock]:
+    """Search for one more knock; each found may be the one, the likeliest first.
+
+    A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
+    But one half of the record it has spared, or left a free decay at its start: so it is searched
+    also in what a beam leaves that was fitted to one half.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    """
+    if field.misread or len(field.comparison.measurement.knocks) == MOST_KNOCKS:
+        return
+    first = knock_in(field)
+    if first is not None and first.obvious:
+        yield first
+        first = None
+    for start in _from_halves(field):
+        found = _knock_in(start)
+        if found is not None:
+            yield found
+    if first is not None:
+        yield first
+
+
+def knock_in(field: CandidateSet) -> FoundKnock | None:
+    """Search for a knock in what the likeliest candidate leaves.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    """
+    likeliest = min(field.candidates, key=lambda each: each.fit.cost)
+    return _knock_in(field.refit(likeliest, 1))
+
+
+def _knock_in(refit: Refit) -> FoundKnock | None:
+    """Search in what is left at one point."""
+    place = _scan(refit)
+    if place is None:
+        return None
+    comparison = refit.objective.comparison
+    for width_s in _WINDOWS_S:
+        half = math.ceil(width_s * comparison.decimation.rate_hz)
+        first, last = max(place - half, 0), min(place + half, comparison.samples)
+        cleaned = _cleaned(refit, first, last)
+        extent = _extent(cleaned, first, last)
+        if extent is None:
+            return None
+        found = _judged(cleaned, *extent)
+        if found.share < _WORTH:
+            return None
+        if extent[0] > first:
+            return found
+        if found.share < _MOST:
+            return None
+        # A touch that began before this window.
+    return None
+
+
+def _from_halves(field: CandidateSet) -> Iterator[Refit]:
+    """Fit the freest structure to either half alone; give the whole record there if that fits."""
+    comparison = field.comparison
+    measurement, hz = comparison.measurement, comparison.frequency_hz
+    band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
+    middle = measurement.angle_rad.size // 2
+    for half in (slice(0, middle), slice(middle, None)):
+        part = replace(
+            measurement,
+            angle_rad=measurement.angle_rad[half],
+            torque_nm=measurement.torque_nm[half],
+            angle_known=measurement.angle_known[half],
+            torque_known=measurement.torque_known[half],
+            reference_rad=(
+                None if measurement.reference_rad is None else measurement.reference_rad[half]
+            ),
+            knocks=(),
+        )
+        try:
+            analysis = fit_record(part, (_FREEST,), band_hz=band_hz)
+        except MeasurementError:
+            continue
+        fit, counts = analysis.fits[0], analysis.noise.counts
+        if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
+            continue
+        plain = comparison.without_hum(()).with_rest_of(fit.plant)
+        unknowns = Unknowns.of(_FREEST, measurement.nominal, field.free, 1)
+        there = partial(
+            Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1
+        )
+        loud = there(noise=field.noise)
+        every = replace(loud.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=())
+        yield there(noise=every)
+
+
+def with_knock(measurement: Measurement, found: FoundKnock) -> Measurement:
+    """Take a knock for known.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    found : FoundKnock
+    """
+    return replace(measurement, knocks=(*measurement.knocks, found.knock))
+
+
+def of_knocks(knocks: tuple[Knock, ...], *, explained: bool) -> Iterator[Finding]:
+    """Name the knocks of a record.
+
+    Parameters
+    ----------
+    knocks : tuple of Knock
+    explained : bool
+        Whether all else in the record is explained.
+    """
+    for knock in knocks:
+        within_s = knock.resolution_s
+        yield Finding(
+            kind="knock",
+            sentence=(
+                f"The beam was struck at {knock.first_s:.2f} s (to within {within_s:.2g} s): "
+                f"{1e3 * knock.largest_nm:.3g} mN·m in the torque, and from then on the free "
+                "decay of its modes. "
+                + (
+                    "It was fitted too, and biases nothing."
+                    if explained
+                    else "It was fitted too, but is not all that is in the record."
+                )
+            ),
+            value=knock.first_s,
+            interval=(knock.first_s - within_s, knock.first_s + within_s),
+            unit="s",
+            remedy="Keep clear of the beam while it is recorded.",
+        )
+
+
+# Search
+
+
+def _scan(refit: Refit) -> int | None:
+    """Sample at which decays of all modes would explain most; None if chance may explain as much.
+
+    By one correlation per column: the sums that decide for all samples at once are those for a
+    decay from the first on, turned in time.
+    """
+    comparison, weight = refit.objective.comparison, refit.noise.weight
+    poles = mode_poles(refit.plant, comparison.visible_modes, ())
+    if not poles:
+        return None
+    residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
+    decays = comparison.decays.columns(poles) * weight
+    along = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
+    along *= comparison.samples / 2
+    scale = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
+    if not scale.all():
+        return None
+    gram = (decays.conj() @ decays.T).real / np.outer(scale, scale)
+    along /= scale[:, None]
+    saved = np.sum(along * np.linalg.solve(gram + 1e-9 * np.eye(scale.size), along), axis=0)
+    place = int(np.argmax(saved))
+    deviate = chi_square_deviate(float(saved[place]), scale.size)
+    if deviate < math.sqrt(2 * largest_of(comparison.samples)):
+        return None
+    # What a wrong model leaves at a resonance rises and falls with the sweep; a knock does not.
+    power = comparison.in_time(residual) ** 2
+    rate_hz = comparison.decimation.rate_hz
+    apart, until = (math.ceil(each * rate_hz) for each in (_APART_S, _APART_S + _AT_ONCE_S))
+    earlier = power[max(place - until, 0) : max(place - apart, 0)]
+    later = power[place : place + until]
+    at_once = earlier.size == 0 or earlier.mean() < _RISES * later.mean()
+    return place if at_once else None
+
+
+def _cleaned(refit: Refit, first: int, last: int) -> Refit:
+    """Fit with a knock between two samples, the noise being what remains then."""
+    comparison = refit.objective.comparison
+    before = refit.columns
+    for _ in range(_ROUNDS):
+        knock = _knock(refit, first, last)
+        columns = np.concatenate([before, comparison.spectrum(_in_time(comparison, knock))])
+        refit = Refit.descend(
+            comparison, refit.objective.unknowns, refit.x, refit.noise, columns,
+            max_evaluations=FEW,
+        )  # fmt: skip
+        refit = replace(refit, noise=refit.noise_here())
+    return Refit.descend(
+        comparison, refit.objective.unknowns, refit.x, refit.noise, before, max_evaluations=1
+    )
+
+
+def _knock(refit: Refit, first: int, last: int) -> Knock:
+    """Knock between two samples with the poles found, of no size."""
+    comparison = refit.objective.comparison
+    rate_hz = comparison.decimation.rate_hz
+    poles = mode_poles(refit.plant, comparison.visible_modes, ())
+    return Knock(
+        first_s=comparison.first_s + first / rate_hz,
+        last_s=comparison.first_s + last / rate_hz,
+        # A touch that begins softly is seen when it has grown.
+        resolution_s=max(2, last - first) / rate_hz,
+        poles_rad_s=tuple(pole.at_rad_s for pole in poles),
+    )
+
+
+def _in_time(comparison: Comparison, knock: Knock) -> NDArray[np.float64]:
+    """Columns of a knock at the samples compared, shape (c, samples)."""
+    return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
+
+
+def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squares saved by each of some columns beside those before it, shape (c,).
+
+    Everything that is free already stays free, to first order.
+
+    Parameters
+    ----------
+    refit : Refit
+    columns : ndarray, shape (c, samples)
+        Torque at the samples compared.
+    """
+    comparison, weight = refit.objective.comparison, refit.noise.weight
+    at = refit.objective.linearise(refit.x)
+    projected = refit.objective.project(at, weight)
+    known = np.concatenate([projected.jacobian, at.columns * weight])
+    free = unexplained_part(comparison.spectrum(columns) * weight, known)
+    free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
+    # One after the other (Gram and Schmidt's method): each of what the former have left.
+    basis, upper = np.linalg.qr(np.ascontiguousarray(free).view(np.float64).T)
+    along = basis.T @ projected.residual.view(np.float64)
+    along[np.abs(np.diag(upper)) < _DEPENDENT] = 0.0
+    saved: NDArray[np.float64] = along**2
+    return saved
+
+
+_DEPENDENT: Final = 1e-6
+"""Length, relative to its own, of what of a column the former ones leave, if it is one of them."""
+
+
+def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
+    """First sample of a knock within a window, and the one after its last; None if there is none.
+
+    Each sample of unknown torque has to save what BIC counts a parameter as. There is no knock
+    where the samples do without the decays: then it was the sensor that was disturbed.
+    """
+    price = math.log(2 * np.count_nonzero(refit.noise.counts))
+    comparison = refit.objective.comparison
+    # From behind: decays from the window's end on, then one sample after the other before it.
+    knock = _knock(refit, last, last)
+    decays = _in_time(comparison, knock)
+    single = np.zeros((last - first, comparison.samples))
+    single[np.arange(last - first), np.arange(first, last)] = 1.0
+    saved = _sums(refit, np.concatenate([decays, single[::-1]]))[len(decays) :]
+    gained = np.concatenate([[0.0], np.cumsum(saved - price)])
+    begins = last - max(int(np.argmax(gained)), 1)
+    # From its beginning on: how long it lasts.
+    knock = _knock(refit, begins, begins)
+    decays = _in_time(comparison, knock)
+    saved = _sums(refit, np.concatenate([decays, single[begins - first :]]))[len(decays) :]
+    gained = np.concatenate([[0.0], np.cumsum(saved - price)])
+    ends = begins + int(np.argmax(gained))
+    alone = _sums(refit, np.concatenate([single[begins - first : ends - first], decays]))
+    rings = float(alone[ends - begins :].sum())
+    deviate = chi_square_deviate(rings, len(decays))
+    sure = deviate > math.sqrt(2 * largest_of(comparison.samples))
+    return (begins, ends) if sure and rings > _RINGS * float(alone.sum()) else None
+
+
+def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
+    """Give a knock its size, and say how much it explains."""
+    comparison, weight = refit.objective.comparison, refit.noise.weight
+    at = refit.objective.linearise(refit.x)
+    projected = refit.objective.project(at, weight)
+    known = np.concatenate([projected.jacobian, at.columns * weight])
+    knock = _knock(refit, first, last)
+    in_time = _in_time(comparison, knock)
+    free = unexplained_part(comparison.spectrum(in_time) * weight, known).view(np.float64)
+    scale = np.linalg.norm(free, axis=1)
+    scale[scale == 0] = 1.0
+    free /= scale[:, None]
+    # The residual is prediction less measurement.
+    sizes = -np.linalg.lstsq(free.T, projected.residual.view(np.float64), rcond=1e-10)[0]
+    left = (projected.residual.view(np.float64) + sizes @ free).view(np.complex128)
+    cost, explained = projected.cost, float(np.vdot(left, left).real)
+    expected = 2 * np.count_nonzero(refit.noise.counts) * comparison.measurement.torque_share
+    sizes /= scale
+    torque_nm = sizes @ in_time
+    after = slice(first, first + math.ceil(comparison.decimation.rate_hz))
+    before = comparison.in_time(left)
+    quiet = before[max(first - math.ceil(_QUIET_S * comparison.decimation.rate_hz), 0) : first]
+    return FoundKnock(
+        knock=replace(
+            knock,
+            sizes=tuple(sizes.tolist()),
+            largest_nm=float(np.abs(torque_nm[after]).max()),
+        ),
+        share=float((cost - explained) / max(cost - expected, 1.0)),
+        before=float(np.mean(quiet**2) / np.mean(before**2)) if quiet.size else 0.0,
+    )

@@ -1,0 +1,101 @@
+"""A knock on the beam is named with its instant, and biases nothing; forces by the exact model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.identify import freest_alone, select
+from analysis.identify._candidates import CandidateSet
+from analysis.identify._knock import knock_in, knocks_in
+from rigd.beam import PointForceGrid, modes
+
+RATE_HZ = 1000.0
+NOISE_NM = 5e-3
+BAND_HZ = (0.0, 50.0)
+
+
+def struck(session, plants, link, force_n, at_s, duration_s=0.02, x_m=0.6):
+    """Add what half a sine of force does to the torque of the root."""
+    n = session.torque_nm.size
+    t = np.arange(n) / RATE_HZ
+    decay = np.exp(-5.0 * np.arange(n) / n)
+    s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
+    during = (t >= at_s) & (t < at_s + duration_s)
+    force = np.where(during, force_n * np.sin(np.pi * (t - at_s) / duration_s), 0.0)
+    torque = np.fft.rfft(force * decay, 4 * n)
+    torque *= PointForceGrid(s, link, plants["III"]).torque_per_force(x_m)
+    torque_nm = session.torque_nm + np.fft.irfft(torque, 4 * n)[:n] / decay
+    return replace(session, torque_nm=torque_nm)
+
+
+@pytest.fixture(scope="module")
+def plain(sessions):
+    return sessions("III")
+
+
+@pytest.fixture(scope="module")
+def knocked(plain, plants, link):
+    def make(force_n, at_s, **more):
+        return struck(plain, plants, link, force_n, at_s, **more)
+
+    return make
+
+
+def told(headline, plants, link):
+    """Largest deviation of modes from the truth, in their own standard deviations."""
+    true = modes(link, plants["III"], 3)
+    return max(
+        abs(quantity.value - value) / quantity.std
+        for mode, own in zip(headline.modes, true, strict=True)
+        for quantity, value in (
+            (mode.frequency_hz, own.frequency_hz),
+            (mode.damping_ratio, own.damping_ratio),
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("force_n", "at_s", "duration_s"),
+    [(0.3, 30.0, 0.02), (3.0, 45.0, 0.02), (1.0, 12.3456, 0.005), (0.3, 40.0, 0.3)],
+)
+def test_a_knock_is_named_with_its_instant(knocked, plants, link, force_n, at_s, duration_s):
+    measurement = knocked(force_n, at_s, duration_s=duration_s).measured(NOISE_NM, 1)
+    headline, (finding,), analysis = freest_alone(measurement, BAND_HZ)
+    assert finding.kind == "knock"
+    low, high = finding.interval
+    assert low < at_s + 0.01
+    assert high > at_s - 0.01
+    assert high - low < 0.04 + 2 * duration_s
+    assert headline.flags.keys() <= {"lambda", "gamma", "alpha", "zeta"}
+    assert all(mode.damping_ratio.flag is None for mode in headline.modes)
+    assert told(headline, plants, link) < 4
+    assert len(analysis.comparison.measurement.knocks) == 1
+
+
+@pytest.mark.further
+def test_a_knock_with_torque_missing(knocked, plants, link):
+    missing = np.random.default_rng(2).choice(70_000, 400, replace=False)
+    measurement = knocked(1.0, 20.0).measured(NOISE_NM, 1, unknown_torque=missing)
+    headline, found, _ = freest_alone(measurement, BAND_HZ)
+    assert [each.kind for each in found] == ["knock"]
+    assert told(headline, plants, link) < 4
+
+
+def test_the_whole_judgement_says_so(knocked):
+    verdict = select(knocked(1.0, 30.0).measured(NOISE_NM, 1)).verdict
+    assert verdict.adequate
+    assert verdict.structure == "III"
+    (finding,) = verdict.findings
+    assert finding.sentence.startswith("The beam was struck at 30.0")
+    assert finding.sentence in verdict.sentences
+
+
+def test_noise_and_a_disturbed_sensor_are_no_knock(plain):
+    for seed in range(3):
+        field = CandidateSet.of_freest(plain.measured(NOISE_NM, seed), (), BAND_HZ)
+        assert knock_in(field) is None
+    measurement = plain.measured(NOISE_NM, 1)
+    measurement.torque_nm[30_000:30_020] += 5.0
+    field = CandidateSet.of_freest(measurement, (), BAND_HZ)
+    assert not any(knocks_in(field))
