@@ -36,7 +36,7 @@ from rigd.excitation import (
     next_piece,
     parse_target,
 )
-from rigd.excitation._fisher_information import PARAMETERS, RecordSoFar, covariance_of
+from rigd.excitation._fisher_information import OF_UNIFORM, RecordSoFar, covariance_of
 from rigd.excitation._piece_search import PieceSearch
 from rigd.excitation._targets import Quantities
 from rigd.profile import load_profile
@@ -45,7 +45,7 @@ from rigd.runner import LoopPreview
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]
 ESTIMATE = BeamEstimate(
-    LINK, DAMPING, PARAMETERS, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
+    LINK, DAMPING, OF_UNIFORM, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
 )
 SCAN = chirp(rate_hz=RATE_HZ, start_hz=0.5, stop_hz=50.0, duration_s=5.0, rest_s=1.0, ring_down_s=0)
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from rigd.beam import (
     Beam,
     Damping,
+    LoadedBeam,
     clamped_free_eigenvalues,
     pole_gradient,
     poles_for_eigenvalues,
@@ -42,7 +43,7 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 BAND_HZ: Final = 50.0
 """Upper end of the band that the whole-record fit compares."""
 
-PARAMETERS: Final = (
+OF_UNIFORM: Final = (
     "zeta",
     "alpha",
     "gamma",
@@ -52,6 +53,11 @@ PARAMETERS: Final = (
     "delay_s",
     "tool_inertia_kg_m2",
 )
+"""Parameters of the fit of a uniform beam on a rigid clamp."""
+
+_OF_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+
+PARAMETERS: Final = (*OF_UNIFORM, *_OF_ENDS)
 """Parameters of the fit; the `LOGARITHMIC` ones count by their logarithm."""
 
 LOGARITHMIC: Final = frozenset(
@@ -63,6 +69,9 @@ _BY_PARAMETER: Final = {
     "bending_stiffness_n_m2": "ln_stiffness",
 }
 """Names by which the exact model is differentiated, where they differ."""
+
+_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
+"""Parameters beside beam and damping; 0 where nothing is said of them."""
 
 _PRIOR_STD: Final = {
     "zeta": 3.0,
@@ -102,9 +111,10 @@ class BeamEstimate:
     """By how much the torque is older than the angle."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between torque sensor and beam."""
-    covariance: Real | None = None
-    """Shape (k, k): covariance that the fit states, in the order of `names`, `LOGARITHMIC` ones as
-    logarithms; None: not known."""
+    tip_mass_kg: float = 0.0
+    """Point mass at the tip."""
+    root_compliance_rad_per_nm: float = 0.0
+    """By how much the clamp turns for a torque."""
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
@@ -115,7 +125,8 @@ class BeamEstimate:
         document
             ``beam`` with the keys of `Beam`; ``damping`` with zeta, alpha, gamma and lambda;
             ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and perhaps
-            ``delay_s``, ``tool_inertia_kg_m2`` and ``covariance``. Other keys are ignored.
+            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg`` and
+            ``root_compliance_rad_per_nm``. Other keys are ignored.
 
         Raises
         ------
@@ -124,7 +135,6 @@ class BeamEstimate:
         """
         try:
             damping, noise = document["damping"], document["noise"]
-            covariance = document.get("covariance")
             estimate = cls(
                 beam=Beam(
                     **{
@@ -141,9 +151,7 @@ class BeamEstimate:
                 names=tuple(name for name in document["names"] if name in PARAMETERS),
                 noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
-                delay_s=float(document.get("delay_s", 0.0)),
-                tool_inertia_kg_m2=float(document.get("tool_inertia_kg_m2", 0.0)),
-                covariance=None if covariance is None else np.array(covariance, dtype=np.float64),
+                **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
             )
         except KeyError as error:
             raise ExcitationError(f"The estimate of the beam has no key {error}.") from None
@@ -169,8 +177,7 @@ class BeamEstimate:
             ("damping.alpha", damping.alpha, 0.0, 2.0),
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
-            ("delay_s", self.delay_s, -np.inf, np.inf),
-            ("tool_inertia_kg_m2", self.tool_inertia_kg_m2, -np.inf, np.inf),
+            *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
         ):
             if not (isfinite(value) and least <= value < below):
                 raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
@@ -188,11 +195,6 @@ class BeamEstimate:
             )
         if not self.names:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
-        if self.covariance is not None and self.covariance.shape != (len(self.names),) * 2:
-            raise ExcitationError(
-                f"The estimate of the beam has {len(self.names)} names, but a covariance of shape "
-                f"{self.covariance.shape}."
-            )
 
     @property
     def values(self) -> dict[str, float]:
@@ -204,10 +206,20 @@ class BeamEstimate:
                 (
                     *(damping.zeta, damping.alpha, damping.gamma, damping.lambda_),
                     *(beam.density_over_stiffness, beam.bending_stiffness_n_m2),
-                    *(self.delay_s, self.tool_inertia_kg_m2),
+                    *(getattr(self, key) for key in _OF_RIG),
                 ),
                 strict=True,
             )
+        )
+
+    @property
+    def loaded(self) -> LoadedBeam | None:
+        """The beam with what is at its ends; None if nothing is, and nothing of it is free."""
+        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm
+        if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
+            return None
+        return LoadedBeam(
+            self.beam, self.damping, self.tip_mass_kg, self.root_compliance_rad_per_nm
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
@@ -221,20 +233,25 @@ class BeamEstimate:
         count = 2
         while True:
             z = clamped_free_eigenvalues(count)
-            upper = poles_for_eigenvalues(z, self.beam, self.damping)[:, 0]
             reached = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
                 self.beam.density_over_stiffness
             )
             if reached[-1]:
                 break
             count *= 2
-        found = []
-        for number, pole in enumerate(upper.tolist(), start=1):
+        loaded, found = self.loaded, []
+        pairs = (
+            poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
+        )
+        names = [_BY_PARAMETER.get(name, name) for name in self.names]
+        for number, pole in enumerate(pairs[:, 0].tolist(), start=1):
             if not (np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz):
                 continue
-            k4 = float(z[number - 1] / self.beam.length_m) ** 4
-            names = [_BY_PARAMETER.get(name, name) for name in self.names]
-            moved = pole_gradient(pole, k4, self.beam, self.damping, names)
+            if loaded is None:
+                k4 = float(z[number - 1] / self.beam.length_m) ** 4
+                moved = pole_gradient(pole, k4, self.beam, self.damping, names)
+            else:
+                moved = loaded.pole_gradient(pole, names)
             found.append(EstimatedMode(number, pole, (moved * _scales(self)).astype(np.complex128)))
         return tuple(found)
 
@@ -375,9 +392,15 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
         Torque on the beam; as it is measured, tool inertia and delay included; slope of the tip
         against the root.
     """
-    g = transfer(s, estimate.beam, estimate.damping)
+    loaded = estimate.loaded
+    if loaded is None:
+        g = transfer(s, estimate.beam, estimate.damping)
+        slope = tip_response(estimate.beam, estimate.damping, s)[1] - 1.0
+    else:
+        at = s.astype(np.complex128)
+        g, slope = loaded.transfer(at), loaded.tip_slope(at)
     measured = (g + estimate.tool_inertia_kg_m2 * s * s) * np.exp(-s * estimate.delay_s)
-    return g, measured, tip_response(estimate.beam, estimate.damping, s)[1] - 1.0
+    return g, measured, slope
 
 
 def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
@@ -394,7 +417,12 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     """
     names = estimate.names
     wrt = [_BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
-    g, of_beam = transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+    loaded = estimate.loaded
+    g, of_beam = (
+        transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+        if loaded is None
+        else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
+    )
     late = np.exp(-s * estimate.delay_s)
     kernels: Complex = np.empty((len(names), s.size), dtype=np.complex128)
     rows = iter(of_beam)
@@ -579,8 +607,13 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
+    beam = estimate.beam
     if name == "tool_inertia_kg_m2":
-        return estimate.beam.inertia_kg_m2
+        return beam.inertia_kg_m2
+    if name == "tip_mass_kg":
+        return beam.density_kg_per_m * beam.length_m
+    if name == "root_compliance_rad_per_nm":
+        return beam.length_m / beam.bending_stiffness_n_m2
     return _PRIOR_STD[name]
 
 

@@ -40,6 +40,8 @@ _TAIL_S: Final = 1.0
 LOOK_AHEAD_S: Final = 8.0
 """How far a plan looks ahead: a mode tells of its damping only after it has swung for a while."""
 _HALF_WIDTH_HZ: Final = 0.5
+_OVER: Final = 2.0
+"""Half the width of a sweep over a whole resonance, in its half-power half-widths."""
 _BESIDE: Final = 0.06
 """Distance of the sweeps beside a mode, relative to its frequency: they tell of stiffness and tool
 inertia, without which the height of a resonance does not tell its damping."""
@@ -151,14 +153,12 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _GoingOn:
-    """A band that is driven on after a piece, in two phases."""
+    """A mode that is driven on after a piece, in two phases."""
 
     weighted: Real
     """(2, q, samples): for amplitude 1."""
-    factors: Real
-    """(2,): as far as the limits allow."""
-    per_amplitude: Real | None
-    """(2, 2): what keeps a mode at its amplitude, real and imaginary; None beside a mode."""
+    per_amplitude: Real
+    """(2, 2): what keeps the mode at its amplitude, real and imaginary."""
 
 
 class PieceSearch:
@@ -219,10 +219,11 @@ class PieceSearch:
         found = []
         for mode in self.modes:
             hz = mode.frequency_hz
-            found += [
-                _Band(mode.number, hz, half_hz, _FADE_S)
-                for half_hz in (0.0, min(_HALF_WIDTH_HZ, 0.2 * hz))
-            ]
+            # A sine, a narrow sweep, and one over the whole resonance where that is wider.
+            half_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
+            over_hz = min(_OVER * mode.damping_ratio * hz, 0.2 * hz)
+            widths_hz = [0.0, half_hz, *([over_hz] if over_hz > 1.5 * half_hz else [])]
+            found += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
             # Fades as long as the beat with the mode: a shorter one makes it swing as well.
             found += [
                 _Band(
@@ -271,7 +272,7 @@ class PieceSearch:
         return max((self.best_of(d, through) for d in durations_s), key=lambda each: each.value)
 
     def best_of(self, duration_s: float, through: Collection[int]) -> _Candidate:
-        """Return the best piece of a duration: of one band, then with others in addition."""
+        """Return the best piece of a duration: through one mode, then with others in addition."""
         bases = [(band, self.basis(band, duration_s)) for band in self.bands()]
         nothing = _Candidate(
             duration_s,
@@ -283,12 +284,14 @@ class PieceSearch:
             0.0,
         )
         at_modes = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
+        # To show a mode takes more than a line, of which any smooth response is capable.
+        over = {band.number: band for band, _ in bases if band.at_mode and band.number in through}
         quiet = {number: self.quieted(nothing, number, at_modes) for number in at_modes}
         found = max(
             (
                 self.added(start, 1.0, band, basis, turn)
                 for band, basis in bases
-                if not through or (band.at_mode and band.number in through)
+                if band.at_mode and (not through or band is over.get(band.number))
                 for start in (nothing, quiet[band.number])
                 for turn in range(_PHASES)
             ),
@@ -424,19 +427,16 @@ class PieceSearch:
         )
 
     def value(self, band: _Band, weighted: Real, swing: Real, duration_s: float) -> float:
-        """Compute what is told as far as one looks ahead if a band is driven on after a piece.
+        """Compute what is told as far as one looks ahead if a mode is driven on after a piece.
 
-        A mode is driven so that it keeps the amplitude that it has at the end of the piece, and
-        beside a mode as far as the limits allow.
+        It is driven so that it keeps the amplitude that it has at the end of the piece.
         """
         first = self.model_samples(duration_s)
         rest = self.samples - first
         going_on = self.going_on(band)
-        factors = going_on.factors
-        if going_on.per_amplitude is not None:
-            amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
-            place = 2 * [mode.number for mode in self.modes].index(band.number)
-            factors = going_on.per_amplitude @ amplitudes[place : place + 2]
+        amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
+        place = 2 * [mode.number for mode in self.modes].index(band.number)
+        factors = going_on.per_amplitude @ amplitudes[place : place + 2]
         before = weighted[:, :first]
         after = weighted[:, first:] + np.tensordot(factors, going_on.weighted[:, :, :rest], axes=1)
         return float(np.vdot(before, before) + np.vdot(after, after))
@@ -450,25 +450,22 @@ class PieceSearch:
         return np.linalg.pinv(columns.T)
 
     def going_on(self, band: _Band) -> _GoingOn:
-        """Drive a band as long as one looks ahead."""
+        """Drive a mode as long as one looks ahead."""
         if band.middle_hz not in self._going_on:
             duration_s = LOOK_AHEAD_S - DURATIONS_S[0]
             sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
             weighted = np.stack([sweep.weighted for sweep in sweeps])
-            factors = np.array([largest_factor(np.zeros((1, 1)), sweeps[0].channels), 0.0])
-            per_amplitude = None
-            if band.at_mode:
-                mode = next(each for each in self.modes if each.number == band.number)
-                last = self.model_samples(duration_s - _FADE_S)
-                here = slice(last - self.model_samples(_TAIL_S), last)
-                time_s = np.arange(here.start, here.stop) / self.model.sample_hz
-                # What it has reached by then of its steady amplitude.
-                rising = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
-                turn = np.exp(1j * mode.pole_rad_s.imag * time_s)
-                columns = np.stack([turn.real, -turn.imag], axis=1) * rising[:, None]
-                slopes = np.stack([sweep.slope[here] for sweep in sweeps], axis=1)
-                per_amplitude = np.linalg.inv(np.linalg.lstsq(columns, slopes)[0])
-            self._going_on[band.middle_hz] = _GoingOn(weighted, factors, per_amplitude)
+            mode = next(each for each in self.modes if each.number == band.number)
+            last = self.model_samples(duration_s - _FADE_S)
+            here = slice(last - self.model_samples(_TAIL_S), last)
+            time_s = np.arange(here.start, here.stop) / self.model.sample_hz
+            # What it has reached by then of its steady amplitude.
+            rising = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
+            turn = np.exp(1j * mode.pole_rad_s.imag * time_s)
+            columns = np.stack([turn.real, -turn.imag], axis=1) * rising[:, None]
+            slopes = np.stack([sweep.slope[here] for sweep in sweeps], axis=1)
+            per_amplitude = np.linalg.inv(np.linalg.lstsq(columns, slopes)[0])
+            self._going_on[band.middle_hz] = _GoingOn(weighted, per_amplitude)
         return self._going_on[band.middle_hz]
 
     def piece(self, chosen: _Candidate, time_left_s: float) -> Piece:

@@ -48,6 +48,10 @@ _DOUBTED: Final = 4
 _WIDTH: Final = 22
 _SCANS: Final = 2
 """How often the scan is repeated where nothing can be fitted."""
+_MOST_BETWEEN: Final = 3
+"""How often the scan is repeated because rivals differ between the modes alone."""
+_TIGHTER: Final = 0.7
+"""Share of what is asked that is aimed at next because rivals are left: twice the information."""
 _OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 
 
@@ -87,12 +91,10 @@ def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[State
     targets
         What is asked for; of modes without a number, it is asked of each one in the band.
     """
-    found = [each for target in targets for each in _stated(document, target)]
-    doubt = of_another_beam(document)
-    return [replace(each, std=inf, doubt=doubt) for each in found] if doubt else found
+    return [each for target in targets for each in _stated(document, target)]
 
 
-def of_another_beam(document: Mapping[str, Any]) -> str:
+def between_modes(document: Mapping[str, Any]) -> str:
     """Say why what narrow bands tell of a beam is not to be believed; empty if it is uniform.
 
     Between the modes, where no piece goes, a mass at the tip and modes with stiffnesses of their
@@ -136,7 +138,7 @@ def _read(target: Target, name: str, found: Mapping[str, Any] | None) -> Stated:
     return Stated(name, value, inf if doubt or std is None else float(std), asked_std, doubt)
 
 
-def uniform_beam(document: Mapping[str, Any]) -> BeamEstimate | None:
+def beam_found(document: Mapping[str, Any]) -> BeamEstimate | None:
     """Return the beam of an answer of the fit program, for the design of excitation.
 
     Parameters
@@ -147,8 +149,7 @@ def uniform_beam(document: Mapping[str, Any]) -> BeamEstimate | None:
     Returns
     -------
     BeamEstimate or None
-        None if it is no uniform beam with a rigid clamp, by whose parameters alone its modes are
-        not known.
+        None if its modes have stiffnesses of their own, by which the torque is not known.
 
     Raises
     ------
@@ -156,20 +157,10 @@ def uniform_beam(document: Mapping[str, Any]) -> BeamEstimate | None:
         If it cannot be used.
     """
     plant = document["plant"]
-    if plant.get("stiffness_offsets") or plant.get("root_compliance_rad_per_nm"):
+    if plant.get("stiffness_offsets"):
         return None
-    if plant.get("tip_mass_kg"):
-        return None
-    return BeamEstimate.from_dict(
-        {
-            "beam": plant["beam"],
-            "damping": plant["damping"],
-            "delay_s": plant["delay_s"],
-            "tool_inertia_kg_m2": plant["tool_inertia_kg_m2"],
-            "names": document["covariance"]["names"],
-            "noise": document["noise"],
-        }
-    )
+    names, noise = document["covariance"]["names"], document["noise"]
+    return BeamEstimate.from_dict({**plant, "names": names, "noise": noise})
 
 
 # The search
@@ -232,9 +223,10 @@ class Search:
         self._stretches = [_Stretch("scan", scan_rad, first, first)]
         self._pieces = self._scans = 0
         self._shows_modes = False
-        self._hopeless = self._doubtful = 0
+        self._hopeless = self._doubtful = self._between = 0
+        self._share = 1.0
         self._course = _Course()
-        self._uniform: BeamEstimate | None = None
+        self._beam: BeamEstimate | None = None
         self._columns: list[str] = []
         self.due: int | None = first + scan_rad.size
         self.may_be_last = False
@@ -260,14 +252,24 @@ class Search:
                 yield from self._scan_again(problem, held)
             return
         found = stated(document, self._targets)
+        narrow = "" if self._between else between_modes(document)
+        if narrow:
+            found = [replace(each, std=inf, doubt=narrow) for each in found]
         time_s = document["tick"] / self._rate_hz
         self._course.note(time_s, max(each.ratio for each in found))
-        doubt = document["doubt"] or of_another_beam(document)
+        doubt = document["doubt"] or narrow
         # Doubts of a uniform beam alone are looked into first.
         yield self._told(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
         if self.may_be_last and all(each.ratio <= 1.0 for each in found):
             yield self._end(f"Reached: {in_words(found)}.", reached=True)
             return
+        rivals = [each.doubt for each in found if each.doubt not in ("", _NOT_SEEN)]
+        open_still = last.name == "pause" and not document["doubt"]
+        if self.may_be_last and rivals and (narrow or open_still):
+            self._share *= _TIGHTER if open_still else 1.0
+            if self._scan_between(held):
+                yield PieceTold("a scan between the modes as well", {"why": rivals[0]})
+                return
         if self.may_be_last:
             self._doubtful = self._doubtful + 1 if doubt else 0
         if self._doubtful >= _DOUBTED:
@@ -276,8 +278,8 @@ class Search:
             yield self._end(reason.replace("  ", " "), reached=False)
             return
         try:
-            self._uniform = uniform_beam(document) or self._uniform
-            yield from self._go_on(self._uniform, found, held, doubt)
+            self._beam = beam_found(document) or self._beam
+            yield from self._go_on(self._beam, found, held, doubt)
         except (RigdError, ArithmeticError, ValueError) as error:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
@@ -303,13 +305,13 @@ class Search:
                 self._pause(min(PAUSE_S, left_s))
             return
         if estimate is None:
-            raise ExcitationError("No uniform beam was found.")
+            raise ExcitationError("No beam was found that excitation can be planned for.")
         plant = self._rig.plant_with(estimate.beam, estimate.damping)
         angle_rad = plant.respond(reference_rad).angle_rad
         piece = next_piece(
             estimate,
             angle_rad,
-            self._targets,
+            [replace(target, std=self._share * target.std) for target in self._targets],
             self._rig,
             left_s - PAUSE_S,
             tip_slope_rad=self._tip_slope_rad,
@@ -342,6 +344,23 @@ class Search:
         unseen = [each.mode for each in found if each.doubt == _NOT_SEEN and each.mode]
         self._shows_modes = bool(unseen) and self._pieces > 0 and not self._shows_modes
         return unseen if self._shows_modes else []
+
+    def _scan_between(self, held: int) -> bool:
+        """Scan once more, because beams that differ between the modes explain the record alike.
+
+        Returns
+        -------
+        bool
+            Whether there was time for it, and it was not done often enough.
+        """
+        scan_rad = self._stretches[0].reference_rad
+        left = self._most_ticks - self._writer.ticks - held
+        if self._between >= _MOST_BETWEEN or left < scan_rad.size:
+            return False
+        self._between += 1
+        self._append(f"between_{self._between}", scan_rad)
+        self.due, self.may_be_last = self._writer.ticks, True
+        return True
 
     def _scan_again(self, why: str, held: int) -> Iterator[object]:
         """Repeat the scan where an estimate is of no use."""

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -130,6 +131,7 @@ def test_the_free_end_stays_within_small_slopes(record):
     assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
 
 
+@pytest.mark.further  # as tests/runner, without processes
 def test_what_is_not_reached_in_its_time_is_said(rigd, tmp_path):
     options = ("--damping", "0.01%", "--at-most", "8", "--fast", "--json", "--no-look")
     run = rigd("run", "until", *options)
@@ -165,7 +167,7 @@ def test_what_makes_no_sense_is_refused(rigd_here, options, words):
     ("victim", "number"),
     [
         ("rigd.runner.fit_process", signal.SIGKILL),
-        ("analysis.online", signal.SIGKILL),
+        pytest.param("analysis.online", signal.SIGKILL, marks=pytest.mark.further),
         pytest.param("rigd.runner.fit_process", signal.SIGSTOP, marks=pytest.mark.slow),
     ],
 )
@@ -187,6 +189,7 @@ def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, vict
     assert session["scheduled"] == session["recorded"] + session["missed"]
 
 
+@pytest.mark.further  # as test_run.py has it of other sessions
 def test_a_stop_ends_it_at_once(start_rigd):
     process = start_rigd(*LONG)
     for line in process.stderr:
@@ -202,6 +205,7 @@ def test_a_stop_ends_it_at_once(start_rigd):
     assert not session["fit"]["search"]["reached"]
 
 
+@pytest.mark.further  # as other sessions do
 def test_real_time_keeps_its_books(rigd, patient, tmp_path):
     """On a computer that stands still for long there are gaps, with which nothing can be fitted."""
     options = ("--damping", "10%", "--at-most", "20", "--json", "--no-look", "--profile", patient)
@@ -216,6 +220,7 @@ def test_real_time_keeps_its_books(rigd, patient, tmp_path):
     assert len(read_session(tmp_path / session["path"]).samples) == session["recorded"]
 
 
+@pytest.mark.further  # as tests/daemon/test_fits.py and test_online.py
 def test_a_chirp_is_fitted_while_it_runs(rigd, tmp_path):
     lengths = ("--duration", "8", "--ring-down", "1", "--start-hz", "0.5")
     run = rigd("run", "chirp", "--fast", "--json", "--no-look", "--watch-fit", *lengths)
@@ -225,3 +230,37 @@ def test_a_chirp_is_fitted_while_it_runs(rigd, tmp_path):
     assert "search" not in session["fit"]
     told = whole_record(load_record(tmp_path / session["path"])).headline
     assert told.modes[0].damping_ratio.as_json() == session["fit"]["modes"][0]["damping_ratio"]
+
+
+def test_a_full_disk_ends_it_with_its_reason(start_rigd, tmp_path):
+    process = start_rigd(*LONG)
+    for line in process.stderr:
+        if ROW.match(line):
+            break
+    # What is written already is more than that: the next write fails, as on a full disk.
+    recorder = child_running(process.pid, "rigd.engine.recorder")
+    resource.prlimit(recorder, resource.RLIMIT_FSIZE, (20_000, 20_000))
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 1, errors
+    assert "Traceback" not in errors
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] != "complete"
+    assert "cannot be written" in session["reason"]
+    assert list(tmp_path.glob("sessions/*.mcap*"))
+
+
+@pytest.mark.slow
+def test_a_limit_ends_it_as_any_session(rigd, tmp_path):
+    """From 7 s on the beam stands in a wall, which throws it."""
+    wall = "x=0.9,angle=-1,side=1,from=7"
+    options = ("--damping", "0.01%", "--at-most", "30", "--fast", "--json", "--no-look")
+    run = rigd("run", "until", *options, "--obstacle", wall)
+    assert run.returncode == 1, run.stderr
+    assert "Traceback" not in run.stderr
+    (session,) = json.loads(run.stdout)["sessions"]
+    assert session["outcome"] == "fault"
+    assert session["reason"]
+    assert not session["fit"]["search"]["reached"]
+    record = read_session(tmp_path / session["path"])
+    assert record.outcome["reason"] == session["reason"]
+    assert record.samples["torque_command_nm"][-1] == 0

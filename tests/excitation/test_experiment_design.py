@@ -15,7 +15,7 @@ from rigd.excitation import (
     next_piece,
     parse_target,
 )
-from rigd.excitation._fisher_information import PARAMETERS, covariance_of
+from rigd.excitation._fisher_information import OF_UNIFORM, covariance_of
 from rigd.excitation._piece_search import SHARE_OF_LIMITS, largest_factor
 
 RATE_HZ = 1000.0
@@ -23,7 +23,7 @@ LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090
 ESTIMATE = BeamEstimate(
     beam=LINK,
     damping=Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
-    names=PARAMETERS,
+    names=OF_UNIFORM,
     noise_frequency_hz=np.array([1.0]),
     noise_nm2_per_hz=np.array([5e-8]),
 )
@@ -43,15 +43,20 @@ def design(rig, scanned):
     return design_excitation(ESTIMATE, rig, DAMPING, 30.0, angle_rad_so_far=scanned)
 
 
+@pytest.mark.further  # as tests/cli/test_until.py
 def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
+    """Against the largest of the session: what a step there would be like."""
+
+    def derivatives(path):
+        speed = np.diff(path) * RATE_HZ
+        return path, speed, np.diff(speed) * RATE_HZ
+
+    largest = [np.abs(values).max() for values in derivatives(design.reference_rad)]
     for piece in design.pieces:
         path = np.concatenate([np.zeros(3), piece.reference_rad, np.zeros(3)])
-        speed = np.diff(path) * RATE_HZ
-        acceleration = np.diff(speed) * RATE_HZ
-        for values, share in ((path, 1e-5), (speed, 1e-4), (acceleration, 2e-3)):
-            largest = np.abs(values).max()
-            assert np.abs(values[:5]).max() < share * largest
-            assert np.abs(values[-5:]).max() < share * largest
+        for values, most, share in zip(derivatives(path), largest, (1e-5, 1e-4, 2e-3), strict=True):
+            assert np.abs(values[:5]).max() < share * most
+            assert np.abs(values[-5:]).max() < share * most
 
 
 def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
@@ -81,6 +86,7 @@ def test_the_expected_covariance_is_that_of_the_record(scanned, design):
     np.testing.assert_allclose(expected, computed, rtol=0.02)
 
 
+@pytest.mark.further  # as the limits are kept
 def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
     free, held = (
         next_piece(ESTIMATE, np.zeros(1000), DAMPING, rig, 10.0, tip_slope_rad=slope)
@@ -112,7 +118,7 @@ def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned):
     internal = replace(
         ESTIMATE,
         damping=Damping(zeta=7.1e-5),
-        names=tuple(name for name in PARAMETERS if name not in ("gamma", "lambda")),
+        names=tuple(name for name in OF_UNIFORM if name not in ("gamma", "lambda")),
     )
     absent = next_piece(internal, scanned, [parse_target("gamma", "5%")], rig, 60.0)
     assert absent.forecast.seconds == np.inf

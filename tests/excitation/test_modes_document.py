@@ -121,6 +121,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
         read_modes(tmp_path / "pipe")
 
 
+@pytest.mark.further  # its plan is tested below
 def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(document()), "--fast", "--json"]
     command += ["--duration", "14", "--ring-down", "1", "--output", str(tmp_path)]

@@ -93,3 +93,17 @@ def test_a_move_through_the_engine_leaves_nothing_that_rings(rigd, tmp_path):
     amplitude = 2 * abs(np.mean((torque - torque.mean()) * wave))
     assert predicted_nm > 0.1
     assert amplitude < 0.02 * predicted_nm
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"angle_rad": 0.2}, r"angle_rad = 0\.2 rad is where the motor stands"),
+        ({"angle_rad": 0.5, "speed_rad_s": 0.0}, r"speed_rad_s = 0 rad/s must be more than 0"),
+        ({"angle_rad": 0.5, "hold_s": 1e-3}, "ends before the motor has stopped"),
+        ({"angle_rad": 0.5, "passes": 0}, r"passes = 0 must be at least 1"),
+    ],
+)
+def test_a_search_for_obstacles_that_cannot_be_is_refused(profile, options, says):
+    with pytest.raises(ExcitationError, match=says):
+        excitation_for(profile, "touch", options, start_rad=0.2)

@@ -30,7 +30,7 @@ def profile():
     return load_profile("sim")
 
 
-def answer(profile, tick, share, flag=None):
+def answer(profile, tick, share, flag=None, kind="VI"):
     """What the fit program answers where every number has a share of itself as its deviation."""
     beam, damping = profile.rig.beam, profile.rig.damping
 
@@ -42,6 +42,7 @@ def answer(profile, tick, share, flag=None):
     found = [mode for mode in modes(beam, damping, 3) if mode.frequency_hz < 50]
     return {
         "tick": tick,
+        "type": kind,
         "problem": "",
         "doubt": flag,
         "findings": ["Something struck the beam."] if flag else [],
@@ -95,18 +96,28 @@ class Bench:
         return list(self.search.answered({"tick": self.search.due, "problem": text}, 0))
 
 
-@pytest.fixture
-def quick_pieces(monkeypatch):
+def designed_at_once(monkeypatch, std):
     """Pieces of a second of rest, in place of a design that takes its time."""
     rest = np.zeros(RATE_HZ)
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **_):
         k = len(estimate.names)
-        forecast = Forecast(1e4, "")
-        far = (Precision(targets[0], 1.0, 1.0, 0.1),)
-        return Piece("rest", rest, rest, estimate.names, np.eye(k), far, far, forecast, 0.0)
+        now = (Precision(targets[0], 1.0, std, 0.1),)
+        return Piece("rest", rest, rest, estimate.names, np.eye(k), now, now, Forecast(1e4, ""), 0)
 
     monkeypatch.setattr("rigd.runner._precision_search.next_piece", design)
+
+
+@pytest.fixture
+def quick_pieces(monkeypatch):
+    """None of them is expected to suffice."""
+    designed_at_once(monkeypatch, std=1.0)
+
+
+@pytest.fixture
+def quick_pauses(monkeypatch):
+    """What is planned is always expected to suffice."""
+    designed_at_once(monkeypatch, std=0.01)
 
 
 @pytest.fixture
@@ -147,6 +158,7 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
     assert bench.search.due is None
 
 
+@pytest.mark.further  # as a doubtful record
 def test_a_doubted_number_is_not_reached(bench):
     while not bench.search.may_be_last:
         bench.told(CERTAIN)
@@ -155,6 +167,7 @@ def test_a_doubted_number_is_not_reached(bench):
     assert {target["std"] for target in fit.document["search"]["targets"]} == {None}
 
 
+@pytest.mark.further  # as one never certain
 def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
     ends = []
     while not ends:
@@ -236,11 +249,35 @@ def test_an_absent_mode_is_not_stated(profile):
 
 
 @pytest.mark.parametrize("kind", ["VI, tip mass", "IV, modes free"])
-def test_a_beam_that_is_not_uniform_is_not_told_by_narrow_bands(profile, kind):
-    document = answer(profile, 1, CERTAIN) | {"type": kind}
-    for found in stated(document, [parse_target("damping", "1%")]):
-        assert found.ratio == np.inf
-        assert kind in found.doubt
+def test_a_beam_that_is_not_uniform_is_told_after_a_scan_between_the_modes(
+    profile, quick_pieces, kind
+):
+    bench = Bench(profile)
+    assert any(isinstance(m, PieceTold) for m in bench.told(ON_THE_WAY, flag="not explained"))
+    assert bench.search.may_be_last
+    fit, scan = bench.told(CERTAIN, kind=kind)
+    assert all(kind in each["doubt"] for each in fit.document["search"]["targets"])
+    assert scan.name == "a scan between the modes as well"
+    assert bench.search.may_be_last
+    ends = [m for m in bench.told(CERTAIN, kind=kind) if isinstance(m, SearchEnded)]
+    assert ends[0].reached
+    begins, end = ends[0].segments["between_1"]
+    assert end - begins == 5 * RATE_HZ
+
+
+def test_rivals_that_are_left_after_a_pause_are_told_apart_by_scans(profile, quick_pauses):
+    """Three of them; then pieces go on as long as there is time."""
+    bench = Bench(profile)
+    names = []
+    for _ in range(5):
+        while not bench.search.may_be_last:
+            bench.told(CERTAIN)
+        document = answer(profile, bench.search.due, CERTAIN)
+        document["modes"][1]["damping_ratio"]["flag"] = "another beam fits as well"
+        told = list(bench.search.answered(document, 0))
+        assert not any(isinstance(m, SearchEnded) for m in told)
+        names += [m.name for m in told if isinstance(m, PieceTold)]
+    assert names.count("a scan between the modes as well") == 3
 
 
 def test_modes_above_the_band_are_not_asked_for(profile):

@@ -38,7 +38,14 @@ session.with_suffix(".look.json").write_text(text)
 
 
 @pytest.fixture
-def looks(tmp_path, monkeypatch):
+def started():
+    """Give the children that came since: one that serves a whole worker may be there already."""
+    before = set(children(os.getpid()))
+    return lambda: [pid for pid in children(os.getpid()) if pid not in before]
+
+
+@pytest.fixture
+def looks(tmp_path, monkeypatch, started):
     (tmp_path / "look_program.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(quick_looks, "_PROGRAM", "look_program")
@@ -48,7 +55,7 @@ def looks(tmp_path, monkeypatch):
     yield looks
     looks.close()
     assert not looks.busy
-    assert not children(os.getpid())
+    assert not started()
 
 
 def done(looks):
@@ -60,11 +67,11 @@ def done(looks):
     return looks.told
 
 
-def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path):
+def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
     paths = [tmp_path / f"{name}.mcap" for name in ("a", "b")]
     for path in paths:
         looks.begin(path)
-        assert len(children(os.getpid())) == 1
+        assert len(started()) == 1
     first, second = done(looks)
     assert [first.session, second.session] == paths
     assert first.path == look_path(paths[0])
@@ -88,16 +95,16 @@ def test_a_look_that_fails_says_why(looks, tmp_path, name, error):
     assert told.lines == [f"No quick look at {name}.mcap: {told.error}"]
 
 
-def test_none_runs_beside_a_session(looks, tmp_path):
+def test_none_runs_beside_a_session(looks, tmp_path, started):
     looks.begin(tmp_path / "waits.mcap")
-    (pid,) = children(os.getpid())
+    (pid,) = started()
     with looks.held():
         assert eventually(lambda: state_of(Path(f"/proc/{pid}")) == "T")
         (tmp_path / "waits.go").touch()
         looks.begin(tmp_path / "next.mcap")
         time.sleep(0.1)
         looks.attend()
-        assert children(os.getpid()) == [pid]
+        assert started() == [pid]
         assert state_of(Path(f"/proc/{pid}")) == "T"
         assert looks.told == []
     assert [each.session.stem for each in done(looks)] == ["waits", "next"]
@@ -151,12 +158,12 @@ def test_of_too_many_the_oldest_are_left_out(looks, tmp_path):
     assert [each.session.stem for each in done(looks)] == ["a", "b", "waits", "c", "d", "e"]
 
 
-def test_closing_ends_one_that_is_suspended(looks, tmp_path):
+def test_closing_ends_one_that_is_suspended(looks, tmp_path, started):
     looks.begin(tmp_path / "hangs.mcap")
-    os.kill(children(os.getpid())[0], signal.SIGSTOP)
+    os.kill(started()[0], signal.SIGSTOP)
     looks.begin(tmp_path / "a.mcap")
     looks.close()
-    assert children(os.getpid()) == []
+    assert started() == []
     assert looks.told == []
 
 

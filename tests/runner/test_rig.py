@@ -85,6 +85,7 @@ def test_status_tells_of_every_process_and_topic(rig, run):
     assert (second.tick, second.missed, second.lost) == (1200, 0, 0)
 
 
+@pytest.mark.further  # as in the daemon's service
 def test_tare_and_zero_between_sessions(rig, run):
     run(rig)
     tare = rig.tare()
@@ -94,6 +95,7 @@ def test_tare_and_zero_between_sessions(rig, run):
     assert run(rig).went_well
 
 
+@pytest.mark.further  # as in the service
 def test_a_zero_is_lost_with_its_connection_and_has_to_be_set_again(rig, run):
     rig.zero()
     rig.disconnect()
@@ -118,6 +120,7 @@ def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
     assert not rig.connected
 
 
+@pytest.mark.further  # as in the daemon's service
 def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
     stop = StopRequest()
 
