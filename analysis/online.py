@@ -317,13 +317,11 @@ class OnlineFit:
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
                 told, found, analysis = freest_alone(measurement, band_hz, self._found)
-        except (SessionError, RecordError, MeasurementError) as error:
-            problem = str(error).removeprefix(f"{self._path}: ")
-            took_s = time.monotonic() - began_s
-            return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
-        except (ArithmeticError, ValueError) as error:
+        except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session is told, and goes on; later samples may do.
+            foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
             problem = f"The record so far cannot be fitted ({error!r})."
+            problem = str(error).removeprefix(f"{self._path}: ") if foreseen else problem
             took_s = time.monotonic() - began_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
         shows = bool(told.visible_modes)

@@ -30,10 +30,10 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._plant import Plant
-from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, loaded_response
+from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, differentiated_response
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -184,21 +184,9 @@ class ResponseGrid:
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
         """Compute the same with a mass at the tip."""
-        damping = plant.damping
-        inertia = plant.beam.density_over_stiffness * self._s_squared
-        s_alpha = np.exp(damping.alpha * self._log_s).astype(np.complex128)
-        s_lambda = np.exp(damping.lambda_ * self._log_s).astype(np.complex128)
-        elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
-        found = loaded_response(self._s_squared, elastic, inertial, plant.beam, plant.tip_mass_kg)
-        slopes: dict[str, Callable[[], NDArray[np.complex128]]] = {
-            "zeta": lambda: found.by_elastic * s_alpha,
-            "alpha": lambda: found.by_elastic * (damping.zeta * self._log_s * s_alpha),
-            "gamma": lambda: found.by_inertial * s_lambda,
-            "lambda": lambda: found.by_inertial * (damping.gamma * self._log_s * s_lambda),
-            "ln_density_over_stiffness": lambda: found.by_inertial * inertia,
-            "ln_stiffness": lambda: found.response - plant.tip_mass_kg * found.by_mass,
-            "tip_mass_kg": lambda: found.by_mass,
-        }
+        found, slopes = differentiated_response(
+            self._log_s, self._s_squared, plant.beam, plant.damping, plant.tip_mass_kg
+        )
         return found.response, {name: slopes[name]() for name in wrt if name in slopes}
 
     def _offset_modes(

@@ -1,23 +1,6 @@
 """Least-squares problem of a record: what of it is compared, and the whitened residual.
 
-The controller feeds the measured torque forward and the measured angle back, so the motor moves
-with the noise of the sensor. A fit of the torque to all of the angle takes part of that noise for
-response: in a closed loop noise and input are correlated, and a fit that leaves out all beyond its
-band is biased by it [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24 standard
-deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the noise, so the
-part of the angle that is coherent with the reference is used as input (`following`). The torque
-that the rest makes is computed with the beam found so far, and taken out. Fitting what remains is
-the instrumental-variable estimate with the reference as instrument. Where the rest is noise it is
-unbiased whatever that beam was. But a beam that rings for long turns the motor in bands narrower
-than the following is smoothed over, and then the rest is no noise: in a record of narrow sweeps
-with 0.2 g at the tip the first beam found would bias the result by up to 45 standard deviations. So
-where a better beam makes another torque of it, what followed is told anew, with the torque that the
-motor felt as a second input (`Comparison.renewed`).
-
-References
-----------
-.. [1] U. Forssell and L. Ljung, Closed-loop identification revisited, Automatica 35 (1999)
-   1215-1241.
+What of the motor's angle counts as input is told by `analysis.identify._instrument`.
 """
 
 from __future__ import annotations
@@ -28,9 +11,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import Decimation, MeasurementError, fast_length, fast_length_below
+from analysis.identify._data import Decimation, MeasurementError, fast_length_below
 from analysis.identify._drag_torque import DragExpansion, DragResponse
 from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
+from analysis.identify._instrument import following
 from analysis.identify._predictor import Prediction
 from analysis.models import LARGEST_SHARE_OF_RATE
 from analysis.optimizer import NormalEquations, Recent, descend
@@ -48,71 +32,6 @@ if TYPE_CHECKING:
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
     from analysis.optimizer import Minimum, Region
-
-
-# Instrument: the part of the angle that is coherent with the reference
-
-_MEMORY_S: Final = 0.4
-"""Standard deviation of the window over the lags of the correlations, that is how long the loop may
-remember its reference: 0.4 Hz in frequency. A longer one lets noise pass for response; what a
-shorter one misses of a sharp feature of the loop costs a little precision and nothing else."""
-
-_RETURN_S: Final = 4.0
-"""For which both are taken to return to 0 after the record. A reference that ended elsewhere and
-fell to 0 at once would do so without the lag of the loop."""
-
-_FLOOR: Final = 1e-12
-"""Least power of the reference at a frequency, relative to its largest."""
-
-
-def following(
-    angle_rad: NDArray[np.float64],
-    reference_rad: NDArray[np.float64],
-    rate_hz: float,
-    torque_nm: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Part of the angle that is coherent with the reference, shape (n,).
-
-    By the response that windowed correlations give (R. B. Blackman and J. W. Tukey, Bell System
-    Technical Journal 37 (1958) 185-282): at each frequency the least squares over its neighbours.
-
-    Parameters
-    ----------
-    angle_rad, reference_rad : ndarray, shape (n,)
-        Both taken as 0 before.
-    rate_hz : float
-    torque_nm : ndarray, shape (n,), optional
-        Torque without noise that the motor feels beside: it may ring in bands narrower than the
-        response is smoothed over.
-    """
-    way_back = 0.5 * (1 + np.cos(np.linspace(0, np.pi, round(_RETURN_S * rate_hz) + 1)[1:]))
-    length = fast_length(2 * (angle_rad.size + way_back.size))
-
-    def transformed(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.fft.rfft(np.concatenate([values, values[-1] * way_back]), length)
-
-    lag_s = np.fft.fftfreq(length) * (length / rate_hz)
-    window = np.exp(-0.5 * (lag_s / _MEMORY_S) ** 2)
-
-    def smoothed(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        return np.fft.rfft(window * np.fft.irfft(power, length))
-
-    angle, reference = transformed(angle_rad), transformed(reference_rad)
-    across, own = smoothed(angle * reference.conj()), smoothed(np.abs(reference) ** 2).real
-    if not own.max() > 0:
-        return np.zeros(angle_rad.size)
-    own = np.maximum(own, _FLOOR * own.max())
-    spectrum = across / own * reference
-    if torque_nm is not None:
-        # What of the torque is no smooth response to the reference itself.
-        torque = transformed(torque_nm)
-        shared = smoothed(torque * reference.conj()) / own
-        apart = smoothed(np.abs(torque) ** 2).real - np.abs(shared) ** 2 * own
-        apart = np.maximum(apart, _FLOOR * apart.max())
-        felt = (smoothed(angle * torque.conj()) - across * shared.conj()) / apart
-        spectrum += felt * (torque - shared * reference)
-    followed: NDArray[np.float64] = np.fft.irfft(spectrum, length)[: angle_rad.size]
-    return followed
 
 
 # Comparison of a record with a plant
@@ -256,18 +175,24 @@ class Comparison:
         ticks = self._places(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
         unknown_s = ticks / self.measurement.rate_hz - reach_s
-        taken_nm = np.sum([each.torque(grid_s, grid_s, rate_hz) for each in knocks], axis=0)
-        torque_nm = self.torque_nm.copy()
-        torque_nm[self.kept] -= taken_nm
+        taken_nm, at_unknown_nm = (
+            np.sum([each.torque(time_s, grid_s, rate_hz) for each in knocks], axis=0)
+            for time_s in (grid_s, unknown_s)
+        )
+        columns = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
+        return replace(self, struck=self.spectrum(columns))._without(taken_nm, at_unknown_nm)
+
+    def _without(
+        self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
+    ) -> Comparison:
+        """Take out torque: at the samples kept, and at the ticks whose torque is unknown."""
+        left_nm = self.torque_nm.copy()
+        left_nm[self.kept] -= torque_nm
         return replace(
             self,
-            torque_nm=torque_nm,
-            apart_nm=self.apart_nm + taken_nm,
-            apart_at_unknown_nm=self.apart_at_unknown_nm
-            + np.sum([each.torque(unknown_s, grid_s, rate_hz) for each in knocks], axis=0),
-            struck=self.spectrum(
-                np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
-            ),
+            torque_nm=left_nm,
+            apart_nm=self.apart_nm + torque_nm,
+            apart_at_unknown_nm=self.apart_at_unknown_nm + at_unknown_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
@@ -299,22 +224,35 @@ class Comparison:
 
         All of it without a reference, or with one that does not explain it.
         """
-        reference_rad = self.measurement.reference_rad
-        if reference_rad is None:
+        if self.measurement.reference_rad is None:
             return self.angle_rad
-        # Later samples fall to 0 with the filter's end, behind everything that is compared.
-        end = self.decimation.inside(self.measurement.angle_rad.size).stop
-        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])
-        followed = self.angle_rad.copy()
-        followed[:end] = following(
-            self.angle_rad[:end], reference_rad[:end], self.decimation.rate_hz
-        )
+        followed = self._followed(self.angle_rad)
         # By its speed: an angle that drifts follows no reference, and disturbs nothing.
         own, apart = (
             np.sum(np.diff(angle_rad[self.kept]) ** 2)
             for angle_rad in (self.angle_rad, self.angle_rad - followed)
         )
         return followed if apart < _LARGEST_REST * own else self.angle_rad
+
+    def _followed(
+        self, moved_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Part of an angle that follows the reference, and a torque if one is given, shape (m,)."""
+        reference_rad = self.measurement.reference_rad
+        assert reference_rad is not None
+        # Later samples fall to 0 with the filter's end, behind everything that is compared.
+        end = self._recorded
+        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
+        followed = moved_rad.copy()
+        followed[:end] = following(
+            moved_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
+        )
+        return followed
+
+    @property
+    def _recorded(self) -> int:
+        """Decimated samples up to the record's end."""
+        return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
 
     def following_reference(self, plant: Plant) -> Comparison:
         """Use the part of the angle coherent with the reference as input, and take out the rest.
@@ -332,13 +270,18 @@ class Comparison:
         followed = self.followed_rad()
         if followed is self.angle_rad:
             return self
-        split = replace(
+        return self._split(self.angle_rad, followed, plant)
+
+    def _split(
+        self, moved_rad: NDArray[np.float64], followed: NDArray[np.float64], plant: Plant
+    ) -> Comparison:
+        """Use a part of the angle as input, and take out what a plant makes of the rest."""
+        return replace(
             self,
             angle_rad=followed,
             prediction=self.prediction.of_other(followed),
-            rest_rad=self.angle_rad - followed,
-        )
-        return split.with_rest_of(plant)
+            rest_rad=moved_rad - followed,
+        ).with_rest_of(plant)
 
     def with_rest_of(self, plant: Plant) -> Comparison:
         """Take out what a plant makes of the angle that followed no reference, in place of before.
@@ -354,17 +297,8 @@ class Comparison:
         at_unknown_nm = rest.torque_between(
             plant, self.decimation.factor, self._places(~self.measurement.torque_known)
         )[0]
-        torque_nm = self.torque_nm.copy()
-        torque_nm[self.kept] -= rest_nm - self.rest_nm
-        return replace(
-            self,
-            torque_nm=torque_nm,
-            apart_nm=self.apart_nm + (rest_nm - self.rest_nm),
-            apart_at_unknown_nm=self.apart_at_unknown_nm
-            + (at_unknown_nm - self.rest_at_unknown_nm),
-            rest_nm=rest_nm,
-            rest_at_unknown_nm=at_unknown_nm,
-        )
+        told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
+        return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
 
     def renewed(self, plant: Plant, noise: Noise) -> Comparison:
         """Tell anew what followed the reference, with a plant better than the one before.
@@ -387,23 +321,12 @@ class Comparison:
         change = self.spectrum(other.rest_nm - np.asarray(self.rest_nm)) * noise.weight
         if np.vdot(change, change).real <= _LARGEST_CHANGE:
             return self
-        assert self.measurement.reference_rad is not None
-        end = self.decimation.inside(self.measurement.angle_rad.size).stop
-        reference_rad = self.measurement.reference_rad
-        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
-        moved_rad = self.angle_rad + self.rest_rad
-        rate_hz = self.decimation.rate_hz
-        followed_rad = self.angle_rad.copy()
+        moved_rad, followed = self.angle_rad + self.rest_rad, self.angle_rad
+        felt = Prediction(followed, self.decimation.rate_hz, slice(0, self._recorded))
         # What rings moves the motor, which makes it ring otherwise.
         for _ in range(_FEEDBACKS):
-            torque_nm = Prediction(followed_rad, rate_hz, slice(0, end)).torque(plant)[0]
-            followed_rad[:end] = following(moved_rad[:end], reference_rad, rate_hz, torque_nm)
-        return replace(
-            self,
-            angle_rad=followed_rad,
-            prediction=self.prediction.of_other(followed_rad),
-            rest_rad=moved_rad - followed_rad,
-        ).with_rest_of(plant)
+            followed = self._followed(moved_rad, felt.of_other(followed).torque(plant)[0])
+        return self._split(moved_rad, followed, plant)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
@@ -413,18 +336,11 @@ class Comparison:
     def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
         """Take out hum, in place of what was taken out before."""
         other = replace(self, hum=hum)
-        more = other.hum_nm - self.hum_nm
         ticks = self._places(~self.measurement.torque_known)
         first_s = self.kept.start / self.decimation.rate_hz
         time_s = ticks / self.measurement.rate_hz - first_s
-        torque_nm = self.torque_nm.copy()
-        torque_nm[self.kept] -= more
-        return replace(
-            other,
-            torque_nm=torque_nm,
-            apart_nm=self.apart_nm + more,
-            apart_at_unknown_nm=self.apart_at_unknown_nm
-            + (other._hum_at(time_s) - self._hum_at(time_s)),
+        return other._without(
+            other.hum_nm - self.hum_nm, other._hum_at(time_s) - self._hum_at(time_s)
         )
 
     def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:

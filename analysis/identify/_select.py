@@ -210,12 +210,8 @@ def _selected(
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        found = (
-            *of_knocks(field.comparison.measurement.knocks, explained=explained),
-            *_as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained),
-        )
-        if not explained:
-            found = (*found, unexplained(white, related, told.best.fit.modes))
+        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
         said = of_headline(numbers, orders, alone=alone)
         advice = experiments(field, orders, visible, found, close)
@@ -304,12 +300,8 @@ def _freest_alone(
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         doubt = wrong or _doubt((), clipped="clipping" in kinds)
-        found = (
-            *of_knocks(field.comparison.measurement.knocks, explained=explained),
-            *_as_sure(found, (), wrong, doubt, explained=explained),
-        )
-        if not explained:
-            found = (*found, unexplained(white, related, field.best.fit.modes))
+        found = _as_sure(found, (), wrong, doubt, explained=explained)
+        found = _with_knocks_and_rest(field, found, white, related)
     told = of_fit(
         field.best.name,
         field.best.fit,
@@ -397,6 +389,16 @@ def _as_sure(
     if wrong is not None:
         along = tuple(doubted(each, wrong) for each in along)
     return (*beside, *along)
+
+
+def _with_knocks_and_rest(
+    told: CandidateSet, found: tuple[Finding, ...], white: Whiteness, related: InputRelation
+) -> tuple[Finding, ...]:
+    """Name knocks before all that was found, and after it what remains unexplained."""
+    explained = white.white and not related.related
+    knocks = of_knocks(told.comparison.measurement.knocks, explained=explained)
+    rest = () if explained else (unexplained(white, related, told.best.fit.modes),)
+    return (*knocks, *found, *rest)
 
 
 def _tests(

@@ -39,4 +39,4 @@ from ._tip import tip_motion as tip_motion
 from ._tip import tip_response as tip_response
 from ._tip_mass import LoadedBeam as LoadedBeam
 from ._tip_mass import LoadedResponse as LoadedResponse
-from ._tip_mass import loaded_response as loaded_response
+from ._tip_mass import differentiated_response as differentiated_response

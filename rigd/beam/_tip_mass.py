@@ -99,6 +99,46 @@ def loaded_response(
     )
 
 
+Slopes = dict[str, Callable[[], Complex]]
+"""Derivatives of a response by the names of parameters, each computed when it is asked for."""
+
+
+def differentiated_response(
+    log_s: Complex, s_squared: Complex, beam: Beam, damping: Damping, tip_mass_kg: float
+) -> tuple[LoadedResponse, Slopes]:
+    """Evaluate G with a tip mass on a rigid clamp, to be differentiated by any parameter.
+
+    Parameters
+    ----------
+    log_s, s_squared : ndarray of complex
+        Logarithm and square of the Laplace variable, which is not 0.
+    beam, damping
+        Parameters of the exact model.
+    tip_mass_kg
+        Point mass at the tip.
+
+    Returns
+    -------
+    response : LoadedResponse
+    slopes : dict of str to callable
+        By `rigd.beam.PARAMETERS` but for the length, and by ``tip_mass_kg``.
+    """
+    s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
+    s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
+    inertia = beam.density_over_stiffness * s_squared
+    elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
+    found = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
+    return found, {
+        "zeta": lambda: found.by_elastic * s_alpha,
+        "alpha": lambda: found.by_elastic * (damping.zeta * log_s * s_alpha),
+        "gamma": lambda: found.by_inertial * s_lambda,
+        "lambda": lambda: found.by_inertial * (damping.gamma * log_s * s_lambda),
+        "ln_density_over_stiffness": lambda: found.by_inertial * inertia,
+        "ln_stiffness": lambda: found.response - tip_mass_kg * found.by_mass,
+        "tip_mass_kg": lambda: found.by_mass,
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class LoadedBeam:
     """Beam with a tip mass on an elastic clamp.
@@ -136,9 +176,8 @@ class LoadedBeam:
         transfer : complex ndarray, shape of `s`
         gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
         """
-        at = self.at(s)
+        at, by = self._differentiated(s)
         share = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
-        by = self._by_parameter(s, at)
         gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
         return at.response * share, gradient * share * share
 
@@ -157,27 +196,17 @@ class LoadedBeam:
         """
         aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
         s = np.array([pole_rad_s * (1 - aside)], dtype=np.complex128)
-        at = self.at(s)
-        by, slope = self._by_parameter(s, at), self.slope(s, at)
+        at, by = self._differentiated(s)
+        slope = self.slope(s, at)
         moved = [-(by[name]() / slope)[0] if name in by else 0.0 for name in wrt]
         return np.array(moved, dtype=np.complex128)
 
-    def _by_parameter(self, s: Complex, at: LoadedResponse) -> dict[str, Callable[[], Complex]]:
-        """Give the derivatives of G on a rigid clamp, that by its compliance at 0."""
-        damping, log_s = self.damping, np.log(s)
-        s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
-        s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
-        inertia = self.beam.density_over_stiffness * s * s
-        return {
-            "zeta": lambda: at.by_elastic * s_alpha,
-            "alpha": lambda: at.by_elastic * (damping.zeta * log_s * s_alpha),
-            "gamma": lambda: at.by_inertial * s_lambda,
-            "lambda": lambda: at.by_inertial * (damping.gamma * log_s * s_lambda),
-            "ln_density_over_stiffness": lambda: at.by_inertial * inertia,
-            "ln_stiffness": lambda: at.response - self.tip_mass_kg * at.by_mass,
-            "tip_mass_kg": lambda: at.by_mass,
-            "root_compliance_rad_per_nm": lambda: -at.response * at.response,
-        }
+    def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
+        """Give `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
+        at, by = differentiated_response(
+            np.log(s), s * s, self.beam, self.damping, self.tip_mass_kg
+        )
+        return at, by | {"root_compliance_rad_per_nm": lambda: -at.response * at.response}
 
     def tip_slope(self, s: Complex) -> Complex:
         """Slope of the tip against the root per motor angle, of the shape of `s`."""

@@ -353,26 +353,29 @@ class Search:
         bool
             Whether there was time for it, and it was not done often enough.
         """
-        scan_rad = self._stretches[0].reference_rad
-        left = self._most_ticks - self._writer.ticks - held
-        if self._between >= _MOST_BETWEEN or left < scan_rad.size:
+        if self._between >= _MOST_BETWEEN or not self._scan(f"between_{self._between + 1}", held):
             return False
         self._between += 1
-        self._append(f"between_{self._between}", scan_rad)
-        self.due, self.may_be_last = self._writer.ticks, True
+        self.may_be_last = True
         return True
 
     def _scan_again(self, why: str, held: int) -> Iterator[object]:
         """Repeat the scan where an estimate is of no use."""
-        scan = self._stretches[0]
-        left = self._most_ticks - self._writer.ticks - held
-        if self._scans >= _SCANS or left < scan.size:
+        if self._scans >= _SCANS or not self._scan(f"scan_{self._scans + 2}", held):
             yield self._end(f"Given up: {why}", reached=False)
             return
         self._scans += 1
-        self._append(f"scan_{self._scans + 1}", scan.reference_rad)
-        self.due, self.may_be_last = self._writer.ticks, False
+        self.may_be_last = False
         yield PieceTold("the scan once more", {"why": why})
+
+    def _scan(self, name: str, held: int) -> bool:
+        """Append the scan, as a stretch of another name; say whether there was time for it."""
+        scan_rad = self._stretches[0].reference_rad
+        if self._most_ticks - self._writer.ticks - held < scan_rad.size:
+            return False
+        self._append(name, scan_rad)
+        self.due = self._writer.ticks
+        return True
 
     def _pause(self, duration_s: float) -> None:
         """Hold the angle for a while; then have all structures fitted to the whole record."""
