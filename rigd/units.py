@@ -20,6 +20,7 @@ UNITS: Final = MappingProxyType(
         "_rad_s2": "rad/s²",
         "_rad_s": "rad/s",
         "_rad": "rad",
+        "_per_s": "1/s",
         "_hpa": "hPa",
         "_kg": "kg",
         "_mm": "mm",

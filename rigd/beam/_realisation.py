@@ -81,6 +81,8 @@ class Realisation:
     """Largest ``|realised - exact| / |exact|`` between 0.05 and 100 Hz."""
     poles_rad_s: Complex
     """(m,): of a conjugate pair the one in the upper half plane, then the real ones."""
+    modes: NDArray[np.intp]
+    """(m,): mode of each pole, the first is 0; -1: a pole of the branch cut."""
 
     def transfer(self, s: ArrayLike) -> Complex:
         """G(s) as realised, in N·m/rad, of the shape of `s` (rad/s)."""
@@ -192,6 +194,7 @@ def realise(
     max_relative_error: float = 1e-3,
     tip_mass_kg: float = 0.0,
     root_compliance_rad_per_nm: float = 0.0,
+    modes_of: Beam | None = None,
 ) -> Realisation:
     """Real-time realisation of the beam.
 
@@ -203,13 +206,17 @@ def realise(
         Point mass at its tip, and by how much its clamp turns for a torque.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
+    modes_of
+        A beam that is a little stiffer or softer: of this one the same modes are realised as of
+        that one, so that both have as many states. None: no such beam.
 
     Raises
     ------
     RealisationError
         If the error is larger, naming the error achieved; if the realisation would make a
         frictionless motor unstable; if the exact beam itself is not passive: negative
-        coefficients, orders outside 0…2; or if the beam has more than 300 modes to realise.
+        coefficients, orders outside 0…2; if the beam has more than 300 modes to realise; or if it
+        does not have the modes of `modes_of`.
 
     Examples
     --------
@@ -225,7 +232,7 @@ def realise(
     """
     _check_passive(damping)
     loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
-    poles = _poles(loaded)
+    poles, modes = _poles(loaded, beam if modes_of is None else modes_of)
     zeros = _zeros(loaded)
     landmarks = np.concatenate([poles[poles.imag > 0], zeros])
 
@@ -242,7 +249,7 @@ def realise(
             f"{damping} on {beam} is realised with a relative error of {error:.1e} between "
             f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was asked."
         )
-    realisation = _state_space(poles, coefficients, error)
+    realisation = _state_space(poles, modes, coefficients, error)
     growth = _growth_on_frictionless_motor(realisation, beam)
     if growth > MAX_GROWTH_PER_S:
         raise RealisationError(
@@ -268,29 +275,51 @@ def _exact(loaded: LoadedBeam, s: Complex) -> Complex:
     return loaded.transfer(np.asarray(s, dtype=np.complex128))
 
 
-def _poles(loaded: LoadedBeam) -> Complex:
-    """Modes up to 1.2 kHz, upper half plane first, then every real pole."""
-    beam = loaded.beam
-    reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * beam.density_over_stiffness
+def _poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
+    """Modes up to 1.2 kHz, upper half plane first, then every real pole; and which modes."""
+    reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * modes_of.density_over_stiffness
     # Damping may shift the highest modes down, so a few more are looked at than the undamped count.
-    count = int(1.25 * reach**0.25 * beam.length_m / np.pi) + 3
+    count = int(1.25 * reach**0.25 * modes_of.length_m / np.pi) + 3
     if count > _MOST_MODES:
         raise RealisationError(
-            f"{beam} has some {count} modes below {_MODES_UP_TO_HZ:g} Hz, more than the "
+            f"{modes_of} has some {count} modes below {_MODES_UP_TO_HZ:g} Hz, more than the "
             f"{_MOST_MODES} that are realised; check the units of its length, density and "
             "stiffness."
         )
-    pairs = loaded.poles(clamped_free_eigenvalues(count))
-    pairs = pairs[~np.isnan(pairs[:, 0])]
+    eigenvalues = clamped_free_eigenvalues(count)
+    pairs = loaded.poles(eigenvalues)
+    if modes_of == loaded.beam:
+        chosen = _realised(pairs)
+    else:
+        chosen = _realised(replace(loaded, beam=modes_of).poles(eigenvalues))
     oscillating = pairs[:, 0].imag > 0
-    upper = pairs[oscillating, 0]
+    # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
+    if np.isnan(pairs[chosen]).any() or (oscillating & (chosen.sum(axis=1) == 1)).any():
+        raise RealisationError(
+            f"{loaded.beam} with {loaded.damping} does not have the modes of {modes_of}."
+        )
+    upper = np.flatnonzero(oscillating & chosen[:, 0])
+    over_damped = chosen & ~oscillating[:, None]
+    cut = np.full(_CUT_POLES.size, -1)
+    return (
+        np.concatenate([pairs[upper, 0], pairs[over_damped], _CUT_POLES]),
+        np.concatenate([upper, np.nonzero(over_damped)[0], cut]),
+    )
+
+
+def _realised(pairs: Complex) -> NDArray[np.bool_]:
+    """Choose what is realised of the poles of the modes; of the shape of `pairs`."""
+    oscillating = pairs[:, 0].imag > 0
+    numbers = np.flatnonzero(oscillating)
+    upper = pairs[numbers, 0]
     in_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
-    upper = upper[in_band | (-upper.real < _HEAVY_DAMPING * np.abs(upper))]
+    light = in_band | (-upper.real < _HEAVY_DAMPING * np.abs(upper))
+    numbers, upper = numbers[light], upper[light]
     beyond = np.flatnonzero(upper.imag > 2 * np.pi * _MODES_UP_TO_HZ)
-    upper = upper[: beyond[0] + 1] if beyond.size else upper
-    over_damped = pairs[~oscillating].ravel()
-    over_damped = over_damped[np.abs(over_damped) < 2 * np.pi * _MODES_UP_TO_HZ]
-    return np.concatenate([upper, over_damped, _CUT_POLES])
+    numbers = numbers[: beyond[0] + 1] if beyond.size else numbers
+    chosen = ~oscillating[:, None] & (np.abs(pairs) < 2 * np.pi * _MODES_UP_TO_HZ)
+    chosen[numbers] = True
+    return chosen
 
 
 def _zeros(loaded: LoadedBeam) -> Complex:
@@ -365,7 +394,9 @@ def _apart(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
     return apart
 
 
-def _state_space(poles: Complex, coefficients: Real, error: float) -> Realisation:
+def _state_space(
+    poles: Complex, modes: NDArray[np.intp], coefficients: Real, error: float
+) -> Realisation:
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
     n = 2 * upper.size + real.size
     a = np.zeros((n, n))
@@ -378,7 +409,7 @@ def _state_space(poles: Complex, coefficients: Real, error: float) -> Realisatio
     b = np.ones(n)
     b[even + 1] = 0.0
     inertia, viscosity, stiffness = (float(value) for value in coefficients[-3:])
-    return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles)
+    return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles, modes)
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:

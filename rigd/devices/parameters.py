@@ -111,6 +111,16 @@ class Simulation:
     )
     """By how much the torque's samples lie farther apart than the angle's; below 0 the torque grows
     older all the time, and it cannot grow younger than it is."""
+    hum_nm: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Amplitude of a sine that the sensor's torque picks up, whatever the beam does; 0: none."""
+    hum_hz: Positive = field(default=50.0, metadata=OPTIONAL)
+    """Its frequency, below half the rate at which the sensor takes readings."""
+    stiffness_drift_per_s: Annotated[float, Ge(-1e-3), Le(1e-3)] = field(
+        default=0.0, metadata=OPTIONAL
+    )
+    """By what share of itself the beam's bending stiffness grows each second, from the first
+    enabling of the drive until it has changed by 5 %; below 0, as of a beam that warms, it
+    falls."""
     air_drag_m: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Drag coefficient times diameter of the beam, C_D d, in air of 1.2 kg/m³; 0: no drag."""
     crosstalk_percent: Annotated[float, Ge(0), Le(20)] = field(default=0.0, metadata=OPTIONAL)

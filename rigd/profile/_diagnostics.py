@@ -99,6 +99,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
     yield from _out_of_reach(values)
     yield from _not_beside_air(values)
+    yield from _hum(values)
     warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
     if drift < warning:
         yield (
@@ -151,12 +152,26 @@ def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the simulated rig cannot have together with drag of the air."""
     if not values.get("simulation.air_drag_m"):
         return
-    for name in ("clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz"):
+    for name in (
+        "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
+    ):  # fmt: skip
         if values.get(f"simulation.{name}"):
             yield (
                 f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
                 "one of them out, or make it 0."
             )
+
+
+def _hum(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with a hum that the simulated sensor picks up."""
+    rate_hz, hum_hz = values["rig.rate_hz"], values.get("simulation.hum_hz", 0.0)
+    per_tick = max(1, round(values.get("ati_serial.stream_hz", rate_hz) / rate_hz))
+    if values.get("simulation.hum_nm") and hum_hz >= 0.5 * per_tick * rate_hz:
+        yield (
+            f"simulation.hum_hz = {hum_hz:g} Hz is not below half of the {per_tick * rate_hz:g} "
+            "readings that the simulated sensor takes each second; choose less than "
+            f"{0.5 * per_tick * rate_hz:g} Hz, 50 or 60 for the mains."
+        )
 
 
 def _shear(values: Mapping[str, Any]) -> Iterator[str]:

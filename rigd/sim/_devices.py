@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
+from math import sin, tau
 from operator import mul
 from typing import IO
 
@@ -76,7 +77,7 @@ class SimulatedRig:
         self._ended: list[Encounter] = []
         self._preparing: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
-        self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, weights)
+        self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
         self._resolution_rad = rig.encoder.resolution_rad
 
     def advance(self, n_periods: int) -> None:
@@ -85,9 +86,11 @@ class SimulatedRig:
             self._look()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
+            self.sensor.elapse(n_periods)
             return
         for _ in range(n_periods * self.records_per_period):
             self.plant.advance(1)
+            self.sensor.elapse(1)
             self.sensor.sample()
 
     def check(self, encounter: Encounter) -> None:
@@ -243,16 +246,18 @@ class SimulatedDrive:
 
 
 class SimulatedSensor:
-    """Six-axis sensor with white noise, offset, limited resolution and range.
+    """Six-axis sensor with white noise, hum, offset, limited resolution and range.
 
-    Coupling torque and base shear appear as the smallest wrench whose projections they are, with
-    the crosstalk of the simulation. Where the readings are streamed, what is read is the last of
-    them through the decimating filter.
+    Coupling torque, with the hum on it, and base shear appear as the smallest wrench whose
+    projections they are, with the crosstalk of the simulation. Where the readings are streamed,
+    what is read is the last of them through the decimating filter.
 
     Parameters
     ----------
     plant, sensor, simulation
         Plant, sensor and its noise.
+    rate_hz
+        Rate of the readings, by which the hum goes on.
     weights
         Weights of the last readings in the value, oldest first; one weight: a reading is taken when
         it is asked for.
@@ -263,6 +268,7 @@ class SimulatedSensor:
         plant: SimulatedPlant,
         sensor: WrenchSensor,
         simulation: Simulation,
+        rate_hz: float,
         weights: tuple[float, ...] = (1.0,),
     ) -> None:
         self._plant = plant
@@ -279,6 +285,9 @@ class SimulatedSensor:
             if per_torque[axis] != 0.0 or per_shear[axis] != 0.0
         ]
         self._rows = chain.from_iterable(self._noise())
+        self._hum_nm = simulation.hum_nm
+        self._hum_turn = simulation.hum_hz / rate_hz
+        self._hum_turns = 0.0
         self._saturated = False  # since the last that was read
         self.wrench_stale = False
         self.wrench_time_ns = 0
@@ -321,10 +330,18 @@ class SimulatedSensor:
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
 
+    def elapse(self, readings: int) -> None:
+        """Let the time of some readings pass, taken or not."""
+        if self._hum_nm:
+            # Whole turns are left out, for the phase to stay exact.
+            self._hum_turns = (self._hum_turns + readings * self._hum_turn) % 1.0
+
     def measure(self) -> Wrench:
         """Return a reading of this instant."""
         row = next(self._rows)
         torque_nm = self._plant.sensed_torque_nm
+        if self._hum_nm:
+            torque_nm += self._hum_nm * sin(tau * self._hum_turns)
         shear_n = self._plant.sensed_shear_n
         saturated = False
         for axis, per_torque, per_shear, limit, step in self._active:

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
+    Beam,
     CoupledModel,
     LoadedBeam,
     Realisation,
+    RealisationError,
     couple,
     held_inputs,
     propagator,
@@ -27,6 +29,7 @@ from rigd.devices import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import Contact, March
+from rigd.sim._stiffness_drift import StiffnessDrift, in_displacements
 
 Real = NDArray[np.float64]
 
@@ -81,7 +84,7 @@ class SimulatedPlant:
     Raises
     ------
     RealisationError
-        If the beam's damping cannot be realised.
+        If the beam's damping cannot be realised, at the stiffness that it drifts to included.
     ObstacleError
         If an obstacle is not written as it should be, or lies beyond the beam's tip.
 
@@ -100,6 +103,7 @@ class SimulatedPlant:
         "_direct_share",
         "_direct_shear_n",
         "_direct_shear_share",
+        "_drift",
         "_free",
         "_free_march",
         "_friction_effects",
@@ -107,8 +111,10 @@ class SimulatedPlant:
         "_friction_speed",
         "_holding_beam_nm",
         "_jump_gain",
+        "_jump_is_sensed",
         "_locked",
         "_locked_march",
+        "_next_is_known",
         "_peak_nm",
         "_period_s",
         "_periods",
@@ -150,36 +156,8 @@ class SimulatedPlant:
             bending_stiffness_n_m2=simulation.stiffness_ratio * stated.bending_stiffness_n_m2,
         )
         parameters = replace(parameters, beam=own)
-        beam = realise(
-            parameters.beam,
-            parameters.damping,
-            tip_mass_kg=simulation.tip_mass_kg,
-            root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
-        )
-        loaded = LoadedBeam(
-            parameters.beam,
-            parameters.damping,
-            simulation.tip_mass_kg,
-            simulation.clamp_compliance_rad_per_nm,
-        )
-        attach = partial(
-            couple,
-            beam,
-            tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-            shear=state_output(beam, loaded.shear, inertial=True),
-        )
-        free = attach(
-            motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
-            viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
-        )
-        # No torque turns an infinite inertia: the beam on a locked shaft.
-        locked = attach(motor_inertia_kg_m2=np.inf)
+        beam, free, locked = _models(parameters, simulation)
         filtered = simulation.torque_filter_hz > 0
-        if filtered:
-            free, locked = (
-                with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
-                for model in (free, locked)
-            )
         self._air = _air(parameters, beam)
         if self._air is not None:
             (free, on_free), (locked, on_locked) = map(self._air.attached, (free, locked))
@@ -187,16 +165,8 @@ class SimulatedPlant:
         if self._contact is not None:
             (free, on_free), (locked, on_locked) = map(self._contact.attached, (free, locked))
         n = free.b.size
-        step = _step(free, locked.sensor_torque, period, *instants)
-        locked_step = _step(locked, locked.sensor_torque, period, *instants)
-
-        # A period's friction is known only after its step, from the speed reached without it. The
-        # outputs are then corrected at once, the state by a last column of the next step.
-        friction = -(step[:, n] + step[:, n + 1])
+        step, locked_step, friction = _steps(free, locked, period, instants)
         self._friction_effects: list[float] = friction[n:].tolist()
-        # A bound method of a matrix in column order: the quickest product of this size in numpy.
-        step = np.column_stack([step, step[:, :n] @ friction[:n]])
-        locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
         points = 0
         if self._air is not None:
             points = len(self._air.speed)
@@ -222,6 +192,16 @@ class SimulatedPlant:
             step, locked_step = (
                 np.vstack([whole, self._contact.place @ whole[:n]]) for whole in (step, locked_step)
             )
+        self._drift: StiffnessDrift | None = None
+        if simulation.stiffness_drift_per_s:
+            self._drift = StiffnessDrift(
+                simulation.stiffness_drift_per_s,
+                period,
+                np.abs(beam.poles_rad_s).max(initial=0.0, where=beam.poles_rad_s.imag > 0),
+                lambda share: _arrays_at(share, parameters, simulation, beam, period, instants),
+            )
+            step, locked_step = self._drift.arrays[:2]
+        # A bound method of a matrix in column order: the quickest product of this size in numpy.
         self._free = np.asfortranarray(step).dot
         self._locked = np.asfortranarray(locked_step).dot
 
@@ -237,12 +217,9 @@ class SimulatedPlant:
         self._stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
         self._share_before_switch = switch / period
-        next_is_known = switch == 0 and periods > 0
-        self._jump_gain = 0.5 * free.sensor_torque_per_torque if next_is_known else 0.0
-        self._shear_jump_gain = 0.5 * free.shear_per_torque if next_is_known else 0.0
-        seen = torque_age == 0 and not filtered
-        self._sensed_jump_gain = self._jump_gain if seen else 0.0
-        self._sensed_shear_jump_gain = self._shear_jump_gain if seen else 0.0
+        self._next_is_known = switch == 0 and periods > 0
+        self._jump_is_sensed = torque_age == 0 and not filtered
+        self._set_jump_gains(free.sensor_torque_per_torque, free.shear_per_torque)
 
         self._torque_nm = 0.0
         self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
@@ -329,6 +306,8 @@ class SimulatedPlant:
         n = self._states
         torques = self._torques
         for _ in range(n_periods):
+            if self._drift is not None and self._drift.renew(self._periods):
+                self._take_stiffness(self._drift)
             torques.append(self._torque_nm)
             before, after = torques[0], torques[1]
             (vector, input_, _), (output, _, results) = self._vectors
@@ -401,6 +380,18 @@ class SimulatedPlant:
             self.sensed_torque_nm = self._sensed_torques[0]
             self.sensed_shear_n = self._sensed_shears[0]
 
+    def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
+        """Set what is told of half a jump of the motor's torque at a tick."""
+        self._jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
+        self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
+        self._sensed_jump_gain = self._jump_gain if self._jump_is_sensed else 0.0
+        self._sensed_shear_jump_gain = self._shear_jump_gain if self._jump_is_sensed else 0.0
+
+    def _take_stiffness(self, drift: StiffnessDrift) -> None:
+        """Take what is not in the matrices of a step, which have changed by themselves."""
+        self._friction_effects = drift.arrays[2].tolist()
+        self._set_jump_gains(*drift.arrays[3].tolist())
+
     def _touch(self, march: March, input_: Real, output: Real, *, turns: bool) -> None:
         """Add what the obstacles do to a step that was made without them.
 
@@ -458,6 +449,130 @@ class SimulatedPlant:
             sensed_torque + share * (before_nm + at * (now_nm - before_nm)),
             sensed_shear + before_n + at * (now_n - before_n),
         )
+
+
+def _models(
+    parameters: RigParameters, simulation: Simulation, modes_of: Beam | None = None
+) -> tuple[Realisation, CoupledModel, CoupledModel]:
+    """Realise the beam, and attach it to the free and to the locked shaft.
+
+    Parameters
+    ----------
+    parameters
+        The rig, with the beam as it is simulated.
+    simulation
+        What is at the beam and in its sensor.
+    modes_of
+        As for `realise`.
+    """
+    beam = realise(
+        parameters.beam,
+        parameters.damping,
+        tip_mass_kg=simulation.tip_mass_kg,
+        root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
+        modes_of=modes_of,
+    )
+    loaded = LoadedBeam(
+        parameters.beam,
+        parameters.damping,
+        simulation.tip_mass_kg,
+        simulation.clamp_compliance_rad_per_nm,
+    )
+    attach = partial(
+        couple,
+        beam,
+        tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
+        shear=state_output(beam, loaded.shear, inertial=True),
+    )
+    free = attach(
+        motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
+        viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
+    )
+    # No torque turns an infinite inertia: the beam on a locked shaft.
+    locked = attach(motor_inertia_kg_m2=np.inf)
+    if simulation.torque_filter_hz > 0:
+        free, locked = (
+            with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
+            for model in (free, locked)
+        )
+    return beam, free, locked
+
+
+def _steps(
+    free: CoupledModel, locked: CoupledModel, period_s: float, instants: tuple[float, float, float]
+) -> tuple[Real, Real, Real]:
+    """One period on the free and on the locked shaft, and what friction of 1 N·m does in it.
+
+    A period's friction is known only after its step, from the speed reached without it. The outputs
+    are then corrected at once, the state by a last column of the next step.
+
+    Parameters
+    ----------
+    free, locked
+        Motor and beam.
+    period_s, instants
+        As for `_step`.
+
+    Returns
+    -------
+    step, locked_step : (n + 8, n + 3)
+    friction : (n + 8,)
+    """
+    n = free.b.size
+    step = _step(free, locked.sensor_torque, period_s, *instants)
+    locked_step = _step(locked, locked.sensor_torque, period_s, *instants)
+    friction = -(step[:, n] + step[:, n + 1])
+    step = np.column_stack([step, step[:, :n] @ friction[:n]])
+    locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
+    return step, locked_step, friction
+
+
+def _arrays_at(
+    share: float,
+    parameters: RigParameters,
+    simulation: Simulation,
+    at_start: Realisation,
+    period_s: float,
+    instants: tuple[float, float, float],
+) -> tuple[Real, Real, Real, Real]:
+    """Compute what depends on the stiffness of a beam that drifts.
+
+    Parameters
+    ----------
+    share
+        The stiffness over that at the start.
+    parameters, simulation
+        As for `_models`, at the start.
+    at_start
+        The beam there.
+    period_s, instants
+        As for `_step`.
+
+    Returns
+    -------
+    step, locked_step : (n + 8, n + 3)
+    friction_effects : (8,)
+    per_torque : (2,)
+        What the motor's torque adds at once to torque and shear of the sensor.
+
+    Raises
+    ------
+    RealisationError
+        If the beam cannot be realised at that stiffness.
+    """
+    own = parameters.beam
+    drifted = replace(own, bending_stiffness_n_m2=share * own.bending_stiffness_n_m2)
+    try:
+        beam, *models = _models(replace(parameters, beam=drifted), simulation, own)
+    except RealisationError as error:
+        raise RealisationError(
+            "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
+            f"{share:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
+        ) from error
+    free, locked = (in_displacements(model, beam, at_start) for model in models)
+    step, locked_step, friction = _steps(free, locked, period_s, instants)
+    per_torque = np.array([free.sensor_torque_per_torque, free.shear_per_torque])
+    return step, locked_step, friction[free.b.size :], per_torque
 
 
 def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import further
 
 from rigd.beam import Beam, Damping, RealisationError, couple, modes, realise, transfer
 
@@ -151,3 +152,29 @@ def test_a_beam_of_too_many_modes_is_refused_at_once():
     millimetres_for_metres = Beam(980.0, 4.7e-3, 0.090275)
     with pytest.raises(RealisationError, match=r"modes below 1200 Hz.*units"):
         realise(millimetres_for_metres, Damping())
+
+
+@pytest.mark.parametrize("share", [0.95, further(0.98), further(1.02), 1.05])
+def test_a_beam_of_another_stiffness_has_as_many_states(share):
+    # At 1200 Hz, where no more modes are realised, and at critical damping a mode changes sides.
+    for length_m in np.linspace(0.5, 1.5, 21):
+        for damping in (Damping(7.1e-5, 0.996, 0.055, 0.594), Damping(zeta=1.075e-3)):
+            beam = Beam(length_m, 4.7e-3, 0.090275)
+            other = Beam(length_m, 4.7e-3, share * 0.090275)
+            one, two = realise(beam, damping), realise(other, damping, modes_of=beam)
+            assert one.b.size == two.b.size
+            assert np.array_equal(np.unique(one.modes), np.unique(two.modes))
+            of_first = two.poles_rad_s[two.modes == 0] / one.poles_rad_s[one.modes == 0]
+            assert of_first.imag == pytest.approx(0.0, abs=1e-2)
+            assert of_first.real == pytest.approx(share**0.5, rel=1e-2)
+            own = realise(beam, damping, modes_of=beam)
+            assert np.array_equal(own.c, one.c)
+
+
+def test_modes_of_quite_another_beam_are_refused():
+    with pytest.raises(RealisationError, match="does not have the modes of"):
+        realise(
+            Beam(0.98, 4.7e-3, 0.090275),
+            Damping(zeta=1.075e-3),
+            modes_of=Beam(0.98, 4.7e-3, 0.9),
+        )

@@ -327,7 +327,12 @@ def test_simulated_devices_need_their_section(refuse, sim_toml):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("clamp_compliance_rad_per_nm", 0.02), ("tip_mass_kg", 1e-4), ("torque_filter_hz", 100.0)],
+    [
+        ("clamp_compliance_rad_per_nm", 0.02),
+        ("tip_mass_kg", 1e-4),
+        ("torque_filter_hz", 100.0),
+        ("stiffness_drift_per_s", -1e-5),
+    ],
 )
 def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(refuse, sim_toml, name, value):
     def with_extras(**extras):
@@ -338,6 +343,44 @@ def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(refuse, sim_tom
     assert line.startswith(f"simulation.{name} and simulation.air_drag_m cannot be simulated")
     for one in ({name: value, "air_drag_m": 0.0}, {name: 0.0, "air_drag_m": 2.3e-3}):
         profile_of(with_extras(**one)[1], Path("a.toml"))
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"hum_nm": -1e-3}, "simulation.hum_nm = -0.001 N·m must be at least 0."),
+        ({"hum_hz": 0.0}, "simulation.hum_hz = 0 Hz must be more than 0."),
+        (
+            {"hum_nm": 5e-3, "hum_hz": 500.0},
+            "simulation.hum_hz = 500 Hz is not below half of the 1000 readings that the simulated "
+            "sensor takes each second; choose less than 500 Hz",
+        ),
+        (
+            {"stiffness_drift_per_s": 0.01},
+            "simulation.stiffness_drift_per_s = 0.01 1/s must be at most 0.001.",
+        ),
+        (
+            {"stiffness_drift_per_s": -0.01},
+            "simulation.stiffness_drift_per_s = -0.01 1/s must be at least -0.001.",
+        ),
+    ],
+)
+def test_disturbances_that_cannot_be_simulated_are_refused(refuse, sim_toml, more, said):
+    lines = [f'{key} = {{ value = {more[key]}, source = "assumed" }}' for key in more]
+    [line] = refuse((sim_toml, "\n".join([sim_toml, *lines, ""])))
+    assert line.startswith(said)
+
+
+def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams():
+    path = Path(__file__).resolve().parents[2] / "hw_profiles" / "antenna_serial.toml"
+    lines = [
+        f'{key} = {{ value = {value}, source = "assumed" }}'
+        for key, value in (("hum_nm", 1e-3), ("hum_hz", 700.0))
+    ]
+    text = path.read_text(encoding="utf-8")
+    assert text.count("[simulation]\n") == 1
+    text = text.replace("[simulation]\n", "\n".join(["[simulation]", *lines, ""]))
+    assert profile_of(text, Path("a.toml")).rig.simulation.hum_hz == 700.0
 
 
 def test_a_projection_of_nothing_is_refused(refuse):

@@ -357,6 +357,7 @@ def test_the_sensor_sees_a_touch_as_late_as_it_is(delay_s):
         ({"clamp_compliance_rad_per_nm": 1e-3}, "clamp_compliance_rad_per_nm"),
         ({"air_drag_m": 2e-3}, "air_drag_m"),
         ({"torque_filter_hz": 100.0}, "torque_filter_hz"),
+        ({"stiffness_drift_per_s": -1e-5}, "stiffness_drift_per_s"),
     ],
 )
 def test_what_is_not_simulated_together_is_refused(simulation, key):

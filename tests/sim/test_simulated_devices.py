@@ -9,6 +9,7 @@ from rigd.devices._registry import open_devices
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Selection
 from rigd.profile import load_profile
+from rigd.sim._devices import SimulatedRig
 
 PERIOD_NS = 1_000_000
 
@@ -122,6 +123,60 @@ def test_crosstalk_is_a_share_of_each_range_and_always_the_same(quiet):
     assert (np.abs(other) > 1e-3).all()
     _, again, _ = watch(replace(crossed, sensor=replace(crossed.sensor)), 400, wiggle)
     assert np.array_equal(again, wrenches)
+
+
+def hum_of(quiet, ticks, **more):
+    """Wrenches of a rig whose motor stands still, with a hum on its torque."""
+    rig = replace(quiet, simulation=replace(quiet.simulation, **more))
+    return watch(rig, ticks, lambda _: 0.0)[1]
+
+
+def test_a_hum_is_a_sine_on_the_projection_of_the_torque(quiet):
+    turned = replace(quiet, sensor=replace(quiet.sensor, projection=(0, 0.03, 0, 0, 0, -1.0)))
+    wrenches = hum_of(turned, 2000, hum_nm=5e-3, hum_hz=33.3)
+    torque = wrenches @ np.array(turned.sensor.projection)
+    sine = 5e-3 * np.sin(2 * np.pi * 33.3e-3 * np.arange(2000))
+    assert torque == pytest.approx(sine, abs=1e-12)
+    assert wrenches @ np.array(turned.sensor.shear_projection) == pytest.approx(0.0, abs=1e-15)
+    # 50 Hz unless it is said; none unless it is asked for.
+    mains = hum_of(quiet, 200, hum_nm=2e-3)[:, 5]
+    assert mains == pytest.approx(2e-3 * np.sin(0.1 * np.pi * np.arange(200)), abs=1e-12)
+    assert not hum_of(quiet, 200).any()
+
+
+def test_a_hum_is_there_whatever_the_beam_does(quiet):
+    _, alone, _ = watch(quiet, 600, wiggle)
+    humming = replace(quiet, simulation=replace(quiet.simulation, hum_nm=5e-3))
+    angles, wrenches, _ = watch(humming, 600, wiggle)
+    assert np.array_equal(angles, watch(quiet, 600, wiggle)[0])
+    sine = 5e-3 * np.sin(0.1 * np.pi * np.arange(600))
+    assert (wrenches - alone)[:, 5] == pytest.approx(sine, abs=1e-12)
+
+
+def test_a_hum_goes_on_through_missed_periods(quiet):
+    rig = replace(quiet, simulation=replace(quiet.simulation, hum_nm=5e-3, hum_hz=47.0))
+    simulated = SimulatedRig(rig)
+    seen, ticks = [], [0, 1, 5, 6, 40]
+    for before, tick in zip([0, *ticks], ticks, strict=False):
+        simulated.advance(tick - before)
+        seen.append(simulated.sensor.read_wrench()[5])
+    assert seen == pytest.approx(5e-3 * np.sin(2 * np.pi * 0.047 * np.array(ticks)), abs=1e-12)
+
+
+def test_a_hum_is_sampled_with_every_record_of_a_stream(quiet):
+    serial = load_profile("antenna_serial").rig.ati_serial
+    rig = replace(
+        quiet,
+        ati_serial=replace(serial, filter="mean", stream_hz=3000.0),
+        simulation=replace(quiet.simulation, hum_nm=5e-3, hum_hz=700.0),
+    )
+    simulated = SimulatedRig(rig)
+    records = []
+    for _ in range(50):
+        simulated.advance(1)
+        records += [record[5] for record in simulated.sensor.records]
+    phase = 2 * np.pi * 700.0 * np.arange(1, 151) / 3000.0
+    assert records == pytest.approx(5e-3 * np.sin(phase), abs=1e-12)
 
 
 def test_a_declared_delay_is_the_age_of_the_reading(rig):

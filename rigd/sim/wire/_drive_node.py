@@ -31,7 +31,7 @@ from rigd.sim.wire._drive_objects import (
     StateMachine,
     add_drive_objects,
     follow_file,
-    peak_permille,
+    peak_per_mille,
 )
 from rigd.sim.wire._object_dictionary import ObjectDictionary, SdoServer
 
@@ -173,8 +173,8 @@ class DriveNode:
         self._sync_timeout_s = sync_timeout_s
         self._resolution_rad = rig.encoder.resolution_rad
         self._direction = rig.cia402.direction
-        self._nm_per_permille = rig.cia402.direction * rig.motor.rated_torque_nm / 1000
-        self._peak_permille = peak_permille(rig.motor)
+        self._nm_per_mille = rig.cia402.direction * rig.motor.rated_torque_nm / 1000
+        self._peak_per_mille = peak_per_mille(rig.motor)
         self._rad_s_per_rpm = math.tau / 60 / rig.cia402.gear_ratio
 
         node_id = self._node_id = rig.cia402.node_id
@@ -182,8 +182,8 @@ class DriveNode:
         self._nmt = Nmt.INITIALISING
         self._last_sync_s = 0.0
         self._sync_alive = False
-        self._permille = 0
-        self._measured_permille = 0.0
+        self._per_mille = 0
+        self._measured_per_mille = 0.0
         self._measured_at_s = 0.0
         self._mode = NO_MODE
         self._limited = self._following = self._too_fast = False
@@ -556,7 +556,7 @@ class DriveNode:
         state = self._machine.state
         if left is State.OPERATION_ENABLED:
             self._plant.disable()
-            self._permille = 0
+            self._per_mille = 0
             self._limited = self._following = False
             self._log("torque", torque_nm=0.0, enabled=False)
         self._log("state", state=state.label)
@@ -581,16 +581,16 @@ class DriveNode:
             and (not self._target_pdos or any(pdo.applied for pdo in self._target_pdos))
         )
         wanted = own.target_torque.value + own.torque_offset.value if self._following else 0
-        limit = min(own.max_torque.value, self._peak_permille)
+        limit = min(own.max_torque.value, self._peak_per_mille)
         high = min(limit, abs(own.positive_limit.value))
         low = -min(limit, abs(own.negative_limit.value))  # some drives have it with its sign
-        permille = low if wanted < low else min(wanted, high)
-        if self._too_fast and permille * self._direction * self._plant.velocity_rad_s > 0:
-            permille = 0
-        self._limited = permille != wanted
-        if permille != self._permille:
-            self._permille = permille
-            torque_nm = permille * self._nm_per_permille
+        per_mille = low if wanted < low else min(wanted, high)
+        if self._too_fast and per_mille * self._direction * self._plant.velocity_rad_s > 0:
+            per_mille = 0
+        self._limited = per_mille != wanted
+        if per_mille != self._per_mille:
+            self._per_mille = per_mille
+            torque_nm = per_mille * self._nm_per_mille
             self._plant.command(torque_nm)
             self._log("torque", torque_nm=torque_nm, enabled=True)
 
@@ -622,10 +622,10 @@ class DriveNode:
     def _measure_torque(self) -> None:
         elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
         share = -math.expm1(-elapsed_s / self.torque_lag_s)
-        self._measured_permille += share * (self._permille - self._measured_permille)
+        self._measured_per_mille += share * (self._per_mille - self._measured_per_mille)
 
     def _actual_torque(self) -> int:
-        return round(self._measured_permille) if self.torque_lag_s else self._permille
+        return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille
 
     def _velocity(self) -> int:
         counts = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction

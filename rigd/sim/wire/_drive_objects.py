@@ -256,7 +256,7 @@ def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
     return counts
 
 
-def peak_permille(motor: Motor) -> int:
+def peak_per_mille(motor: Motor) -> int:
     """Return the peak torque in 1/1000 of the rated torque, rounded down."""
     return min(math.floor(1000 * motor.peak_torque_nm / motor.rated_torque_nm + 1e-9), 0x7FFF)
 
@@ -288,7 +288,7 @@ def add_drive_objects(
     communication_error = Entry("B", high=2)
     objects.add_record(0x1029, {1: communication_error})
 
-    peak = peak_permille(motor)
+    peak = peak_per_mille(motor)
     add(0x605B, Entry("h", 0, low=0, high=1))
     add(0x605C, Entry("h", 0, low=0, high=1))
     add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))

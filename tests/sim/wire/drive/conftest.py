@@ -109,8 +109,8 @@ class Bench:
         frames = [data for can_id, data in self.sent if can_id == 0x180 + NODE]
         return struct.unpack("<Hih", frames[0]) if frames else None
 
-    def rpdo(self, word, permille):
-        self.node.receive(0x200 + NODE, struct.pack("<Hh", word, permille))
+    def rpdo(self, word, per_mille):
+        self.node.receive(0x200 + NODE, struct.pack("<Hh", word, per_mille))
 
     def nmt(self, command):
         self.node.receive(0, bytes([command, NODE]))
@@ -170,9 +170,9 @@ class Bench:
         self.sent.clear()
         return self
 
-    def drive(self, permille):
+    def drive(self, per_mille):
         """Have a torque take effect."""
-        self.rpdo(0x0F, permille)
+        self.rpdo(0x0F, per_mille)
         return self.sync()
 
     def state(self):

@@ -158,7 +158,7 @@ def test_values_come_from_the_file_where_it_tells_them(made_of):
     assert bench.read(0x1018, 1) == 0xABC
     assert bench.read(0x1018, 2) == 0
     assert bench.read(0x6502) == 0x200  # it does not tell, and has a target torque
-    assert bench.read(0x6072) == bench.node._peak_permille  # no limit is meant by zero
+    assert bench.read(0x6072) == bench.node._peak_per_mille  # no limit is meant by zero
     assert bench.read(0x6080) == 1234
     assert bench.read(0x6076) == 500  # of the profile's motor
     assert bench.read(0x3000) == 2

@@ -177,8 +177,8 @@ def test_a_pdo_that_waits_is_dropped_when_operational_is_left(bench):
 
 
 def test_the_last_pdo_before_a_sync_counts(running):
-    for permille in (100, 200, 300):
-        running.rpdo(0x0F, permille)
+    for per_mille in (100, 200, 300):
+        running.rpdo(0x0F, per_mille)
     assert running.sync()[2] == 300
 
 

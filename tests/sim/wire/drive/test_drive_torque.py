@@ -35,16 +35,16 @@ def test_on_arrival_a_torque_takes_effect_at_once(bench):
 @pytest.mark.parametrize("direction", [1, -1])
 def test_the_rig_moves_as_it_does_without_a_wire(make_bench, direction):
     bench = make_bench(direction=direction).configure().enable()
-    permille = [round(300 * np.sin(0.05 * k)) for k in range(400)]
+    per_mille = [round(300 * np.sin(0.05 * k)) for k in range(400)]
     angles = []
-    for value in permille:
+    for value in per_mille:
         _, counts, _ = bench.sync()
         angles.append(direction * counts * bench.rig.encoder.resolution_rad)
         bench.rpdo(0x0F, direction * value)
     direct = SimulatedDrive(SimulatedRig(bench.rig), 1000.0)
     direct.enable()
     expected = []
-    for k, value in enumerate(permille):
+    for k, value in enumerate(per_mille):
         direct.latch(k * 1_000_000)
         expected.append(direct.read_angle())
         direct.command(value * RATED_NM / 1000)
@@ -220,8 +220,8 @@ def test_an_encoder_that_jumps_and_wraps(running):
 
 def test_a_log_entry_for_each_change_of_torque_or_enabling_and_no_other(running):
     running.events.clear()
-    for permille in (0, 100, 100, -100, 0):
-        running.drive(permille)
+    for per_mille in (0, 100, 100, -100, 0):
+        running.drive(per_mille)
     running.write(0x6040, 0, 0x06, 2)
     torques = [values for _, what, values in running.events if what == "torque"]
     assert [(round(v["torque_nm"], 6), v["enabled"]) for v in torques] == [

@@ -240,8 +240,8 @@ def test_of_a_pdo_that_is_too_long_the_first_bytes_count(running):
     running.take()
     running.node.receive(0x205, b"\x0f\x00\x64\x00\x00")
     assert running.emergencies() == [(0x8220, COMMUNICATION, "0504000000")]
-    word, _, permille = running.sync()
-    assert (permille, running.state()) == (100, "operation enabled")
+    word, _, per_mille = running.sync()
+    assert (per_mille, running.state()) == (100, "operation enabled")
     assert word & 0x0080  # warning
     running.take()
     running.rpdo(0x0F, 100)

@@ -12,6 +12,11 @@ from rigd.sim.wire._faults import EventLog
 PERIOD_NS = 1_000_000
 
 
+@pytest.fixture(autouse=True)
+def _patient(patient_drives):
+    pass
+
+
 def frame(can_id, data=b""):
     """16 bytes of struct can_frame, packed by hand."""
     return struct.pack("=IB3x8s", can_id, len(data), data)

@@ -230,8 +230,8 @@ def test_a_host_drives_the_motor(simulate, connect):
     start = host.tick()[1]
     for _ in range(100):
         host.send((0x77F, b"\x05"))
-        _, counts, permille = host.tick(0x0F, 400)
-    assert permille == 400
+        _, counts, per_mille = host.tick(0x0F, 400)
+    assert per_mille == 400
     # 0.2 N·m less 0.03 of friction on some 2 to 3 g·m² for 0.1 s.
     assert 0.1 < (counts - start) * 7e-5 < 0.5
 

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,10 @@ from rigd.sim.wire._simulator import ask
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
 AND_AN_OBSTACLE = '1, source = "assumed" }\nobstacles = ["x=0.6,angle=0.01,stiffness=3000"]  # '
+AND_A_HUM = '1, source = "assumed" }\nhum_nm = { value = 0.02, source = "assumed" }  # '
+AND_A_DRIFT = (
+    '1, source = "assumed" }\nstiffness_drift_per_s = { value = -1e-3, source = "assumed" }  # '
+)
 RUN = (
     "import sys\n"
     "from rigd.profile import load_profile\n"
@@ -170,6 +175,8 @@ def bare(rig, ticks):
         ("antenna_serial", {}),
         ("antenna_can", {"seed": AND_AN_OBSTACLE}),
         ("antenna_serial", {"seed": AND_AN_OBSTACLE}),
+        further("antenna_can", {"seed": AND_A_DRIFT}),
+        further("antenna_serial", {"seed": AND_A_DRIFT}),
     ],
 )
 def test_the_wire_changes_nothing(simulated_profile, name, changes):
@@ -185,3 +192,22 @@ def test_the_wire_changes_nothing(simulated_profile, name, changes):
     off = np.max(np.abs(np.subtract(changes, wanted)), axis=0)
     assert np.all(off <= rig.sensor.resolution)
     assert max(abs(change[5]) for change in changes) > 0.02
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_a_hum_comes_over_the_wire(simulated_profile, name):
+    rig = simulated_profile(name, {"seed": AND_A_HUM})
+    ticks = 120
+    alone = replace(rig, simulation=replace(rig.simulation, hum_nm=0.0))
+    torque = np.array([wrench[5] for _, wrench in over_the_wire(rig, ticks)])
+    hum = torque - [wrench[5] for _, wrench in bare(alone, ticks)]
+    # Its phase at the first tick is that of the time that the simulator has been running for.
+    phase = 0.1 * np.pi * np.arange(ticks)
+    columns = np.column_stack([np.sin(phase), np.cos(phase), np.ones(ticks)])
+    found = np.linalg.lstsq(columns, hum)[0]
+    assert np.abs(hum - columns @ found).max() < 2 * rig.sensor.resolution[5]
+    gain = 1.0
+    if rig.ati_serial is not None:
+        turns = 50.0 / rig.ati_serial.stream_hz * np.arange(len(rig.ati_serial.weights(1000.0)))
+        gain = abs(np.exp(2j * np.pi * turns) @ rig.ati_serial.weights(1000.0))
+    assert np.hypot(*found[:2]) == pytest.approx(0.02 * gain, abs=rig.sensor.resolution[5])
