@@ -266,6 +266,16 @@ def damping_changes(share: float, rig: Rig, seed: int) -> Record:
     return _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
 
 
+def stiffness_changes(share: float, rig: Rig, seed: int) -> Record:
+    """Bending stiffness from 1 - share to 1 + share of its mean; mass and external damping stay."""
+    ramp = (share * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
+
+    def force(i: int, r: float, w: float, _v: float, k: float) -> float:
+        return ramp[i] * k * (r + rig.zeta * w)
+
+    return _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
+
+
 def stiffens(shares: dict[int, float], power: int, rig: Rig, seed: int) -> Record:
     """Let the stiffness of modes rise by a share up to their largest deflection."""
 
@@ -492,6 +502,8 @@ DEFECTS: dict[str, tuple[tuple[str, ...], Make]] = {
     **{f"clocks {e} ppm": (ALL, _linear(clock=1e-6 * e)) for e in (1, 10, 100)},
     "damping ±10 % over the session": (_III, partial(damping_changes, 0.1)),
     "damping ±2 % over the session": (_III, partial(damping_changes, 0.02)),
+    "stiffness ±0.25 % over the session": (_III, partial(stiffness_changes, 2.5e-3)),
+    "stiffness ±0.05 % over the session": (_III, partial(stiffness_changes, 5e-4)),
     "air drag, wire of 0.2 mm": (_III, partial(air_drag, 2e-4)),
     "air drag, wire of 1 mm": (_III, partial(air_drag, 1e-3)),
     "cubic stiffness +1 % (mode 1)": (_III, partial(stiffens, {1: 0.01}, 2)),

@@ -61,6 +61,12 @@ _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 _INTEGER: Final = STRUCTURES["VII"]
 
+_FAR_BEHIND: Final = 1000.0
+"""Difference of BIC from which a candidate stays behind wherever exactly its minimum is."""
+
+_A_STEP: Final = 3
+"""Evaluations that bring such a candidate next to it."""
+
 _CROSS_CHECKS: Final = 3
 _NEARLY: Final = 1e-3
 
@@ -290,7 +296,7 @@ class CandidateSet:
             return self
         # The others from where they were: they have seen their best's noise only.
         others = (c for c in self.candidates if c is not self.best)
-        every = (field.refit(c).candidate() for c in others)
+        every = (self._brought_to(field, c, MANY) for c in others)
         return field.ranked((*field.candidates, *every)).cross_checked()
 
     def _without_leakage(self) -> CandidateSet:
@@ -301,7 +307,12 @@ class CandidateSet:
     def under(self, noise: Noise) -> CandidateSet:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
-        return other.ranked(other.refit(c, FEW).candidate() for c in self.candidates)
+        return other.ranked(self._brought_to(other, c, FEW) for c in self.candidates)
+
+    def _brought_to(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
+        """Fit a candidate in a set that differs a little; roughly where it is far behind."""
+        behind = c.bic - min(each.bic for each in self.candidates)
+        return other.refit(c, max_evaluations if behind < _FAR_BEHIND else _A_STEP).candidate()
 
     def _with_modes_free(self, uniform: RecordFit) -> CandidateSet:
         """Free the modes' stiffness from where a uniform beam explains the record."""
@@ -464,9 +475,18 @@ class CandidateSet:
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
-        """Fit all again, with what is not linear beside the beam."""
+        """Fit all again, with what is not linear beside the beam.
+
+        Extras that stood for it, and do nothing beside it, are left out.
+        """
         other = replace(self, columns=columns, noise=noise)
-        return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
+        other = other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
+        bare = {(c.structure.name, c.uniform): c.bic for c in other.candidates if not c.extras}
+        return other.ranked(
+            c
+            for c in other.candidates
+            if not c.extras or c.bic < bare.get((c.structure.name, c.uniform), math.inf)
+        )
 
     def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
         """Hold these candidates, the lowest BIC first."""

@@ -111,16 +111,20 @@ def fit_record(
         searches = [
             Search.of(Objective(comparison, search.unknowns), coarse) for search in searches
         ]
-    noise, descents = _under_its_noise(searches, closest, reference)
+    # What was apart from the reference may hide the beam, or stand for noise. The closest structure
+    # shows that before all others are fitted, and the closest of all once they are.
+    renewed = reference.renewed(reference.noise(), _BEFORE_LINES)
     for _ in range(_REPEATS):
-        closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
-        reference = descents[closest].renewed(noise, _BEFORE_LINES)
-        if reference is descents[closest]:
-            break
-        # What was apart from the reference hid the beam, or stood for noise.
-        comparison = reference.objective.comparison
-        searches = [search.on(comparison) for search in searches]
+        if renewed is not reference:
+            reference = renewed
+            comparison = reference.objective.comparison
+            searches = [search.on(comparison) for search in searches]
         noise, descents = _under_its_noise(searches, closest, reference)
+        closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
+        reference = descents[closest]
+        renewed = reference.renewed(noise, _BEFORE_LINES)
+        if renewed is reference:
+            break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
     return RecordAnalysis.of(fits, noise, comparison)
 

@@ -83,11 +83,15 @@ def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, .
     loaded = LoadedBeam(
         plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
     )
-    return tuple(
-        Pole(mode, complex(pole), loaded.pole_gradient(complex(pole), wrt))
+    found = [
+        (mode, pole)
         for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1)
         if not np.isnan(pair).any()
         for pole in pair[: 1 if pair[0].imag else 2]
+    ]
+    moved = loaded.pole_gradients(np.array([pole for _, pole in found], dtype=np.complex128), wrt)
+    return tuple(
+        Pole(mode, complex(pole), row) for (mode, pole), row in zip(found, moved, strict=True)
     )
 
 

@@ -1,8 +1,8 @@
-"""Selection of a structure for one record: candidates, tests, profiles, verdict, and their words.
+"""Selection of a structure for one record: candidates, tests, profiles, verdict.
 
 Every structure is fitted under one noise spectrum, the residual is tested, what is found beside the
-beam is named, the orders are profiled in the freest structure; sentences say what the record
-supports, and which experiment would tell more.
+beam is named, the orders are profiled in the freest structure. What the verdict says of that
+stands in `analysis.identify._sentences`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from analysis.identify._diagnostics import findings, unexplained
 from analysis.identify._drag import damping_with_amplitude, with_air_drag
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._headline import MISREAD, ONE_MODE, UNEXPLAINED, Headline, headline, of_fit
+from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
 from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._problem import Comparison
@@ -30,6 +30,7 @@ from analysis.identify._residual_tests import (
     whiteness,
 )
 from analysis.identify._result import RecordAnalysis
+from analysis.identify._sentences import experiments, of_headline
 from analysis.identify._time_varying import along_time, changing
 from analysis.identify._verdict import (
     EVEN,
@@ -37,15 +38,13 @@ from analysis.identify._verdict import (
     STRONG,
     Row,
     Verdict,
-    deviance_of_one,
     order_verdict,
     rivals,
     untold_reason,
 )
-from analysis.identify._visible_modes import driven, visible_modes
+from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
-from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -53,15 +52,11 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
-    from analysis.identify._headline import Quantity, Simpler
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
-    from analysis.identify._verdict import OrderVerdict
 
-
-# Selection
 
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
@@ -191,6 +186,11 @@ def _selected(
         (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
     )
     field, changes = along_time(field.with_orders_free())
+    if forces or field.drag is not None:
+        # What changes along the record may have looked like an amplitude, which does so as well.
+        other, other_changes = along_time(linear.with_orders_free())
+        if other_changes and other.bic < field.bic:
+            field, forces, changes = other, (), other_changes
     field, *profiles = profiled(field, walk=untold_reason(field, visible) is None)
     told = field.led_by(field.freest)
     white, related, multiples = _tests(told, band_hz)
@@ -427,218 +427,4 @@ def _table(field: CandidateSet) -> tuple[Row, ...]:
             delta_aic=c.aic - least_aic,
         )
         for c in field.candidates
-    )
-
-
-# Sentences of the verdict
-
-_DAMPING: Final = {
-    "I": "Internal damping only",
-    "II": "External damping only",
-    "III": "Internal and external damping",
-    "IV": "Internal damping only",
-    "V": "External damping only",
-    "VI": "Internal and external damping",
-    "VII": "Internal and external damping",
-}
-_SEVERAL: Final = 2
-_FREE: Final = "modes free"
-_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
-
-
-def of_headline(
-    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
-) -> list[str]:
-    """Say what the beam does, what is excluded, and what would do.
-
-    Parameters
-    ----------
-    told : Headline
-    orders : tuple of OrderVerdict
-        Alpha's and lambda's.
-    alone : bool
-        Whether nothing else explains the record as well.
-    """
-    free = told.fit.structure
-    kind = told.name.partition(", ")[2]
-    beam = ", on a non-uniform beam (stiffness correction per mode)" if kind == _FREE else ""
-    if kind and not beam:
-        beam = f", beside {kind}"
-    if len(told.visible_modes) < _SEVERAL:
-        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
-    else:
-        said = [
-            f"{_DAMPING[free.name]}{beam}. Numbers are those of type {told.name}, all orders free."
-        ]
-        excluded = told.with_status("excluded")
-        if told.explained and excluded:
-            said.append(f"Excluded: {_types(excluded)}.")
-        if told.simpler is not None and told.simpler.fixed:
-            said.append(_condition(told.simpler))
-    said += [order(each) for each in orders]
-    if told.explained:
-        said.append(
-            "The residual is noise; no unmodelled effect found."
-            if alone
-            else "The residual is noise, but another model fits the record equally well."
-        )
-    return said
-
-
-def order(verdict: OrderVerdict) -> str:
-    """Say what is known of one order.
-
-    Parameters
-    ----------
-    verdict : OrderVerdict
-    """
-    profile = verdict.profile
-    low, high = profile.interval
-    name, of = verdict.order, _OF[verdict.order]
-    value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
-    if verdict.status == "absent":
-        return f"No {of} was found, so its order {name} has no meaning."
-    if verdict.status == "not identifiable":
-        return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
-    if verdict.reason is not None:
-        return (
-            f"The order {name} of the {of} is not established: {value} fits, but {verdict.reason}. "
-            "Do not interpret it."
-        )
-    if verdict.status == "compatible":
-        return f"The order {name} of the {of} is {value}, consistent with 1."
-    if verdict.status == "fractional":
-        return f"The order {name} of the {of} is {value}; 1 is excluded."
-    return (
-        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (p = "
-        f"{math.erfc(math.sqrt(deviance_of_one(profile) / 2)):.1g})."
-    )
-
-
-def _types(names: tuple[str, ...]) -> str:
-    """List structures, those of a uniform beam first."""
-    plain = sorted(name for name in names if "," not in name)
-    others: dict[str, list[str]] = {}
-    for name in sorted(set(names) - set(plain)):
-        structure, beam = name.split(", ", 1)
-        others.setdefault(beam, []).append(structure)
-    groups = [_listed(plain)] if plain else []
-    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
-    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def _condition(simpler: Simpler) -> str:
-    """Say what a simpler structure would give."""
-    taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
-    numbers = [
-        f"{name} = {_with_interval(simpler.parameters[name])}"
-        for name in ("zeta", "alpha", "gamma", "lambda")
-        if name in simpler.parameters
-    ]
-    return (
-        f"{taken[0].upper()}{taken[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not excluded; "
-        f"if true (type {simpler.name}): {', '.join(numbers)}."
-    )
-
-
-def _with_interval(quantity: Quantity) -> str:
-    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
-    if quantity.interval_95 is None or not quantity.std:
-        return f"{quantity.value:.4g}"
-    low, high = quantity.interval_95
-    power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
-    scale = 10.0**power if power < -2 else 1.0
-    digits = decimals(quantity.std / scale)
-    exponent = f"e{power}" if power < -2 else ""
-    return (
-        f"{quantity.value / scale:.{digits}f}{exponent} "
-        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
-    )
-
-
-def _why_not(verdict: OrderVerdict) -> str:
-    profile = verdict.profile
-    low, high = profile.interval
-    if verdict.reason is not None and (profile.identifiable or not profile.walked):
-        return verdict.reason
-    if len(profile.valleys) > 1:
-        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
-        return (
-            f"{equal} fit the record equally well, each with a different damping (95 %: {low:.3f} "
-            f"to {high:.3f}, with all that lies between)"
-        )
-    return (
-        "any value between 0 and 2 fits"
-        if profile.open_below and profile.open_above
-        else f"anything below {high:.2f} fits"
-        if profile.open_below
-        else f"anything above {low:.2f} fits"
-        if profile.open_above
-        else f"anything from {low:.2f} to {high:.2f} fits"
-    )
-
-
-# Advice on experiments
-
-_ENOUGH: Final = 2
-_SECOND: Final = 6.267
-"""Frequency of the second mode of a uniform beam over that of the first."""
-
-_ORDINALS: Final = {1: "first", 2: "second"}
-
-
-def experiments(
-    field: CandidateSet,
-    orders: tuple[OrderVerdict, ...],
-    visible: tuple[int, ...],
-    found: tuple[Finding, ...],
-    close: tuple[Candidate, ...],
-) -> list[str]:
-    """Say what would tell more, beside the findings' remedies."""
-    advice = []
-    unknown = [o for o in orders if o.status == "not identifiable"]
-    if unknown:
-        names = " and ".join(o.order for o in unknown)
-        if len(visible) < _ENOUGH:
-            advice.append(f"To determine {names}, {_for_two_modes(field, visible)}")
-        else:
-            advice.append(
-                f"To determine {names}, run narrow, slow sweeps around the modes, or a wider sweep "
-                "that reaches one more mode."
-            )
-    unexplained = any(finding.kind == "unexplained" for finding in found)
-    if close or (not unexplained and any(o.status == "open" for o in orders)):
-        advice.append(
-            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
-        )
-    return advice
-
-
-def _for_two_modes(field: CandidateSet, visible: tuple[int, ...]) -> str:
-    """Say how both of the first two modes would show."""
-    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
-    first_hz = modes.get(1, 0.0)
-    at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}
-    missing = next(number for number in (1, 2) if number not in visible)
-    other = 3 - missing
-    last_hz = float(field.comparison.frequency_hz[-1])
-    if at_hz[missing] > last_hz:
-        return (
-            f"analyse and excite the {_ORDINALS[missing]} mode as well: band and sweep up to at "
-            f"least {1.3 * at_hz[missing]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
-        )
-    if not driven(field.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
-        return f"excite the {_ORDINALS[missing]} mode as well: sweep " + (
-            f"up to at least {1.3 * at_hz[2]:.0f} Hz."
-            if missing == 2
-            else f"from below {0.7 * at_hz[1]:.1f} Hz."
-        )
-    return (
-        f"raise the {_ORDINALS[missing]} mode above the noise: it was driven at its "
-        f"{at_hz[missing]:.1f} Hz, so increase the amplitude (twice), sweep slower or repeat; a "
-        "wider band does not help."
     )

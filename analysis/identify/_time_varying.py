@@ -6,16 +6,17 @@ follows the shaft only once a gap is closed. In one sweep time and frequency go 
 damping that drifts competes with an order of the damping, and a gain that drifts with a filter. A
 delay that rises so is what clocks of different rates make: see `analysis.identify._rivals`.
 
-A mode remembers the damping that it had. A damping that changes as ``1 + e w(t)`` puts, to first
-order in e, another force on mode i. With ``p = rho/EI s² + gamma s^lambda``,
-``c = 1 + zeta s^alpha``, ``S = c k⁴ / (c k⁴ + p)`` and ``R = p / (c k⁴ + p)``, the torque gains e
-times::
+A mode that rings for seconds remembers the damping and the stiffness that it had: at 0.4 % of
+stiffness in 22 s, one of 2.6 Hz is 0.03 rad out of phase with what its frequency of the moment
+would make of it. With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``,
+``R = p / (c k⁴ + p)``, its place in space u (a angle, where it does not vibrate, with the part q
+that vibrates) and what changes as ``1 + e w(t)``, a stress D of stiffness or damping::
 
-    a² EI (S w gamma s^lambda S + k⁴ R w zeta s^alpha R) angle
+    D = o k⁴ q + gamma s^lambda u,    q = -R a angle - e (c k⁴ + p)^-1 w D
 
-where w multiplies in time what stands to its right. To read the derivative of the response off at
-each moment is to put w in front of all; a mode that rings for seconds does not follow so soon, and
-`late_damping` is the correction.
+the torque gains ``e a EI (w gamma s^lambda u - R w D)``, where w multiplies in time what stands to
+its right; o is ``zeta s^alpha`` for a damping that changes, and c for the stiffness of a beam whose
+mass stays. The second equation put into the first, again and again, gives D.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ _GAIN: Final = SURE**2 + 2 * math.log(20)
 """Deviance that a column must save: four of them are tried on four candidates."""
 
 _UNIT_PLAY_RAD: Final = 1e-4
-_ROUNDS: Final = 4
+_ROUNDS: Final = 8
 _SETTLED: Final = 0.01
 
 
@@ -185,51 +186,26 @@ def _columns(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
 ) -> dict[What, NDArray[np.complex128]]:
     """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
-    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
-    ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    changes: dict[What, NDArray[np.float64]] = {
-        "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
-        "stiffness": gain - ratio,  # EI rises, rho stays
-        "gain": gain,
-    }
-    spectra = {what: comparison.spectrum(ramp * values) for what, values in changes.items()}
-    spectra["damping"] += comparison.spectrum(late_damping(comparison, plant, ramp))
-    spectra["play"] = comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
-    return spectra
+    return {what: _column(comparison, plant, lag, what, 0.0) for what in _NAMES}
 
 
 def _column(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64], what: What, size: float
 ) -> NDArray[np.complex128]:
-    """Column at a size that is not small, divided by it, shape (K,).
-
-    As if the rig were at each moment as it is then: between the torques at the beginning's, the
-    middle's and the end's state a parabola is laid.
-    """
-    if size == 0 or what in ("gain", "play"):
-        return _columns(comparison, plant, lag)[what]
-    place = np.linspace(-1, 1, comparison.samples)
-    first, middle, last = (
-        comparison.prediction.torque(_changed(plant, what, share * size))[0]
-        for share in (-0.5, 0.0, 0.5)
-    )
-    change = place * (last - first) / 2 + place**2 * ((first + last) / 2 - middle)
-    change /= size
-    if what == "damping":
-        change += late_damping(comparison, plant, place / 2)
+    """Column at a size that is perhaps not small, divided by it, shape (K,)."""
+    if what == "play":
+        return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
+    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
+    ramp = np.linspace(-0.5, 0.5, comparison.samples)
+    now: dict[What, NDArray[np.float64]] = {
+        "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
+        "stiffness": gain - ratio,  # EI rises, rho stays
+        "gain": gain,
+    }
+    change = ramp * now[what]
+    if what != "gain":
+        change += remembered(comparison, plant, ramp, what, size)
     return comparison.spectrum(change)
-
-
-def _changed(plant: Plant, what: What, size: float) -> Plant:
-    """Plant whose damping or stiffness is larger by a share."""
-    if what == "damping":
-        damping, factor = plant.damping, max(1 + size, 0.0)
-        return replace(
-            plant,
-            damping=replace(damping, zeta=factor * damping.zeta, gamma=factor * damping.gamma),
-        )
-    stiffness = max(1 + size, 0.1) * plant.beam.bending_stiffness_n_m2
-    return replace(plant, beam=replace(plant.beam, bending_stiffness_n_m2=stiffness))
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
@@ -248,17 +224,25 @@ def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
     return lag
 
 
-# Damping that a mode remembers
+# What a mode remembers
 
 _PADDED: Final = 1.5
 _DECAY: Final = 9.0
 """As in `analysis.identify._nonlinear`: on s = sigma + j omega what wraps round has decayed."""
 
+_ORDERS: Final = 12
+_SMALL: Final = 1e-4
+"""Orders of the size that are followed at most, and the share of the stress that counts."""
 
-def late_damping(
-    comparison: Comparison, plant: Plant, change: NDArray[np.float64]
+
+def remembered(
+    comparison: Comparison,
+    plant: Plant,
+    change: NDArray[np.float64],
+    what: Literal["damping", "stiffness"],
+    size: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Torque by damping that changes, less what is read off at each moment, shape (samples,).
+    """Torque by what changes, over its size, less what the derivative of the moment makes of it.
 
     Parameters
     ----------
@@ -266,6 +250,14 @@ def late_damping(
     plant : Plant
     change : ndarray, shape (samples,)
         w at the samples kept; before and after as at its ends.
+    what : str
+        "stiffness": while the mass stays.
+    size : float
+        e.
+
+    Returns
+    -------
+    ndarray, shape (samples,)
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
     length = fast_length(int(np.ceil(_PADDED * n)))
@@ -278,6 +270,7 @@ def late_damping(
     internal = damping.zeta * s**damping.alpha
     external = damping.gamma * s**damping.lambda_
     inertial = beam.density_over_stiffness * s * s + external
+    own = internal + 1 if what == "stiffness" else internal
     angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
     total = np.zeros(n)
 
@@ -285,20 +278,28 @@ def late_damping(
         values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
         return values
 
+    def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        found: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
+        return found
+
     uniform = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
     offsets = np.zeros(uniform.size)
     offsets[1 : 1 + len(plant.stiffness_offsets)] = plant.stiffness_offsets
     shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * uniform)
     for share, k in zip(shares.tolist(), (uniform * (1 + offsets)).tolist(), strict=True):
-        resists = (1 + internal) * k + inertial
-        ways = (
-            ((1 + internal) * k / resists, external),
-            (inertial / resists, k * internal),
-        )
-        for through, damper in ways:
-            moved = damper * through * angle
-            later = through * np.fft.rfft(w * in_time(moved) / growth, length)
-            total += share * (in_time(later) - w * in_time(through * moved))
+        compliance = 1 / ((1 + internal) * k + inertial)
+        follows = inertial * compliance
+        at_first = own * k * -follows + external * (1 - follows)
+        steady = stress = at_first * angle
+        moved = np.zeros_like(stress)
+        for _ in range(_ORDERS if size else 1):
+            moved = -compliance * weighted(stress)
+            before, stress = stress, steady + size * (own * k + external) * moved
+            if np.abs(stress - before).max() < _SMALL * np.abs(steady).max():
+                break
+        place = (1 - follows) * angle + size * moved
+        late = in_time(inertial * moved) + w * in_time(external * place)
+        total += share * (late - w * in_time(external * (1 - follows) * angle - follows * steady))
     return total[kept]
 
 

@@ -42,7 +42,10 @@ _N = np.array(
 _HOMOTOPY_STEPS = 12
 _SHARE_A_STEP = 0.02
 _NEWTON_STEPS = 60
-_CONVERGED = 1e-13
+_CONVERGED = 1e-10
+"""Relative length of Newton's last step: the error is of the order of its square."""
+_NEARLY = 1e-4
+"""The same on the way to the whole mass."""
 _FARTHEST = 10.0
 """By how much a pole may move in one step of the way to the whole mass."""
 _ASIDE = 1e-7
@@ -181,25 +184,28 @@ class LoadedBeam:
         gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
         return at.response * share, gradient * share * share
 
-    def pole_gradient(self, pole_rad_s: complex, wrt: Sequence[str]) -> Complex:
-        """Differentiate a pole with respect to parameters; shape (len(wrt),).
+    def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
+        """Differentiate poles with respect to parameters; shape (n, len(wrt)).
 
-        As that of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is infinite,
+        As those of roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is infinite,
         but next to it the ratios of its derivatives are already as they should be.
 
         Parameters
         ----------
-        pole_rad_s
-            The pole, as of `poles`.
+        poles_rad_s : ndarray of complex, shape (n,)
+            Poles, as of `poles`.
         wrt
             Names as of `transfer_and_gradient`; what does not move a pole gives 0.
         """
         aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
-        s = np.array([pole_rad_s * (1 - aside)], dtype=np.complex128)
+        s = poles_rad_s * (1 - aside)
         at, by = self._differentiated(s)
         slope = self.slope(s, at)
-        moved = [-(by[name]() / slope)[0] if name in by else 0.0 for name in wrt]
-        return np.array(moved, dtype=np.complex128)
+        moved = np.zeros((s.size, len(wrt)), dtype=np.complex128)
+        for column, name in zip(moved.T, wrt, strict=True):
+            if name in by:
+                column[:] = -by[name]() / slope
+        return moved
 
     def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
         """Give `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
@@ -296,25 +302,46 @@ class LoadedBeam:
         if self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0:
             return found
         known = ~np.isnan(found[:, 0])
-        here = found[known].ravel() * (1 - _ASIDE)  # G is infinite at an undamped pole
+        # One of a conjugate pair will do; where the decay does not oscillate both have to be found.
+        turning = found[known][:, 0].imag != 0
+        others = found[known][~turning][:, 1]
+        here = np.concatenate([found[known][:, 0], others])
+        here *= 1 - _ASIDE  # G is infinite at an undamped pole
         # As shares of the beam's own: what moves the poles by a few percent needs no small steps.
         share = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         turned = self.beam.bending_stiffness_n_m2 / self.beam.length_m
         share = max(share, self.root_compliance_rad_per_nm * turned)
         steps = min(max(math.ceil(share / _SHARE_A_STEP), 2), _HOMOTOPY_STEPS)
-        for fraction in np.arange(1, steps + 1) / steps:
+        before = here
+        for step in range(1, steps + 1):
+            fraction = step / steps
             partly = LoadedBeam(
                 self.beam,
                 self.damping,
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
             )
-            here = partly._newton(here, zeros=zeros)
-        found[known] = here.reshape(-1, 2)
+            last = step == steps
+            start = 2 * here - before if step > 1 else here
+            before, here = here, partly._newton(start, _CONVERGED if last else _NEARLY, zeros=zeros)
+        first = here[: turning.size]
+        second = first.conj()
+        second[~turning] = here[turning.size :]
+        found[known] = np.column_stack([first, second])
         return found
 
-    def _newton(self, s: Complex, *, zeros: bool) -> Complex:
-        """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found."""
+    def _newton(self, s: Complex, converged: float, *, zeros: bool) -> Complex:
+        """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found.
+
+        Parameters
+        ----------
+        s
+            Starts.
+        converged
+            Relative length of a step that is the last one.
+        zeros
+            Whether roots of G are looked for.
+        """
         start = s
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
@@ -322,10 +349,12 @@ class LoadedBeam:
                 step = at.response / self.slope(s, at)
                 step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
                 s = s + step
-                if not np.nanmax(np.abs(step / s), initial=0.0) > _CONVERGED:
+                if not np.nanmax(np.abs(step / s), initial=0.0) > converged:
                     break
             # Far away every step is a short one.
-            found = (np.abs(step) < 1e-9 * np.abs(s)) & (np.abs(s) < _FARTHEST * np.abs(start))
+            found = (np.abs(step) < max(converged, 1e-9) * np.abs(s)) & (
+                np.abs(s) < _FARTHEST * np.abs(start)
+            )
             return np.where(found, s, np.nan + 0j)
 
 

@@ -16,7 +16,7 @@ M. B. Zarrop, Optimal experiment design for dynamic system identification, Sprin
 L. Pronzato and A. Pázman, Design of experiments in nonlinear models, Springer (2013).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite, pi
 from typing import Any, Final
@@ -239,21 +239,29 @@ class BeamEstimate:
             if reached[-1]:
                 break
             count *= 2
-        loaded, found = self.loaded, []
+        loaded = self.loaded
         pairs = (
             poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
         )
         names = [_BY_PARAMETER.get(name, name) for name in self.names]
-        for number, pole in enumerate(pairs[:, 0].tolist(), start=1):
-            if not (np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz):
-                continue
-            if loaded is None:
-                k4 = float(z[number - 1] / self.beam.length_m) ** 4
-                moved = pole_gradient(pole, k4, self.beam, self.damping, names)
-            else:
-                moved = loaded.pole_gradient(pole, names)
-            found.append(EstimatedMode(number, pole, (moved * _scales(self)).astype(np.complex128)))
-        return tuple(found)
+        shown = {
+            number: pole
+            for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
+            if np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz
+        }
+        if loaded is None:
+            stiffness = (z / self.beam.length_m) ** 4
+            moved: Iterable[Complex] = (
+                pole_gradient(pole, float(stiffness[number - 1]), self.beam, self.damping, names)
+                for number, pole in shown.items()
+            )
+        else:
+            moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
+        scales = _scales(self)
+        return tuple(
+            EstimatedMode(number, pole, (row * scales).astype(np.complex128))
+            for (number, pole), row in zip(shown.items(), moved, strict=True)
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,6 +59,12 @@ def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
             assert np.abs(values[-5:]).max() < share * most
 
 
+def test_the_loop_with_an_estimate_is_computed_once(rig):
+    plant = rig.plant_with(LINK, ESTIMATE.damping)
+    assert rig.plant_with(replace(LINK), replace(ESTIMATE.damping)) is plant
+    assert rig.plant_with(LINK, Damping(zeta=7e-5)) is not plant
+
+
 def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
     assert all(each.reached for each in design.expected)
     assert not all(each.reached for each in design.pieces[0].now)

@@ -7,7 +7,7 @@ import pytest
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._diagnostics import of_settings
 from analysis.identify._profile_likelihood import Profile
-from analysis.identify._select import order as order_sentence
+from analysis.identify._sentences import order as order_sentence
 from analysis.identify._verdict import order_verdict
 
 BAND_HZ = (0.0, 50.0)

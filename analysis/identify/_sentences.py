@@ -1,0 +1,231 @@
+"""Sentences of the verdict on one record, and which experiments would tell more."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from analysis.identify._headline import ONE_MODE
+from analysis.identify._verdict import deviance_of_one
+from analysis.identify._visible_modes import driven
+from rigd.units import decimals
+
+if TYPE_CHECKING:
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import CandidateSet
+    from analysis.identify._finding import Finding
+    from analysis.identify._headline import Headline, Quantity, Simpler
+    from analysis.identify._verdict import OrderVerdict
+
+# Sentences
+
+_DAMPING: Final = {
+    "I": "Internal damping only",
+    "II": "External damping only",
+    "III": "Internal and external damping",
+    "IV": "Internal damping only",
+    "V": "External damping only",
+    "VI": "Internal and external damping",
+    "VII": "Internal and external damping",
+}
+_SEVERAL: Final = 2
+_FREE: Final = "modes free"
+_OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
+
+
+def of_headline(
+    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
+) -> list[str]:
+    """Say what the beam does, what is excluded, and what would do.
+
+    Parameters
+    ----------
+    told : Headline
+    orders : tuple of OrderVerdict
+        Alpha's and lambda's.
+    alone : bool
+        Whether nothing else explains the record as well.
+    """
+    free = told.fit.structure
+    kind = told.name.partition(", ")[2]
+    beam = ", on a non-uniform beam (stiffness correction per mode)" if kind == _FREE else ""
+    if kind and not beam:
+        beam = f", beside {kind}"
+    if len(told.visible_modes) < _SEVERAL:
+        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
+    else:
+        said = [
+            f"{_DAMPING[free.name]}{beam}. Numbers are those of type {told.name}, all orders free."
+        ]
+        excluded = told.with_status("excluded")
+        if told.explained and excluded:
+            said.append(f"Excluded: {_types(excluded)}.")
+        if told.simpler is not None and told.simpler.fixed:
+            said.append(_condition(told.simpler))
+    said += [order(each) for each in orders]
+    if told.explained:
+        said.append(
+            "The residual is noise; no unmodelled effect found."
+            if alone
+            else "The residual is noise, but another model fits the record equally well."
+        )
+    return said
+
+
+def order(verdict: OrderVerdict) -> str:
+    """Say what is known of one order.
+
+    Parameters
+    ----------
+    verdict : OrderVerdict
+    """
+    profile = verdict.profile
+    low, high = profile.interval
+    name, of = verdict.order, _OF[verdict.order]
+    value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
+    if verdict.status == "absent":
+        return f"No {of} was found, so its order {name} has no meaning."
+    if verdict.status == "not identifiable":
+        return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
+    if verdict.reason is not None:
+        return (
+            f"The order {name} of the {of} is not established: {value} fits, but {verdict.reason}. "
+            "Do not interpret it."
+        )
+    if verdict.status == "compatible":
+        return f"The order {name} of the {of} is {value}, consistent with 1."
+    if verdict.status == "fractional":
+        return f"The order {name} of the {of} is {value}; 1 is excluded."
+    return (
+        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (p = "
+        f"{math.erfc(math.sqrt(deviance_of_one(profile) / 2)):.1g})."
+    )
+
+
+def _types(names: tuple[str, ...]) -> str:
+    """List structures, those of a uniform beam first."""
+    plain = sorted(name for name in names if "," not in name)
+    others: dict[str, list[str]] = {}
+    for name in sorted(set(names) - set(plain)):
+        structure, beam = name.split(", ", 1)
+        others.setdefault(beam, []).append(structure)
+    groups = [_listed(plain)] if plain else []
+    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
+    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _condition(simpler: Simpler) -> str:
+    """Say what a simpler structure would give."""
+    taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
+    numbers = [
+        f"{name} = {_with_interval(simpler.parameters[name])}"
+        for name in ("zeta", "alpha", "gamma", "lambda")
+        if name in simpler.parameters
+    ]
+    return (
+        f"{taken[0].upper()}{taken[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not excluded; "
+        f"if true (type {simpler.name}): {', '.join(numbers)}."
+    )
+
+
+def _with_interval(quantity: Quantity) -> str:
+    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
+    if quantity.interval_95 is None or not quantity.std:
+        return f"{quantity.value:.4g}"
+    low, high = quantity.interval_95
+    power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
+    scale = 10.0**power if power < -2 else 1.0
+    digits = decimals(quantity.std / scale)
+    exponent = f"e{power}" if power < -2 else ""
+    return (
+        f"{quantity.value / scale:.{digits}f}{exponent} "
+        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
+    )
+
+
+def _why_not(verdict: OrderVerdict) -> str:
+    profile = verdict.profile
+    low, high = profile.interval
+    if verdict.reason is not None and (profile.identifiable or not profile.walked):
+        return verdict.reason
+    if len(profile.valleys) > 1:
+        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
+        return (
+            f"{equal} fit the record equally well, each with a different damping (95 %: {low:.3f} "
+            f"to {high:.3f}, with all that lies between)"
+        )
+    return (
+        "any value between 0 and 2 fits"
+        if profile.open_below and profile.open_above
+        else f"anything below {high:.2f} fits"
+        if profile.open_below
+        else f"anything above {low:.2f} fits"
+        if profile.open_above
+        else f"anything from {low:.2f} to {high:.2f} fits"
+    )
+
+
+# Advice on experiments
+
+_ENOUGH: Final = 2
+_SECOND: Final = 6.267
+"""Frequency of the second mode of a uniform beam over that of the first."""
+
+_ORDINALS: Final = {1: "first", 2: "second"}
+
+
+def experiments(
+    field: CandidateSet,
+    orders: tuple[OrderVerdict, ...],
+    visible: tuple[int, ...],
+    found: tuple[Finding, ...],
+    close: tuple[Candidate, ...],
+) -> list[str]:
+    """Say what would tell more, beside the findings' remedies."""
+    advice = []
+    unknown = [o for o in orders if o.status == "not identifiable"]
+    if unknown:
+        names = " and ".join(o.order for o in unknown)
+        if len(visible) < _ENOUGH:
+            advice.append(f"To determine {names}, {_for_two_modes(field, visible)}")
+        else:
+            advice.append(
+                f"To determine {names}, run narrow, slow sweeps around the modes, or a wider sweep "
+                "that reaches one more mode."
+            )
+    unexplained = any(finding.kind == "unexplained" for finding in found)
+    if close or (not unexplained and any(o.status == "open" for o in orders)):
+        advice.append(
+            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
+        )
+    return advice
+
+
+def _for_two_modes(field: CandidateSet, visible: tuple[int, ...]) -> str:
+    """Say how both of the first two modes would show."""
+    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
+    first_hz = modes.get(1, 0.0)
+    at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}
+    missing = next(number for number in (1, 2) if number not in visible)
+    other = 3 - missing
+    last_hz = float(field.comparison.frequency_hz[-1])
+    if at_hz[missing] > last_hz:
+        return (
+            f"analyse and excite the {_ORDINALS[missing]} mode as well: band and sweep up to at "
+            f"least {1.3 * at_hz[missing]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
+        )
+    if not driven(field.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
+        return f"excite the {_ORDINALS[missing]} mode as well: sweep " + (
+            f"up to at least {1.3 * at_hz[2]:.0f} Hz."
+            if missing == 2
+            else f"from below {0.7 * at_hz[1]:.1f} Hz."
+        )
+    return (
+        f"raise the {_ORDINALS[missing]} mode above the noise: it was driven at its "
+        f"{at_hz[missing]:.1f} Hz, so increase the amplitude (twice), sweep slower or repeat; a "
+        "wider band does not help."
+    )
