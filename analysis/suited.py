@@ -20,6 +20,7 @@ _NO_SWEEP: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
     "multisine": "a multisine excites single lines, and segments spread noise between them",
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
+    "until": "a search excites little beside the modes, and the response between them is noise",
 }
 """Excitation → why Welch's method does not suit it."""
 

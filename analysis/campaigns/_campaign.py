@@ -254,11 +254,15 @@ def _of_one_experiment(
 def _alike_by_welch(
     sessions: list[SessionResult], failures: list[SessionFailure]
 ) -> tuple[list[SessionResult], list[SessionFailure]]:
-    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without."""
+    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without.
+
+    A search is never set aside: its record tells as much as any.
+    """
     without = [each for each in sessions if not each.frequency_hz.size]
     if not without:
         return sessions, failures
-    if 2 * len(without) >= len(sessions):
+    searched = any(each.experiment.searched for each in without)
+    if searched or 2 * len(without) >= len(sessions):
         return [each.without_welch() for each in sessions], failures
     odd = [
         SessionFailure(

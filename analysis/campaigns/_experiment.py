@@ -62,6 +62,9 @@ LABEL: Final = "specimen"
 
 _OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
                        "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
+_SEARCH: Final = "until"
+"""Excitation that was planned while it ran: each is another one."""
+
 _WHOLE: Final = 0.99
 """Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
 
@@ -126,6 +129,11 @@ class Experiment:
         """What the file calls the specimen; empty if nothing."""
         return str(self.facts.get(LABEL, ""))
 
+    @property
+    def searched(self) -> bool:
+        """Whether the session planned its own excitation, which agrees with any other."""
+        return self.facts.get("excitation") == _SEARCH
+
     def unfinished(self, outcome: str) -> str:
         """Say that the sweep ended early, as the end of a sentence; empty if it did not."""
         planned_s = self.facts.get("duration_s")
@@ -138,8 +146,9 @@ class Experiment:
 
     def difference(self, other: Experiment) -> str | None:
         """Name the first fact in which another one differs, None if it is the same experiment."""
+        planned = self.searched or other.searched
         for key, mine in self.facts.items():
-            theirs = other.facts.get(key, mine)
+            theirs = mine if planned and key in _STATED else other.facts.get(key, mine)
             if not _same(theirs, mine):
                 return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
         return None
@@ -225,9 +234,15 @@ def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
 
 
 def most_common(experiments: Sequence[Experiment]) -> int:
-    """Return the place of the one with which most others agree, the first of several."""
-    agree = [sum(one.difference(two) is None for two in experiments) for one in experiments]
-    return agree.index(max(agree))
+    """Return the place of the one with which most others agree, the first of several.
+
+    A search agrees with any excitation, so it says of none that it is the common one.
+    """
+    places = [i for i, each in enumerate(experiments) if not each.searched]
+    return max(
+        places or range(len(experiments)),
+        key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
+    )
 
 
 def _same(one: str | float, two: str | float) -> bool:

@@ -42,6 +42,18 @@ def test_what_differs_is_named(chirps, facts, words):
     assert words is None or words in failures[0].message
 
 
+def test_a_search_belongs_to_any_excitation_and_does_not_bring_two_together(chirps):
+    search = {"excitation": "until", "amplitude_rad": 0.035, "start_hz": 0.5}
+    searches = [chirps(f"until{n}.mcap", **search) for n in range(3)]
+    small = chirps("small.mcap", amplitude_rad=0.0125)
+    kept, left_out = _of_one_experiment([*searches, chirps("chirp.mcap"), small])
+    assert [each.path.name for each in kept] == [*(s.path.name for s in searches), "chirp.mcap"]
+    assert "amplitude_rad is 0.0125 rad, but 0.025 rad in chirp.mcap" in left_out[0].message
+    assert _of_one_experiment(searches)[1] == []
+    other = chirps("other.mcap", beam_length_m=0.8, **search)
+    assert "beam_length_m is 0.8 m" in _of_one_experiment([*searches, other])[1][0].message
+
+
 def test_another_experiment_is_the_reason_where_the_analysis_failed_too(chirps, make_experiment):
     """A hold is too short for a Welch segment, but that is not why it does not belong here."""
     hold = SessionFailure(

@@ -80,6 +80,18 @@ def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_se
     assert [each.frequency_hz.size for each in both] == [0, 0]
 
 
+def test_a_search_beside_chirps_counts_and_all_do_without(make_session, make_experiment):
+    chirps = [make_session(f"{number}.mcap") for number in range(3)]
+    search = replace(
+        chirps[0].without_welch(),
+        path=Path("until.mcap"),
+        experiment=make_experiment("until.mcap", excitation="until"),
+    )
+    kept, none = _of_one_experiment([*chirps, search])
+    assert none == []
+    assert [each.frequency_hz.size for each in kept] == [0, 0, 0, 0]
+
+
 def test_a_session_with_a_wrong_unit_is_set_aside(make_file, tmp_path, settings):
     """Its file states a beam 57.3 times too light and too soft."""
     beam = {
