@@ -348,11 +348,8 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
     records = round(1 / (1 - share))
-    weights = np.full(records, 1 / records)
-    if kind == "triangle":
-        weights = np.convolve(weights, weights)
-    spacing_s = 2 * delay_s / max(weights.size - 1, 1)
-    return SensorFilter(corner_hz, order, tuple(weights.tolist()), spacing_s)
+    spacing_s = share / rate_hz / max(records - 1, 1)
+    return SensorFilter.of_records(corner_hz, order, kind, records, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:

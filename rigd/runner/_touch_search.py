@@ -36,7 +36,7 @@ _STEP_STD: Final = 1 / sqrt(12)
 _READY_PATIENCE_S: Final = 20.0
 """Time for the estimator to prepare on a busy computer; nothing moves yet."""
 _LAST_PATIENCE_S: Final = 30.0
-"""Time for the last estimate after the end of a record."""
+"""Time for the last estimate after the end of a record; a slow computer takes a minute."""
 _POLL_S: Final = 0.05
 
 
@@ -95,7 +95,8 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     serial = rig.ati_serial
     if serial is None:
         return SensorFilter(*low_pass)
-    return SensorFilter(*low_pass, serial.weights(rig.rate_hz), 1 / serial.stream_hz)
+    records = serial.records_per_tick(rig.rate_hz)
+    return SensorFilter.of_records(*low_pass, serial.filter, records, 1 / serial.stream_hz)
 
 
 def _noise(profile: Profile) -> "Noise":

@@ -121,13 +121,22 @@ class TouchEstimator:
             Whether the likelihood of all places is wanted; without it, it is empty.
         """
         told = None
+        searched = record.angle_rad.size
         for noticed in _NOTICED_S:
             if record.detected - round(noticed * self._rate_hz) < _LEAST_QUIET:
                 break
-            told = _Estimation(self._tables, record, noticed)
-            if not told.begins_too_late:
+            here = _Estimation(self._tables, record, noticed)
+            last = noticed == _NOTICED_S[-1]
+            # After one in which nothing explains the touch, only if it may have been before that.
+            if (here.begins_too_late and not last) or here.seems_to_begin >= searched:
+                continue
+            found = here.told(scan=scan)
+            if told is None or found.explained:
+                told = found
+            if found.explained:
                 break
-        return self._untold(record) if told is None else told.told(scan=scan)
+            searched = here.begin + here.quiet
+        return told or self._untold(record)
 
     def _untold(self, record: TouchRecord) -> TouchEstimate:
         """Too few samples before the touch."""
@@ -228,6 +237,12 @@ class _Estimation:
     def begins_too_late(self) -> bool:
         """Whether the touch seems to be before the samples that may hold it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
+
+    @property
+    def seems_to_begin(self) -> int:
+        """Sample of the record before which the likeliest touch of the first look begins."""
+        after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
+        return self.begin + self.quiet + round(after_s * self.rate)
 
     def told(self, *, scan: bool) -> TouchEstimate:
         """Return what the touch was."""
@@ -520,7 +535,7 @@ class _Estimation:
             history, instants, force_n = self._forces(best, window)
             if kind == "rigid":
                 stiffness = _stiffness(rest.posterior)
-        elif self.blind.chi2 < self._most(self.blind.degrees):
+        elif self.blind.chi2 < self._most(self.blind.degrees) and not self.begins_too_late:
             x_m = self._roughly()
         return TouchEstimate(
             x_m=x_m,

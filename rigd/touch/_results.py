@@ -60,6 +60,11 @@ class TouchEstimate:
     force_times_s: Real
     """Its instants, shape (k,)."""
 
+    @property
+    def explained(self) -> bool:
+        """Whether some obstacle or knock leaves nothing but noise."""
+        return self.time_s is not None
+
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
         """Return it as a document of JSON types.
 

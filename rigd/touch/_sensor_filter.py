@@ -33,6 +33,28 @@ class SensorFilter:
     spacing_s: float = 0.0
     """Time between two records."""
 
+    @classmethod
+    def of_records(
+        cls, corner_hz: float, order: int, kind: str, records: int, spacing_s: float
+    ) -> "SensorFilter":
+        """Return the filter of a sensor that makes several records a tick.
+
+        Parameters
+        ----------
+        corner_hz, order
+            Its low-pass filter.
+        kind
+            What makes a sample of the records: their "mean" over a tick, or a "triangle" over two.
+        records
+            Records a tick.
+        spacing_s
+            Time between two records.
+        """
+        weights = np.full(records, 1 / records)
+        if kind == "triangle":
+            weights = np.convolve(weights, weights)
+        return cls(corner_hz, order, tuple(weights.tolist()), spacing_s)
+
     @property
     def weights_delay_s(self) -> float:
         """Group delay of the weights, which is part of the stated age of a sample."""

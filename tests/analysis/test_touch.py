@@ -99,6 +99,8 @@ def test_filters_of_the_sensor_are_those_of_its_profile(profile, kind, touch_fil
             "sensor_filter_delay_s": repr(serial.filter_delay_s(rig.rate_hz)),
         }
     stated = _sensor_filter(replace(rig, sensor=sensor, ati_serial=serial))
+    if serial is not None:
+        assert stated.weights == pytest.approx(serial.weights(rig.rate_hz), rel=1e-12)
     path = touch_file.write(tmp_path / "a.mcap", length=20, metadata=metadata)
     read = sensor_filter_of(read_session(path), rig.rate_hz)
     s = 2j * np.pi * np.array([1.0, 100.0, 400.0])

@@ -1,0 +1,160 @@
+"""Touches in sessions, with the model that one session of the same rig told.
+
+Each simulated rig has a beam whose density and stiffness differ from the profile's by up to a
+tenth. One ``rigd run until --damping 1%`` and ``analyze`` tell its model; then ``rigd run touch``
+meets obstacles at places of 0.05 to 0.97 m, of 100 to 100 000 N/m, at speeds of 0.3 to 2 rad/s, all
+as an operator types it, in fast mode. What is said of each touch is compared with the truth.
+
+    python benchmarks/bench_touch_sessions.py --touches 60 --rigs 6 --jsonl results.jsonl
+    python benchmarks/bench_touch_sessions.py --table results.jsonl
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_until import Rig, profile_of
+
+BIN = Path(sys.executable).parent
+NOISE_NM = 5e-3
+"""As in the profile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """A slew, and what it meets."""
+
+    x_m: float
+    angle_rad: float
+    stiffness_n_per_m: float
+    speed_rad_s: float
+
+
+def draw_rig(number: int, noise: float) -> Rig:
+    """Draw a beam near the profile's."""
+    rng = np.random.default_rng([2, number])
+    density, stiffness = 1 + 0.1 * rng.uniform(-1, 1, 2)
+    return Rig(number + 1, "VI", density, stiffness, 7.1e-5, 0.996, 5.5e-2, 0.594, noise * NOISE_NM)
+
+
+def draw_meeting(rig: int, number: int) -> Meeting:
+    """Draw an obstacle at rest, met in the middle of a slew."""
+    rng = np.random.default_rng([3, rig, number])
+    speed = rng.uniform(0.3, 2.0)
+    return Meeting(
+        x_m=round(rng.uniform(0.05, 0.97), 4),
+        angle_rad=round(speed * rng.uniform(0.38, 0.55), 4),
+        stiffness_n_per_m=round(float(np.exp(rng.uniform(np.log(1e2), np.log(1e5)))), 1),
+        speed_rad_s=round(speed, 4),
+    )
+
+
+def said(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder, with its own runtime folder."""
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(folder), "RIGD_NO_LOOK": "1"}
+    command = [str(BIN / arguments[0]), *arguments[1:]]
+    return subprocess.run(
+        command, capture_output=True, text=True, env=environment, cwd=folder, check=False
+    )
+
+
+def model_of(profile: Path, folder: Path) -> Path:
+    """Identify a rig by one session."""
+    until = ["--fast", "--damping", "1%", "--profile", str(profile), "--output", "told"]
+    said(folder, "rigd", "run", "until", *until)
+    [file] = (folder / "told").glob("*.mcap")
+    path = folder / "model.json"
+    analysis = ["--method", "record", "--json", str(path), "--report", str(folder / "report")]
+    done = said(folder, "analyze", str(file), *analysis)
+    assert path.exists(), done.stderr
+    return path
+
+
+def meet(rig: Rig, number: int, profile: Path, model: Path, folder: Path) -> dict[str, Any]:
+    """Run one touch, and return what came of it."""
+    meeting = draw_meeting(rig.number, number)
+    obstacle = f"x={meeting.x_m},angle={meeting.angle_rad},stiffness={meeting.stiffness_n_per_m}"
+    done = said(
+        folder, "rigd", "run", "touch", str(round(meeting.angle_rad + 0.4, 4)),
+        "--speed", str(meeting.speed_rad_s), "--fast", "--json", "--model", str(model),
+        "--seed", str(1000 * rig.number + number), "--profile", str(profile),
+        "--obstacle", obstacle, "--output", "touches",
+    )  # fmt: skip
+    result = {"rig": rig.number, "noise_nm": rig.noise_nm, **asdict(meeting)}
+    try:
+        [session] = json.loads(done.stdout)["sessions"]
+    except (ValueError, KeyError):
+        return {**result, "failed": done.stderr[-2000:]}
+    return {**result, "outcome": session["outcome"], "touches": session["touches"]}
+
+
+def table(results: list[dict[str, Any]]) -> Iterator[str]:
+    """Write errors, coverage and kinds, at all places and between 0.1 and 0.95 m."""
+    failed = [each for each in results if "failed" in each]
+    missed = [each for each in results if "failed" not in each and not each["touches"]]
+    told = [each for each in results if each.get("touches")]
+    yield f"{len(results)} touches: {len(failed)} failed, {len(missed)} not detected"
+    rows, kinds = [], Counter[str]()
+    for each in told:
+        first = each["touches"][0]
+        kinds[first.get("kind", "not told")] += 1
+        place = first.get("x_m")
+        if place is None or place["std"] is None:
+            continue
+        low, high = place["interval_95"]
+        error = place["value"] - each["x_m"]
+        rows.append((each["x_m"], error, place["std"], low <= each["x_m"] <= high))
+    found = np.array(rows)
+    inner = (found[:, 0] > 0.1) & (found[:, 0] < 0.95)
+    for name, chosen in (("0.05 to 0.97 m", found), ("0.1 to 0.95 m", found[inner])):
+        error_mm = 1e3 * np.abs(chosen[:, 1])
+        beyond = np.abs(chosen[:, 1]) > 4 * chosen[:, 2]
+        yield (
+            f"{name}: {len(chosen)}, median {np.median(error_mm):.2f} mm, rms "
+            f"{np.sqrt(np.mean(error_mm**2)):.2f}, 90 % {np.percentile(error_mm, 90):.2f}, largest "
+            f"{error_mm.max():.1f}; within the 95 % interval {chosen[:, 3].mean():.1%}, beyond 4 "
+            f"std {beyond.mean():.1%}"
+        )
+    yield f"kinds: {dict(kinds)}"
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--touches", type=int, default=10, help="with each rig")
+    parser.add_argument("--rigs", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="number of the first rig")
+    parser.add_argument("--noise", type=float, default=1.0, help="times that of the profile")
+    parser.add_argument("--jsonl", type=Path, help="where each result is added")
+    parser.add_argument("--table", type=Path, help="show what is there, run nothing")
+    given = parser.parse_args()
+    results = []
+    if given.table:
+        results = [json.loads(line) for line in given.table.read_text("utf-8").splitlines()]
+    else:
+        for i in range(given.first, given.first + given.rigs):
+            rig = draw_rig(i, given.noise)
+            with tempfile.TemporaryDirectory() as name:
+                folder = Path(name)
+                profile = profile_of(rig, folder)
+                model = model_of(profile, folder)
+                for number in range(given.touches):
+                    result = meet(rig, number, profile, model, folder)
+                    results.append(result)
+                    if given.jsonl:
+                        with given.jsonl.open("a", encoding="utf-8") as file:
+                            file.write(json.dumps(result) + "\n")
+    print("\n".join(table(results)))
+
+
+if __name__ == "__main__":
+    main()
