@@ -7,7 +7,7 @@ from rigd.profile import load_profile
 
 
 @pytest.fixture(autouse=True)
-def _no_simulator(tmp_path, monkeypatch):
+def _no_simulator(tmp_path, monkeypatch, patient_drives):
     """A simulated rig that somebody runs here must not be found."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 

@@ -12,6 +12,11 @@ from rigd.profile import load_profile
 HARDWARE = "RIGD_HARDWARE"
 
 
+@pytest.fixture(autouse=True)
+def _patient(patient_drives):
+    pass
+
+
 @pytest.fixture(params=["direct", "can", further("serial"), further("previous_tick"), "hardware"])
 def devices(request, start_simulator, monkeypatch):
     """Drive and sensor: simulated directly, through the wire in lock-step, or the real ones."""

@@ -6,6 +6,7 @@ An object's type is taken from the drive's EDS file where the profile names one,
 """
 
 import logging
+import queue
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,6 +24,7 @@ from canopen.objectdictionary import (
     datatypes,
 )
 from canopen.sdo.base import SdoVariable
+from canopen.sdo.client import SdoClient
 
 from rigd.devices import DeviceError, EdsError, read_eds
 from rigd.devices.canbus import CanPort
@@ -39,6 +41,8 @@ _SDO_TRIES = 2
 _HURRIED_TIMEOUT_S = 0.05
 _LATE_REPLIES = 3
 """Number of replies to earlier, abandoned requests that may come instead of the awaited one."""
+_QUIET_S = 0.25
+"""So long nothing comes once all replies to abandoned requests have."""
 _TIMED_OUT = "No SDO response"
 """Beginning of canopen's message if no reply came; any other message means a wrong reply."""
 _RECEIVER_POLL_S = 0.02
@@ -287,7 +291,7 @@ class SdoAccess:
         variable = SdoVariable(self._node.sdo, self._variable(index, sub))
         what = "reading" if value is None else f"writing {show_value(value)} to"
         try:
-            return _ask(variable, value)
+            return _ask(self._node.sdo, variable, value)
         except canopen.SdoAbortedError as error:
             remedy = (
                 " Name the drive's EDS file in the profile (cia402.eds), which has its types."
@@ -330,7 +334,7 @@ class SdoAccess:
         return f"object {place}" + (f" ({name})" if name else "")
 
 
-def _ask(variable: SdoVariable, value: int | None) -> object:
+def _ask(client: SdoClient, variable: SdoVariable, value: int | None) -> object:
     """Write a value or read one, past replies to requests that were given up before."""
     for left in reversed(range(_LATE_REPLIES + 1)):
         try:
@@ -341,7 +345,17 @@ def _ask(variable: SdoVariable, value: int | None) -> object:
         except canopen.SdoCommunicationError as error:
             if not left or str(error).startswith(_TIMED_OUT):
                 raise
+            # That to this request is still to come: it would be taken for that to the next one.
+            _let_pass(client)
     raise AssertionError
+
+
+def _let_pass(client: SdoClient) -> None:
+    """Take replies until no more come."""
+    patience_s = min(_QUIET_S, client.RESPONSE_TIMEOUT)
+    with suppress(queue.Empty):
+        while True:
+            client.responses.get(timeout=patience_s)
 
 
 def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:

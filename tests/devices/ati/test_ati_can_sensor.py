@@ -162,9 +162,9 @@ def test_a_reply_that_comes_twice_is_not_taken_for_that_to_the_next_request(
     fakes, can_rig, monkeypatch
 ):
     """One that is late is asked for again, and then two are on their way."""
-    monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.25)
     bench = Bench(fakes, can_rig, fakes.LateBus)
-    bench.bus.late_s = {(2, b"\0"): [0.07, 0.07]}
+    bench.bus.late_s = {(2, b"\0"): [0.35, 0.35]}
     bench.sensor.connect()
     assert bench.fake.asked.count((2, b"\0")) == 3
     assert bench.sensor.calibration()["matrix"] == [list(row) for row in fakes.MATRIX]

@@ -20,7 +20,7 @@ from rigd.devices.cia402._drive import Cia402Drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Acquisition, CanBus
 
-RATE_HZ = 100.0
+RATE_HZ = 50.0
 
 
 class SlcanAdapter:
@@ -101,7 +101,7 @@ def behind_adapter(adapter, rig, settings):
         rig,
         rate_hz=RATE_HZ,
         can=CanBus("slcan", adapter.port, 1_000_000),
-        acquisition=Acquisition("same_tick", 8000.0),
+        acquisition=Acquisition("same_tick", 16000.0),
         cia402=slow,
     )
     made = Cia402Drive(rig, CanLink(rig.can, None))

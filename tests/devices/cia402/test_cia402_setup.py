@@ -394,6 +394,20 @@ def test_replies_that_come_late_are_not_taken_for_the_next_ones(drive, scripted,
     assert scripted.objects[0x6072, 0] == 1800
 
 
+def test_a_drive_that_answers_slowly_after_a_reply_that_came_late(drive, scripted):
+    """Each reply would be taken for that to the next request, as long as that waits for one."""
+    answer, heard = scripted._sdo, []
+
+    def slow(data):
+        heard.append(data)
+        time.sleep(0.12 if len(heard) == 1 else 0.01)  # the first is given up after 50 ms
+        answer(data)
+
+    scripted._sdo = slow
+    drive.connect()
+    assert scripted.objects[0x6072, 0] == 1800
+
+
 def test_a_drive_with_its_sto_open_is_not_said_to_be_ready(drive, scripted):
     scripted.state = "switch-on disabled, no supply"
     with pytest.raises(DeviceError) as caught:
