@@ -506,7 +506,10 @@ class SessionSequence:
         return None
 
     def _look(self) -> SessionEnd | None:
-        """Give this process's heartbeat and readings; check whether the others give theirs."""
+        """Give this process's heartbeat and readings; check limits, supervisor and its stop.
+
+        The supervisor asks for a stop when the recorder has died (`rigd.runner`).
+        """
         self._show()
         violation = self._cycle.look(
             self._metronome.due_ns,
