@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.runtime import end_with, give_way, ignore, killed_first, use_one_thread
+from rigd.runtime import begin_background, give_way, ignore
 from rigd.session import EstimateRequest, Session, SessionError, read_frames, read_start
 
 if TYPE_CHECKING:
@@ -161,6 +161,9 @@ class OnlineEstimate:
             for mode, shown in zip(content["modes"], told.modes, strict=True):
                 mode["shown"] = shown.shown
             content |= {
+                "uniform_beam": not (
+                    told.fit.plant.stiffness_offsets or "tip_mass_kg" in told.fit.parameters
+                ),
                 "predicting": fit.structure.name,
                 "plant": asdict(fit.plant),
                 "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
@@ -415,12 +418,7 @@ def main() -> None:
     # Ctrl-C stops the session safely; this ends with the stream.
     ignore()
     parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
-    parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    asked = parser.parse_args()
-    if asked.parent is not None:
-        end_with(asked.parent)
-    killed_first()
-    use_one_thread()
+    begin_background(parser)
     try:
         # Not `sys.stdin`: the interpreter would wait at its end for who reads from that, and abort.
         stream = open(0, "rb", closefd=False)  # noqa: SIM115

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library import change_between
-from rigd.runtime import end_with, give_way, killed_first, raise_on, use_one_thread
+from rigd.runtime import begin_background, give_way, raise_on
 from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_line, read_look
 from rigd.units import decimals
 
@@ -415,13 +415,8 @@ def main() -> None:
     parser.add_argument(
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
-    parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    asked = parser.parse_args()
-    if asked.parent is not None:
-        end_with(asked.parent)
-    killed_first()
+    asked = begin_background(parser)
     give_way()
-    use_one_thread()
     try:
         document = look_at(asked.file, asked.last)
         write_look(document, asked.file)

@@ -14,9 +14,8 @@ from typer.core import TyperGroup
 import rigd
 from rigd.cli.check import bench, check, reset
 from rigd.cli.daemon import serve, status, stop, tare, zero
-from rigd.cli.files import info, recover
 from rigd.cli.identify import identify_app
-from rigd.cli.library import list_sessions, specimens
+from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
 from rigd.cli.profiles import profiles_app

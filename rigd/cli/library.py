@@ -1,4 +1,4 @@
-"""``rigd list`` and ``rigd specimens``: recorded sessions, the trend of a specimen, specimens."""
+"""``rigd list``, ``specimens``, ``info`` and ``recover``: recorded sessions and their specimens."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from rigd.cli.options import EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
+from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
 from rigd.printable import printable
 from rigd.units import with_half_width
 
@@ -243,3 +243,76 @@ def _relative(change: "Change | None", first: float) -> str:
         return ""
     percent = 100 * change.difference / first
     return f"{percent:+.2g} %{' *' if change.significant else ''}"
+
+
+# Single files
+
+
+def info(
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", readable=False, help="Session files.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Show the contents of session files.
+
+    Example: rigd info sessions/20261120-101500-chirp.mcap
+    """
+    from rigd.session import SessionError, describe
+
+    documents: list[dict[str, Any]] = []
+    failed = False
+    for number, path in enumerate(paths):
+        try:
+            found = describe(path)
+        except SessionError as error:
+            failed = True
+            typer.echo(f"Error: {error}", err=True)
+            documents.append({"path": str(path), "error": str(error)})
+        else:
+            documents.append(found.as_dict())
+            if not as_json:
+                typer.echo(("\n" if number else "") + "\n".join(found.lines()))
+    if as_json and not (failed and len(paths) == 1):
+        typer.echo(json.dumps(documents[0] if len(paths) == 1 else {"files": documents}))
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def recover(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", readable=False, help="Incomplete .mcap.part or damaged .mcap files."
+        ),
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Recover the intact part of incomplete or damaged session files.
+
+    Writes X.mcap beside X.mcap.part, and X.recovered.mcap beside a damaged X.mcap: every sample up
+    to the damage, marked as recovered. Nothing is overwritten or removed.
+
+    Example: rigd recover sessions/20261120-101500-chirp.mcap.part
+    """
+    from rigd.session import SessionError
+    from rigd.session import recover as recover_file
+
+    documents: list[dict[str, Any]] = []
+    failed = False
+    for path in paths:
+        try:
+            with progress(path.name) as on_progress:
+                recovery = recover_file(path, on_progress)
+        except SessionError as error:
+            failed = True
+            typer.echo(f"Error: {error}", err=True)
+            documents.append({"source": str(path), "path": None, "error": str(error)})
+        else:
+            documents.append(recovery.as_dict())
+            if not as_json:
+                typer.echo("\n".join(recovery.lines()))
+    if as_json:
+        typer.echo(json.dumps({"files": documents}))
+    if failed:
+        raise typer.Exit(EXIT_FAILED)

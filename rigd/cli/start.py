@@ -219,6 +219,8 @@ def _follow(
                         if event["repeat"] > 1
                         else "",
                     )
+                case "message" if "session" in event:
+                    pass  # how a session ended: the event of that name tells more
                 case "message" if event["level"] != "info":
                     line.say(f"{event['level'].capitalize()}: {event['text']}")
                 case "message" if event.get("notable") or event["text"].startswith("Live view"):

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
@@ -47,6 +47,11 @@ class ServedSeries:
     failed: bool = False
     """Something went wrong: the sessions are fewer, or not what was asked for."""
 
+    @property
+    def words(self) -> str:
+        """What runs, for the operator."""
+        return _WORDS.get(self.request.excitation, self.request.excitation)
+
     def as_document(self) -> Document:
         """Tell what it is and how far it came."""
         return {
@@ -77,10 +82,22 @@ class ServedSeries:
         if fault:
             return State.FAULT, fault
         if self.stop.requested:
-            return State.READY, f"{self.request.excitation} was stopped"
+            return State.READY, f"{self.words} was stopped"
         if self.reason:
             return State.READY, self.reason
-        return State.READY, f"{self.request.excitation} is complete"
+        return State.READY, f"{self.words} is complete"
+
+
+_WORDS: Final = {
+    "file": "session from a file",
+    "modes": "session of narrow sweeps",
+    "touch": "search for an obstacle",
+    "until": "search for a precision",
+}
+"""Excitations whose name is no word for what runs."""
+
+_LEVELS: Final = {"complete": "info", "stopped": "warning"}
+"""Levels of events that tell how a session ended."""
 
 
 class SeriesTeller:
@@ -128,7 +145,9 @@ class SeriesTeller:
             line,
         )
         # For lists of events, in the words of the terminal.
-        self._publish({"event": "message", "level": "info", "text": line})
+        level = _LEVELS.get(result.outcome, "error")
+        message = {"level": level, "text": line, "session": series.session}
+        self._publish({"event": "message", **message})
         document = result.as_dict() | fit
         self._publish({"event": "session", "number": series.session, **document})
 

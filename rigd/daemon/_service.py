@@ -451,7 +451,7 @@ class Service:
             _log.warning("series %d: %s", series.number, warning)
         series.planned = planned
         times = f", {request.repeat} sessions" if request.repeat > 1 else ""
-        self._states.move(State.RUNNING, f"{request.excitation} was started{times}")
+        self._states.move(State.RUNNING, f"{series.words} was started{times}")
         self._task = asyncio.create_task(self._follow(series, planned))
         return {"series": series.number, "plan": planned.plan_document()}
 

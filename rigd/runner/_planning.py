@@ -110,6 +110,7 @@ class LoopPreview:
     def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
         self._profile = profile
         self.start_rad = start_rad
+        self._estimated: tuple[Beam, Damping, MovePlant] | None = None
 
     @property
     def beam(self) -> Beam:
@@ -170,7 +171,8 @@ class LoopPreview:
         """Return the rig with an estimated beam, for the design of excitation.
 
         Where the loop cannot be computed with its damping, that of the profile is taken: the motor
-        hardly moves otherwise for it, since the coupling torque is fed forward.
+        hardly moves otherwise for it, since the coupling torque is fed forward. The last one is
+        kept: a decision asks for it several times.
 
         Parameters
         ----------
@@ -184,10 +186,14 @@ class LoopPreview:
         RealisationError
             If no damping can be realised.
         """
+        if self._estimated is not None and self._estimated[:2] == (beam, damping):
+            return self._estimated[2]
         try:
-            return self._plant_with(beam, damping, _UNSURE)
+            plant = self._plant_with(beam, damping, _UNSURE)
         except (ControlDesignError, RealisationError):
-            return self._plant_with(beam, self._profile.rig.damping, _UNSURE)
+            plant = self._plant_with(beam, self._profile.rig.damping, _UNSURE)
+        self._estimated = beam, damping, plant
+        return plant
 
     def _plant_with(self, beam: Beam, damping: Damping, uncertainty: float) -> MovePlant:
         profile = self._profile

@@ -41,7 +41,6 @@ _HOPELESS: Final = 2.0
 """Forecast over the time that is left from which on a search is out of reach."""
 _SAID: Final = 3
 """Decisions in a row that have to find so before the search is given up."""
-_NOT_UNIFORM: Final = ("modes free", "tip mass")
 _NOT_SEEN: Final = "not visible yet"
 _DOUBTED: Final = 4
 """Fits of all structures in a row of which no number is to be believed, before it is given up."""
@@ -62,8 +61,10 @@ _OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 class Stated:
     """One quantity that is asked for, as a fit states it."""
 
-    name: str
-    """The quantity, for the operator."""
+    quantity: str
+    """One of `rigd.excitation.QUANTITIES`."""
+    mode: int | None
+    """Its mode, from 1 on; None: it is none of a mode, or no mode was found."""
     value: float | None
     """None: there is none."""
     std: float
@@ -72,8 +73,13 @@ class Stated:
     """The standard deviation that is asked for, in the same unit."""
     doubt: str = ""
     """Why the value is not to be believed; empty if it is."""
-    mode: int | None = None
-    """Its mode, from 1 on."""
+
+    @property
+    def name(self) -> str:
+        """The quantity, for the operator."""
+        if self.quantity not in _OF_MODES:
+            return self.quantity
+        return f"{self.quantity} of {'any mode' if self.mode is None else f'mode {self.mode}'}"
 
     @property
     def ratio(self) -> float:
@@ -103,39 +109,37 @@ def between_modes(document: Mapping[str, Any]) -> str:
     Parameters
     ----------
     document
-        Answer of the fit program.
+        Answer of the fit program, which has a fit.
     """
-    kind = document.get("type") or ""
-    if not any(other in kind for other in _NOT_UNIFORM):
+    if document["uniform_beam"]:
         return ""
+    kind = document["type"]
     return f"the beam is not uniform (type {kind}), of which narrow bands tell too little"
 
 
 def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
     key = _OF_MODES.get(target.quantity)
     if key is None:
-        yield _read(target, target.name, document.get("parameters", {}).get(target.quantity))
+        yield _read(target, document.get("parameters", {}).get(target.quantity))
         return
     # A fit tells of modes above its band as well, which no piece drives.
     inside = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
     modes = [m for m in inside if target.mode in (None, m["mode"])]
     for mode in modes:
-        number = int(mode["mode"])
-        found = replace(
-            _read(target, f"{target.quantity} of mode {number}", mode[key]), mode=number
-        )
+        found = _read(replace(target, mode=int(mode["mode"])), mode[key])
         yield found if mode["shown"] else replace(found, std=inf, doubt=_NOT_SEEN)
     if not modes:
-        name = target.name if target.mode else f"{target.quantity} of any mode"
-        yield Stated(name, None, inf, target.std, "no such mode was found in the band")
+        why = "no such mode was found in the band"
+        yield Stated(target.quantity, target.mode, None, inf, target.std, why)
 
 
-def _read(target: Target, name: str, found: Mapping[str, Any] | None) -> Stated:
+def _read(target: Target, found: Mapping[str, Any] | None) -> Stated:
+    of = target.quantity, target.mode
     if found is None or found["value"] is None:
-        return Stated(name, None, inf, target.std, "it is not part of what was found")
+        return Stated(*of, None, inf, target.std, "it is not part of what was found")
     value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
     asked_std = target.std * (abs(value) if target.relative else 1.0)
-    return Stated(name, value, inf if doubt or std is None else float(std), asked_std, doubt)
+    return Stated(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
 
 
 def beam_found(document: Mapping[str, Any]) -> BeamEstimate | None:
@@ -487,8 +491,8 @@ class _Course:
         now_s, now = self._known[-1]
         ratio = (now + (1.0 - now) * time_left_s / left_s) ** -0.5
         return (
-            f"it would take about {left_s:.0f} s more and {time_left_s:.0f} s are left; in these "
-            f"{ratio:.2g} times the deviation asked for can be reached. Ask for that, or give "
+            f"it would take about {left_s:.0f} s more, and the {time_left_s:.0f} s that are left "
+            f"will do for {ratio:.2g} times the deviation asked for. Ask for that, or give "
             f"--at-most {1.2 * (now_s + left_s):.0f}."
         )
 
@@ -513,6 +517,8 @@ def targets_json(found: Sequence[Stated]) -> list[dict[str, Any]]:
     return [
         {
             "name": each.name,
+            "quantity": each.quantity,
+            "mode": each.mode,
             "value": each.value,
             "std": each.std if isfinite(each.std) else None,
             "asked_std": each.asked_std if isfinite(each.asked_std) else None,

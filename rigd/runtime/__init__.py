@@ -3,10 +3,9 @@
 Offers the folder for sockets and addresses (`runtime_folder`), addresses in it (`announce`,
 `read_address`) and whether a process is still there (`answers`), a lock that names its holder
 (`HeldFile`), one program at a time on a rig (`RigLock`), background work that gives way
-(`give_way`, `end_with`), opening a file that a
-user names (`open_plain_file`), and the signals that ask for an end (`raise_on` for commands;
-`StopRequest`, `ignore`, `held_back` for the processes of a rig). The ground floor: it knows nothing
-of rigs but their names.
+(`begin_background`, `give_way`), opening a file that a user names (`open_plain_file`), and the
+signals that ask for an end (`raise_on` for commands; `StopRequest`, `ignore`, `held_back` for the
+processes of a rig). The ground floor: it knows nothing of rigs but their names.
 """
 
 import lazy_loader as lazy

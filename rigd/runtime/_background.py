@@ -1,15 +1,36 @@
-"""Background work: what gives way to everything else, and ends with the process that started it."""
+"""Background work: gives way to all else, takes one thread, ends with whoever started it."""
 
 import os
 import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rigd.runtime._signals import signal_when_orphaned
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+
+SINGLE_THREADED: Final = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+"""Environment in which numpy starts no threads."""
+
 _LOWEST_PRIORITY: Final = 19
+
+
+def use_one_thread() -> None:
+    """Let numpy start no threads, in this process and in those that it starts.
+
+    They gain nothing on matrices as small as ours, and cost a tenth of a fit's time. With a
+    real-time priority they do harm: the threads of one calculation, all kept off the loop's core,
+    wait for each other by turning in a circle, so that what takes a second took a minute and
+    nothing else ran on that core.
+
+    numpy looks at the environment once, when it is imported: this has to come before.
+    """
+    os.environ.update(SINGLE_THREADED)
 
 
 def killed_first() -> None:
@@ -46,3 +67,25 @@ def end_with(parent: int) -> None:
     signal_when_orphaned(signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit(1)
+
+
+def begin_background(parser: "ArgumentParser") -> "Namespace":
+    """Begin a program that works for another one: it is killed first, and takes one thread.
+
+    Parameters
+    ----------
+    parser
+        Command line of the program; ``--parent`` is added, with which it ends.
+
+    Returns
+    -------
+    argparse.Namespace
+        What the command line says.
+    """
+    parser.add_argument("--parent", type=int, help="End with the process of this number.")
+    asked = parser.parse_args()
+    if asked.parent is not None:
+        end_with(asked.parent)
+    killed_first()
+    use_one_thread()
+    return asked

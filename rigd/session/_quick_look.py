@@ -185,8 +185,9 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     dict or None
         ``duration_s`` of the record that was fitted, ``problem``, ``modes`` as of `modes_of`,
         ``parameters`` by name, ``findings``, and ``search`` of a session that went on until a
-        precision was reached: ``reason`` of its end, and ``targets`` with ``name``, ``value``,
-        ``std`` and ``asked_std``. None if there is none that can be used.
+        precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
+        ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None if there is none that can
+        be used.
     """
     try:
         text = (outcome or {})["fit"]
@@ -216,7 +217,14 @@ def _targets(documents: object) -> Iterator[Document]:
         if isinstance(target, dict):
             numbers = {name: _finite(target.get(name)) for name in ("value", "std", "asked_std")}
             if numbers["asked_std"] is not None:
-                yield {"name": _text(target.get("name") or ""), **numbers}
+                mode = target.get("mode")
+                yield {
+                    "name": _text(target.get("name") or ""),
+                    # Older files name them alone.
+                    "quantity": _text(target.get("quantity") or ""),
+                    "mode": mode if type(mode) is int else None,
+                    **numbers,
+                }
 
 
 def _quantity(document: object) -> Document | None:

@@ -506,6 +506,20 @@ class Thinning:
         """
         return np.unique(self._extremes(values)[1])
 
+    def gaps(self, values: Real) -> npt.NDArray[np.intp]:
+        """Return both ends of each stretch between known values where nothing is known, in order.
+
+        Parameters
+        ----------
+        values
+            As for `extremes`.
+        """
+        rows, _ = self._extremes(values)
+        after = np.flatnonzero(np.diff(rows) > 1)
+        first = self.groups[rows[after] + 1, 0]
+        last = self.groups[rows[after + 1] - 1].max(axis=1)
+        return np.unique(np.concatenate([first, last]))
+
     def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return the groups in which anything is known, and the places of both extremes of each."""
         grouped = values[self.groups]

@@ -30,6 +30,7 @@ _MOST_FINDINGS: Final = 8
 @dataclass(frozen=True, slots=True)
 class _Quantity:
     name: str
+    """As targets of a search have it."""
     key: str
     """Its key in a mode of a fit."""
     suffix: str
@@ -110,7 +111,7 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
     if fit is None:
         return record
     record["t_ns"] = round(1e9 * fit["duration_s"])
-    stds = {each["name"]: each["asked_std"] for each in _targets(fit)}
+    stds = {(each["quantity"], each["mode"]): each["asked_std"] for each in _targets(fit)}
     for mode in fit.get("modes", ()):
         for quantity in _QUANTITIES if mode["mode"] <= modes else ():
             found = mode[quantity.key]
@@ -118,7 +119,7 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
             if not mode.get("shown", True) or found["flag"] or ends is None:
                 continue
             value, (low, high) = found["value"], ends
-            asked_std = stds.get(f"{quantity.name} of mode {mode['mode']}")
+            asked_std = stds.get((quantity.name, mode["mode"]))
             half = np.nan
             if asked_std is not None and found["std"]:
                 half = asked_std * (high - low) / (2.0 * found["std"])

@@ -1,7 +1,7 @@
 """Recorded sessions as Rerun shows them."""
 
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
@@ -36,7 +36,9 @@ _DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
 """Attachments that tell the nominal damping; the first that does counts."""
 
 
-def subject_of_session(session: Session, timings: Records | None = None) -> Subject:
+def subject_of_session(
+    session: Session, timings: Records | None = None, *, fitted: bool = False
+) -> Subject:
     """Return what the views need to know of a recorded session.
 
     A stopped session is shown as it was planned, as it was live. Without segments all of
@@ -48,6 +50,8 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
         The session.
     timings
         The readings' ages (n,) of ``TIMING_DTYPE``, if there are any.
+    fitted
+        Whether there is a fit that was made while it was recorded (`rigd.session.fit_of`).
 
     Raises
     ------
@@ -90,7 +94,7 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
         absent=_absent(session, timings),
         recorded=True,
         # The fits before the last one are not in the file.
-        fit_modes=None if fit_of(session.outcome) is None else 0,
+        fit_modes=0 if fitted else None,
     )
 
 
@@ -174,7 +178,8 @@ def draw_session(
     SessionError
         As `subject_of_session` does.
     """
-    subject = subject_of_session(session, timings)
+    fit = fit_of(session.outcome)
+    subject = subject_of_session(session, timings, fitted=fit is not None)
     picture = Scene(
         subject, lambda: recorded_blueprint(front, subject.absent, fit_modes=subject.fit_modes)
     )
@@ -187,13 +192,13 @@ def draw_session(
     stream.send_recording_start_time_nanos(session.start_utc_ns)
     for draw in picture.frame():
         draw(stream)
-    for draw in picture.events(sorted(_notes(session), key=lambda note: note.t_ns)):
+    touches = _touches(session)
+    for draw in picture.events(sorted(_notes(session, touches), key=lambda note: note.t_ns)):
         draw(stream)
     samples = session.samples
     counts = np.zeros(3, np.int64)
     done, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
-    touches = _touches(session)
     for block, ages in _blocks(samples, timings, block_ticks):
         done += len(block)
         counts += _counts(block, last_tick)
@@ -211,7 +216,6 @@ def draw_session(
             draw(stream)
         touches = touches[len(drawn) :]
         on_progress(done / len(samples))
-    fit = fit_of(session.outcome)
     for draw in (
         *picture.finish(),
         *picture.touches(touches),
@@ -258,11 +262,11 @@ def _within(session: Session, key: str, least: float, most: float) -> float:
     return value
 
 
-def _notes(session: Session) -> Iterator[Note]:
-    """Yield the log of the session, and how it ended, which is told elsewhere in the file."""
+def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
+    """Yield the log of the session, with what is told elsewhere in the file: touches, its end."""
     for event in session.events:
         yield Note(event.t_ns, event.level, event.message)
-    for touch in _touches(session):
+    for touch in touches:
         yield Note(round(1e9 * touch["time_s"]["value"]), "info", touch_line(touch))
     if session.outcome is not None:
         outcome = session.outcome.get("outcome", "unknown")

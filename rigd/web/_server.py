@@ -20,7 +20,7 @@ from rigd.beam import Beam, Damping
 from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
 from rigd.profile import specimen_files
-from rigd.runner import QuickLook, result_line
+from rigd.runner import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject
@@ -43,8 +43,6 @@ _LINGERING_S: Final = 1.0
 _RESPONSE_S: Final = 1.0
 _GRACE_S: Final = 0.3
 _AT_WORK: Final = ("running", "stopping")
-_LEVELS: Final = {"complete": "info", "stopped": "warning"}
-"""Levels of events that tell how a session ended."""
 _FAILED: Final = "The page's server has failed; the daemon starts it again."
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
@@ -204,7 +202,6 @@ class PageServer:
             if event != "progress":
                 self._link.ask_for_status()
             if event == "session":
-                self.pages.note(_LEVELS.get(message["outcome"], "error"), result_line(message))
                 self._begin_finding(self._find_specimens())
             elif event == "quick_look":
                 self.pages.note("info", "\n".join(QuickLook.of_event(message).lines))

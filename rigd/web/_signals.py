@@ -189,7 +189,9 @@ class SessionResponse:
         if self._thinning is None:
             self._thinning = response_thinning(grid)
         shown = np.where(estimate.excited, response.response, np.nan)
-        kept = self._thinning.extremes(np.abs(shown))
+        # A gap is told by its ends, of which nothing is known: no line is drawn across.
+        size = np.abs(shown)
+        kept = np.union1d(self._thinning.extremes(size), self._thinning.gaps(size))
         coherence = None
         if response.coherence is not None:
             coherence = _known(np.round(response.coherence[kept], 4))
@@ -218,6 +220,8 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
 def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
     return {
         "frequency_hz": np.round(frequency_hz, 4).tolist(),
-        "magnitude": [float(f"{value:.4g}") for value in np.abs(response)],
-        "phase_rad": np.round(np.angle(response), 4).tolist(),
+        "magnitude": [
+            None if value is None else float(f"{value:.4g}") for value in _known(np.abs(response))
+        ],
+        "phase_rad": _known(np.round(np.angle(response), 4)),
     }

@@ -148,6 +148,7 @@ def test_a_quick_estimate_fits_the_rig_that_the_judgement_has_found(session):
     whole = fit.estimate(whole=True)
     assert "tip mass" in whole.as_json()["type"]
     quick = fit.estimate()
+    assert [each.as_json()["uniform_beam"] for each in (whole, quick)] == [False, False]
     assert quick.doubt is None
     assert quick.as_json()["plant"]["tip_mass_kg"] == pytest.approx(tip_kg, rel=0.05)
     for one, other in zip(quick.headline.modes, whole.headline.modes, strict=True):
@@ -247,6 +248,7 @@ def test_the_program_answers_to_requests(session, program):
     assert answers[1] == {"id": 1} | {k: v for k, v in expected.items() if k != "took_s"}
     names = answers[1]["covariance"]["names"]
     assert np.array(answers[1]["covariance"]["matrix"]).shape == (len(names), len(names))
+    assert answers[1]["uniform_beam"] is True
     assert set(answers[1]["plant"]["damping"]) == {"zeta", "alpha", "gamma", "lambda"}
     noise = answers[1]["noise"]
     white = np.median(noise["nm2_per_hz"]) * 500

@@ -123,11 +123,13 @@ def test_what_is_notable_is_told_and_the_fit_is_in_the_document(follow):
         {"event": "message", "level": "info", "text": text, "notable": notable}
         for text, notable in (("  8.0 s 0.910 ± 0.010 %", True), ("Next: mode 1.", False))
     ]
+    told.append({"event": "message", "level": "error", "text": "Fault: no record.", "session": 1})
     fit = {"duration_s": 9.5, "modes": []}
     ended, done, _ = follow(*told, session(1) | {"fit": fit}, session(2), series(1, 2), looks=False)
     said = [each[1] for each in done if each[0] == "say"]
     assert said[0] == "  8.0 s 0.910 ± 0.010 %"
     assert not any("Next" in each for each in said)
+    assert not any("Fault" in each for each in said)  # the session's own event tells it
     assert [each.get("fit") for each in ended["sessions"]] == [fit, None]
 
 

@@ -38,10 +38,11 @@ def told():
 
 
 def result(**members):
-    return SessionResult(
-        path=Path("1.mcap"), outcome="complete", reason="", scheduled=9, recorded=9, missed=0,
-        late=0, lost=0, fault=False, **members,
-    )  # fmt: skip
+    told = {
+        "path": Path("1.mcap"), "outcome": "complete", "reason": "", "scheduled": 9,
+        "recorded": 9, "missed": 0, "late": 0, "lost": 0, "fault": False,
+    }  # fmt: skip
+    return SessionResult(**told | members)
 
 
 def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
@@ -73,3 +74,32 @@ def test_a_session_without_fits_is_told_as_before(told):
     teller.ended(result())
     assert "fit" not in events[-1]
     assert series.as_document()["fit"] is None
+
+
+@pytest.mark.parametrize(
+    ("outcome", "level"), [("complete", "info"), ("stopped", "warning"), ("fault", "error")]
+)
+def test_how_a_session_ended_is_one_message_of_its_level(told, outcome, level):
+    _, teller, events = told
+    teller.ended(result(outcome=outcome))
+    message, session = events
+    assert (message["level"], message["session"]) == (level, session["number"])
+    assert message["text"].startswith(f"{outcome.capitalize()}: ")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"excitation": "chirp"}, "chirp"),
+        (
+            {"excitation": "until", "parameters": {"targets": "damping 1%"}},
+            "search for a precision",
+        ),
+    ],
+)
+def test_what_runs_is_told_in_words_of_an_operator(fields, words):
+    request = parse_request(json.dumps({"command": "start", **fields}).encode())
+    series = ServedSeries(1, request)
+    assert series.state_after("")[1] == f"{words} is complete"
+    series.stop.request()
+    assert series.state_after("")[1] == f"{words} was stopped"

@@ -11,10 +11,10 @@ def quantity(value, std, flag=None):
 def online_fit(duration_s=8.0, width=1.0, *, search=True, third="not visible"):
     """A fit of the paper's antenna, with deviations `width` times as large; two modes are good."""
     targets = [
-        {"name": "damping of mode 1", "value": 0.0091, "std": 1e-4 * width, "asked_std": 9.1e-5,
-         "doubt": ""},
-        {"name": "damping of mode 3", "value": None, "std": None, "asked_std": 1e-4,
-         "doubt": "It is not part of what was found."},
+        {"name": "damping of mode 1", "quantity": "damping", "mode": 1, "value": 0.0091,
+         "std": 1e-4 * width, "asked_std": 9.1e-5, "doubt": ""},
+        {"name": "damping of mode 3", "quantity": "damping", "mode": 3, "value": None,
+         "std": None, "asked_std": 1e-4, "doubt": "It is not part of what was found."},
     ]  # fmt: skip
     fit = {
         "id": 3, "tick": round(1000 * duration_s), "duration_s": duration_s, "whole": False,

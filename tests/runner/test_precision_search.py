@@ -17,7 +17,7 @@ from rigd.engine import (
 from rigd.excitation import Forecast, Piece, parse_target, until
 from rigd.excitation._targets import Precision
 from rigd.profile import load_profile
-from rigd.runner._precision_search import Search, in_words, stated
+from rigd.runner._precision_search import Search, in_words, stated, targets_json
 
 NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 RATE_HZ = 1000
@@ -43,6 +43,7 @@ def answer(profile, tick, share, flag=None, kind="VI"):
     return {
         "tick": tick,
         "type": kind,
+        "uniform_beam": kind == "VI",
         "problem": "",
         "doubt": flag,
         "findings": ["Something struck the beam."] if flag else [],
@@ -246,6 +247,9 @@ def test_an_absent_mode_is_not_stated(profile):
     (found,) = stated(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
     assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
+    none = answer(profile, 1, CERTAIN) | {"modes": []}
+    (found,) = stated(none, [parse_target("frequency", "1%")])
+    assert in_words([found]) == "frequency of any mode: no such mode was found in the band"
 
 
 @pytest.mark.parametrize("kind", ["VI, tip mass", "IV, modes free"])
@@ -290,6 +294,8 @@ def test_modes_above_the_band_are_not_asked_for(profile):
 
 def test_an_absolute_deviation_is_not_a_share(profile):
     targets = [parse_target("frequency", "1:0.002Hz"), parse_target("damping", "2:1%")]
-    frequency, damping = stated(answer(profile, 1, 0.02), targets)
+    found = frequency, damping = stated(answer(profile, 1, 0.02), targets)
+    told = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
+    assert told == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
     assert frequency.asked_std == 0.002
     assert damping.ratio == pytest.approx(2.0)

@@ -144,7 +144,10 @@ def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():
     assert [each["mode"] for each in found["modes"]] == [1, 2, 3]
     assert found["modes"][2]["damping_ratio"]["flag"] == "It depends on the structure."
     assert found["parameters"].keys() == fit["parameters"].keys()
-    assert [each["std"] for each in found["search"]["targets"]] == [1e-4, None]
+    targets = found["search"]["targets"]
+    assert [each["std"] for each in targets] == [1e-4, None]
+    assert [each["quantity"] for each in targets] == ["damping", "damping"]
+    assert [each["mode"] for each in targets] == [1, 3]
     assert fit_of(None) is None
     assert fit_of({"outcome": "complete"}) is None
 

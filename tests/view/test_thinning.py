@@ -50,7 +50,15 @@ def test_a_curve_is_broken_where_it_is_not_known():
     below, above = Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(values)
     assert below[-1, 0] <= 5.0
     assert above[0, 0] >= 10.0
-    assert Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(np.full(GRID.size, np.nan)) == []
+    thinning = Thinning.logarithmic(GRID, 0.5, 60.0, 200)
+    assert thinning.strips(np.full(GRID.size, np.nan)) == []
+    first, last = GRID[thinning.gaps(values)]
+    assert np.isnan(values[thinning.gaps(values)]).all()
+    assert 5.0 < first < 5.4
+    assert 9.5 < last < 10.0
+    # Nothing lies between what is known before and the unknown end of a curve.
+    assert thinning.gaps(np.where(GRID > 5.0, np.nan, 0.0)).size == 0
+    assert thinning.gaps(np.full(GRID.size, np.nan)).size == 0
 
 
 @pytest.mark.parametrize("grid", [[], [0.1, 0.2]])

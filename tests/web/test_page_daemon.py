@@ -165,7 +165,8 @@ def test_a_new_operator_runs_stops_reports_and_compares_sessions(
     if options:  # in real time, missed ticks may leave nothing to identify
         says(page, f"{row} >> .modes", "Hz")
         says(page, ".detail:not([hidden])", "95 % interval")
-    says(page, "#event-list", "Complete: ")
+    completed = page.locator("#event-list li", has_text="Complete: ")
+    expect(completed).to_have_count(2)
     for number in (0, 2):
         page.check(f"#rows tr[id] >> nth={number} >> input")
     page.click("#overlay")

@@ -1,6 +1,7 @@
 """Strips and the growing response: what the page is told of blocks of signals."""
 
 import base64
+import json
 
 import numpy as np
 import pytest
@@ -107,6 +108,27 @@ def test_the_response_is_that_of_the_record(sweep):
     grid = np.array(told["frequency_hz"])
     expected = np.abs(transfer(2j * np.pi * grid, BEAM, Damping(zeta=2e-3)))
     assert np.median(np.abs(np.array(told["magnitude"]) / expected - 1.0)) < 0.02
+
+
+def test_no_line_is_drawn_across_what_was_not_excited():
+    """Two narrow sweeps, as of a search: 2 to 4 Hz, then 12 to 16 Hz."""
+    t = np.arange(20_000) / RATE_HZ
+    angle = 0.01 * np.concatenate(
+        [
+            np.sin(2 * np.pi * (first * t + (last - first) * t**2 / 40.0))
+            for first, last in ((2.0, 4.0), (12.0, 16.0))
+        ]
+    )
+    growing = SessionResponse(subject(angle.size))
+    growing.feed(block(0, np.zeros(1000)))
+    growing.feed(block(1000, angle, torque=3 * angle))
+    told = growing.document()
+    grid = np.array(told["frequency_hz"])
+    nothing = np.array([each is None for each in told["magnitude"]])
+    assert nothing[(grid > 5.0) & (grid < 11.0)].all()
+    assert 2 <= nothing.sum() <= 6
+    assert [each is None for each in told["phase_rad"]] == nothing.tolist()
+    json.dumps(told, allow_nan=False)
 
 
 def test_the_nominal_model_shows_its_resonances():

@@ -161,10 +161,11 @@ export class ResponsePlot {
     const surface = this.#surface;
     surface.within(LEFT, panel.top, inner, panel.height, (context) => {
       context.fillStyle = surface.colour("shade");
-      const { frequency_hz: at, coherence, reached_hz: reached } = response;
+      const { frequency_hz: at, magnitude, coherence, reached_hz: reached } = response;
       for (let k = 0; k + 1 < at.length; k += 1) {
         const beyond = known(reached) && at[k] >= reached;
-        if (!beyond && known(coherence?.[k]) && coherence[k] < LOW_COHERENCE) {
+        const doubtful = known(coherence?.[k]) && coherence[k] < LOW_COHERENCE;
+        if (!beyond && (doubtful || !known(magnitude[k]))) {
           const from = x(k ? Math.sqrt(at[k - 1] * at[k]) : at[k]);
           context.fillRect(from, panel.top, x(Math.sqrt(at[k] * at[k + 1])) - from, panel.height);
         }
