@@ -21,7 +21,7 @@ from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._refit import FEW, Refit, unexplained_part
+from analysis.identify._refit import FEW, Refit
 from analysis.identify._residual_tests import largest_of, whiteness
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_deviate
@@ -318,15 +318,11 @@ def _sums(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
     columns : ndarray, shape (c, samples)
         Torque at the samples compared.
     """
-    comparison, weight = refit.objective.comparison, refit.noise.weight
-    at = refit.objective.linearise(refit.x)
-    projected = refit.objective.project(at, weight)
-    known = np.concatenate([projected.jacobian, at.columns * weight])
-    free = unexplained_part(comparison.spectrum(columns) * weight, known)
+    free, residual = refit.beside(refit.objective.comparison.spectrum(columns))
     free /= np.maximum(np.linalg.norm(free, axis=1), np.finfo(float).tiny)[:, None]
     # One after the other (Gram and Schmidt's method): each of what the former have left.
     basis, upper = np.linalg.qr(np.ascontiguousarray(free).view(np.float64).T)
-    along = basis.T @ projected.residual.view(np.float64)
+    along = basis.T @ residual.view(np.float64)
     along[np.abs(np.diag(upper)) < _DEPENDENT] = 0.0
     saved: NDArray[np.float64] = along**2
     return saved
@@ -367,20 +363,17 @@ def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
 
 def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
     """Give a knock its size, and say how much it explains."""
-    comparison, weight = refit.objective.comparison, refit.noise.weight
-    at = refit.objective.linearise(refit.x)
-    projected = refit.objective.project(at, weight)
-    known = np.concatenate([projected.jacobian, at.columns * weight])
+    comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
     in_time = _in_time(comparison, knock)
-    free = unexplained_part(comparison.spectrum(in_time) * weight, known).view(np.float64)
+    beside, residual = refit.beside(comparison.spectrum(in_time))
+    free = beside.view(np.float64)
     scale = np.linalg.norm(free, axis=1)
     scale[scale == 0] = 1.0
     free /= scale[:, None]
-    # The residual is prediction less measurement.
-    sizes = -np.linalg.lstsq(free.T, projected.residual.view(np.float64), rcond=1e-10)[0]
-    left = (projected.residual.view(np.float64) + sizes @ free).view(np.complex128)
-    cost, explained = projected.cost, float(np.vdot(left, left).real)
+    sizes = -np.linalg.lstsq(free.T, residual.view(np.float64), rcond=1e-10)[0]
+    left = (residual.view(np.float64) + sizes @ free).view(np.complex128)
+    cost, explained = (float(np.vdot(each, each).real) for each in (residual, left))
     expected = 2 * np.count_nonzero(refit.noise.counts) * comparison.measurement.torque_share
     sizes /= scale
     torque_nm = sizes @ in_time

@@ -229,6 +229,26 @@ class Refit:
         covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
+    def beside(
+        self, columns: NDArray[np.complex128]
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Whiten further columns and leave of them what nothing free already could explain.
+
+        Parameters
+        ----------
+        columns : ndarray of complex, shape (c, K)
+
+        Returns
+        -------
+        free : ndarray of complex, shape (c, K)
+        residual : ndarray of complex, shape (K,)
+            What is left here, prediction less measurement, whitened.
+        """
+        weight, at = self.noise.weight, self.objective.linearise(self.x)
+        projected = self.objective.project(at, weight)
+        known = np.concatenate([projected.jacobian, at.columns * weight])
+        return unexplained_part(columns * weight, known), projected.residual
+
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Squares that each of some further columns alone would save to first order, shape (c,).
 
@@ -236,11 +256,8 @@ class Refit:
         ----------
         columns : ndarray of complex, shape (c, K)
         """
-        weight, at = self.noise.weight, self.objective.linearise(self.x)
-        projected = self.objective.project(at, weight)
-        known = np.concatenate([projected.jacobian, at.columns * weight])
-        free = unexplained_part(columns * weight, known)
-        along = (free.conj() @ projected.residual).real
+        free, residual = self.beside(columns)
+        along = (free.conj() @ residual).real
         squares = np.maximum(np.sum(np.abs(free) ** 2, axis=1), np.finfo(float).tiny)
         saved: NDArray[np.float64] = along**2 / squares
         return saved

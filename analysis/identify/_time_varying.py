@@ -37,7 +37,7 @@ from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -186,23 +186,36 @@ def _columns(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
 ) -> dict[What, NDArray[np.complex128]]:
     """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
-    return {what: _column(comparison, plant, lag, what, 0.0) for what in _NAMES}
+    slopes = _slopes(comparison, plant)
+    return {what: _column(comparison, plant, lag, what, 0.0, slopes) for what in _NAMES}
 
 
-def _column(
-    comparison: Comparison, plant: Plant, lag: NDArray[np.float64], what: What, size: float
-) -> NDArray[np.complex128]:
-    """Column at a size that is perhaps not small, divided by it, shape (K,)."""
-    if what == "play":
-        return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
+def _slopes(comparison: Comparison, plant: Plant) -> dict[What, NDArray[np.float64]]:
+    """Torque per relative change of what may change in time, each of shape (samples,)."""
     _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
-    ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    now: dict[What, NDArray[np.float64]] = {
+    return {
         "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
         "stiffness": gain - ratio,  # EI rises, rho stays
         "gain": gain,
     }
-    change = ramp * now[what]
+
+
+def _column(
+    comparison: Comparison,
+    plant: Plant,
+    lag: NDArray[np.float64],
+    what: What,
+    size: float,
+    slopes: Mapping[What, NDArray[np.float64]] | None = None,
+) -> NDArray[np.complex128]:
+    """Column at a size that is perhaps not small, divided by it, shape (K,).
+
+    `slopes` are those of `_slopes`, where they are known already.
+    """
+    if what == "play":
+        return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
+    ramp = np.linspace(-0.5, 0.5, comparison.samples)
+    change = ramp * (slopes or _slopes(comparison, plant))[what]
     if what != "gain":
         change += remembered(comparison, plant, ramp, what, size)
     return comparison.spectrum(change)
