@@ -7,37 +7,21 @@ here quantises or adds noise: that is what the simulated devices do with the val
 
 from collections import deque
 from dataclasses import replace
-from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
-    Beam,
-    CoupledModel,
-    LoadedBeam,
     Realisation,
-    RealisationError,
-    couple,
-    held_inputs,
-    propagator,
-    realise,
-    state_output,
-    with_filter,
 )
 from rigd.devices import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import Contact, March
-from rigd.sim._stiffness_drift import StiffnessDrift, in_displacements
+from rigd.sim._step import OUTPUTS, arrays_at, held_of, models_of, split_delay, steps_of
+from rigd.sim._stiffness_drift import StiffnessDrift
 
 Real = NDArray[np.float64]
-
-_OUTPUTS = 8
-"""Rows of a step beyond the state: angle, velocity, sensor torque, the same if the shaft did not
-accelerate, base shear, sensed angle, sensed torque, sensed shear."""
-
-_SAME_INSTANT_PERIODS = 1e-9
 
 _OF_OBSTACLES = (
     "_contact", "_free", "_free_march", "_friction_effects", "_locked", "_locked_march", "_states",
@@ -143,9 +127,9 @@ class SimulatedPlant:
 
     def __init__(self, parameters: RigParameters) -> None:
         period = 1 / parameters.rate_hz
-        periods, switch = _split(parameters.actuation.delay_s, period)
-        angle_periods, angle_age = _split(parameters.encoder.delay_s, period)
-        torque_periods, torque_age = _split(parameters.sensor.delay_s, period)
+        periods, switch = split_delay(parameters.actuation.delay_s, period)
+        angle_periods, angle_age = split_delay(parameters.encoder.delay_s, period)
+        torque_periods, torque_age = split_delay(parameters.sensor.delay_s, period)
         instants = (switch, period - angle_age, period - torque_age)
 
         simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
@@ -156,7 +140,7 @@ class SimulatedPlant:
             bending_stiffness_n_m2=simulation.stiffness_ratio * stated.bending_stiffness_n_m2,
         )
         parameters = replace(parameters, beam=own)
-        beam, free, locked = _models(parameters, simulation)
+        beam, free, locked = models_of(parameters, simulation)
         filtered = simulation.torque_filter_hz > 0
         self._air = _air(parameters, beam)
         if self._air is not None:
@@ -165,13 +149,13 @@ class SimulatedPlant:
         if self._contact is not None:
             (free, on_free), (locked, on_locked) = map(self._contact.attached, (free, locked))
         n = free.b.size
-        step, locked_step, friction = _steps(free, locked, period, instants)
+        step, locked_step, friction = steps_of(free, locked, period, instants)
         self._friction_effects: list[float] = friction[n:].tolist()
         points = 0
         if self._air is not None:
             points = len(self._air.speed)
-            held = _held(free, on_free, locked.sensor_torque, period, *instants[1:])
-            locked_held = _held(locked, on_locked, locked.sensor_torque, period, *instants[1:])
+            held = held_of(free, on_free, locked.sensor_torque, period, *instants[1:])
+            locked_held = held_of(locked, on_locked, locked.sensor_torque, period, *instants[1:])
             step, locked_step = (
                 np.vstack([whole := np.column_stack(parts), self._air.speed @ whole[:n]])
                 for parts in ((step, held), (locked_step, locked_held))
@@ -198,7 +182,7 @@ class SimulatedPlant:
                 simulation.stiffness_drift_per_s,
                 period,
                 np.abs(beam.poles_rad_s).max(initial=0.0, where=beam.poles_rad_s.imag > 0),
-                lambda share: _arrays_at(share, parameters, simulation, beam, period, instants),
+                lambda share: arrays_at(share, parameters, simulation, beam, period, instants),
             )
             step, locked_step = self._drift.arrays[:2]
         # A bound method of a matrix in column order: the quickest product of this size in numpy.
@@ -402,7 +386,7 @@ class SimulatedPlant:
         assert contact is not None
         n = self._states
         time_s = self.elapsed_s
-        if contact.nothing(output[n + _OUTPUTS :], time_s):
+        if contact.nothing(output[n + OUTPUTS :], time_s):
             return
         free_m = march.free(input_).reshape(contact.substeps, -1)
         friction = self._friction_nm if turns else 0.0
@@ -433,7 +417,7 @@ class SimulatedPlant:
     ) -> tuple[float, float, float, float, float]:
         """Add what the force of the air does at once to the outputs at the end of a step."""
         assert self._air is not None
-        speed_m_s = output[self._states + _OUTPUTS :]
+        speed_m_s = output[self._states + OUTPUTS :]
         if free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
         before_nm, before_n = self._direct_nm, self._direct_shear_n
@@ -449,130 +433,6 @@ class SimulatedPlant:
             sensed_torque + share * (before_nm + at * (now_nm - before_nm)),
             sensed_shear + before_n + at * (now_n - before_n),
         )
-
-
-def _models(
-    parameters: RigParameters, simulation: Simulation, modes_of: Beam | None = None
-) -> tuple[Realisation, CoupledModel, CoupledModel]:
-    """Realise the beam, and attach it to the free and to the locked shaft.
-
-    Parameters
-    ----------
-    parameters
-        The rig, with the beam as it is simulated.
-    simulation
-        What is at the beam and in its sensor.
-    modes_of
-        As for `realise`.
-    """
-    beam = realise(
-        parameters.beam,
-        parameters.damping,
-        tip_mass_kg=simulation.tip_mass_kg,
-        root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
-        modes_of=modes_of,
-    )
-    loaded = LoadedBeam(
-        parameters.beam,
-        parameters.damping,
-        simulation.tip_mass_kg,
-        simulation.clamp_compliance_rad_per_nm,
-    )
-    attach = partial(
-        couple,
-        beam,
-        tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-        shear=state_output(beam, loaded.shear, inertial=True),
-    )
-    free = attach(
-        motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
-        viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
-    )
-    # No torque turns an infinite inertia: the beam on a locked shaft.
-    locked = attach(motor_inertia_kg_m2=np.inf)
-    if simulation.torque_filter_hz > 0:
-        free, locked = (
-            with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
-            for model in (free, locked)
-        )
-    return beam, free, locked
-
-
-def _steps(
-    free: CoupledModel, locked: CoupledModel, period_s: float, instants: tuple[float, float, float]
-) -> tuple[Real, Real, Real]:
-    """One period on the free and on the locked shaft, and what friction of 1 N·m does in it.
-
-    A period's friction is known only after its step, from the speed reached without it. The outputs
-    are then corrected at once, the state by a last column of the next step.
-
-    Parameters
-    ----------
-    free, locked
-        Motor and beam.
-    period_s, instants
-        As for `_step`.
-
-    Returns
-    -------
-    step, locked_step : (n + 8, n + 3)
-    friction : (n + 8,)
-    """
-    n = free.b.size
-    step = _step(free, locked.sensor_torque, period_s, *instants)
-    locked_step = _step(locked, locked.sensor_torque, period_s, *instants)
-    friction = -(step[:, n] + step[:, n + 1])
-    step = np.column_stack([step, step[:, :n] @ friction[:n]])
-    locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
-    return step, locked_step, friction
-
-
-def _arrays_at(
-    share: float,
-    parameters: RigParameters,
-    simulation: Simulation,
-    at_start: Realisation,
-    period_s: float,
-    instants: tuple[float, float, float],
-) -> tuple[Real, Real, Real, Real]:
-    """Compute what depends on the stiffness of a beam that drifts.
-
-    Parameters
-    ----------
-    share
-        The stiffness over that at the start.
-    parameters, simulation
-        As for `_models`, at the start.
-    at_start
-        The beam there.
-    period_s, instants
-        As for `_step`.
-
-    Returns
-    -------
-    step, locked_step : (n + 8, n + 3)
-    friction_effects : (8,)
-    per_torque : (2,)
-        What the motor's torque adds at once to torque and shear of the sensor.
-
-    Raises
-    ------
-    RealisationError
-        If the beam cannot be realised at that stiffness.
-    """
-    own = parameters.beam
-    drifted = replace(own, bending_stiffness_n_m2=share * own.bending_stiffness_n_m2)
-    try:
-        beam, *models = _models(replace(parameters, beam=drifted), simulation, own)
-    except RealisationError as error:
-        raise RealisationError(
-            "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
-            f"{share:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
-        ) from error
-    free, locked = (in_displacements(model, beam, at_start) for model in models)
-    step, locked_step, friction = _steps(free, locked, period_s, instants)
-    per_torque = np.array([free.sensor_torque_per_torque, free.shear_per_torque])
-    return step, locked_step, friction[free.b.size :], per_torque
 
 
 def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
@@ -595,126 +455,8 @@ def _contact(parameters: RigParameters, beam: Realisation, period_s: float) -> C
 def _vectors(states: int, points: int, *, felt: int) -> tuple[tuple[Real, Real, Real], ...]:
     """Two vectors of a step, with views of input and outputs; the input has `felt` points."""
     return tuple(
-        (vector, vector[: states + 3 + felt], vector[states : states + _OUTPUTS])
-        for vector in np.zeros((2, states + _OUTPUTS + points))
-    )
-
-
-def _split(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Whole periods in a delay, and what is left of it in seconds."""
-    periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
-    rest = delay_s - periods * period_s
-    return periods, rest if rest > _SAME_INSTANT_PERIODS * period_s else 0.0
-
-
-def _step(
-    model: CoupledModel,
-    holding_torque: Real,
-    period_s: float,
-    switch_s: float,
-    angle_instant_s: float,
-    torque_instant_s: float,
-) -> Real:
-    """One period: from [state, torque before and after the switch] to [next state, outputs].
-
-    Parameters
-    ----------
-    model
-        Motor and beam.
-    holding_torque
-        (n,) row: sensor torque on a shaft that does not accelerate.
-    period_s
-        Length of the step.
-    switch_s
-        Time at which the motor's torque changes, from the step's start.
-    angle_instant_s, torque_instant_s
-        Instants of the sensed values, from the start of the step.
-
-    Returns
-    -------
-    (n + 8, n + 2)
-    """
-
-    @cache
-    def state_at(instant_s: float) -> Real:
-        phi, whole = propagator(model, instant_s)
-        after = propagator(model, max(instant_s - switch_s, 0.0))[1]
-        return np.column_stack([phi, whole - after, after])
-
-    def torque_at(instant_s: float) -> Real:
-        return at_once(model.sensor_torque, model.sensor_torque_per_torque, instant_s)
-
-    def shear_at(instant_s: float) -> Real:
-        return at_once(model.shear, model.shear_per_torque, instant_s)
-
-    def at_once(of_state: Real, per_torque: float, instant_s: float) -> Real:
-        """Row of what follows the torque at once."""
-        row: Real = of_state @ state_at(instant_s)
-        apart_s = instant_s - switch_s
-        if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
-            share_after = 0.5
-        else:
-            share_after = 1.0 if apart_s > 0 else 0.0
-        row[-2:] += per_torque * np.array([1 - share_after, share_after])
-        return row
-
-    end = state_at(period_s)
-    return np.vstack(
-        [
-            *_told(model, end, torque_at(period_s), holding_torque),
-            shear_at(period_s),
-            model.angle @ state_at(angle_instant_s),
-            torque_at(torque_instant_s)
-            if model.sensed_torque is None
-            else model.sensed_torque @ state_at(torque_instant_s),
-            shear_at(torque_instant_s)
-            if model.sensed_shear is None
-            else model.sensed_shear @ state_at(torque_instant_s),
-        ]
-    )
-
-
-def _told(model: CoupledModel, end: Real, torque: Real, holding_torque: Real) -> tuple[Real, ...]:
-    """Rows of the state at a period's end, and of what is told of it beside the sensors."""
-    return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
-
-
-def _held(
-    model: CoupledModel,
-    of_force: Real,
-    holding_torque: Real,
-    period_s: float,
-    angle_instant_s: float,
-    torque_instant_s: float,
-) -> Real:
-    """One period under a held force of the air: what it adds to [next state, outputs].
-
-    Parameters
-    ----------
-    model
-        Motor and beam.
-    of_force
-        Effect of the force on the state's derivative, (n, points).
-    holding_torque, period_s, angle_instant_s, torque_instant_s
-        As for `_step`.
-
-    Returns
-    -------
-    (n + 8, points)
-    """
-
-    def state_at(instant_s: float) -> Real:
-        return held_inputs(model, of_force, instant_s)
-
-    end = state_at(period_s)
-    return np.vstack(
-        [
-            *_told(model, end, model.sensor_torque @ end, holding_torque),
-            model.shear @ end,
-            model.angle @ state_at(angle_instant_s),
-            model.sensor_torque @ state_at(torque_instant_s),
-            model.shear @ state_at(torque_instant_s),
-        ]
+        (vector, vector[: states + 3 + felt], vector[states : states + OUTPUTS])
+        for vector in np.zeros((2, states + OUTPUTS + points))
     )
 
 

@@ -125,7 +125,7 @@ def test_a_drift_that_cannot_be_realised_is_refused(rig, monkeypatch):
             raise RealisationError("Too soft.")
         return realise(beam, *args, **more)
 
-    monkeypatch.setattr("rigd.sim._plant.realise", realised)
+    monkeypatch.setattr("rigd.sim._step.realise", realised)
     plant_of(rig, stiffness_drift_per_s=FASTEST)
     with pytest.raises(RealisationError, match=r"stiffness_drift_per_s.*Too soft"):
         plant_of(rig, stiffness_drift_per_s=-FASTEST)
