@@ -5,16 +5,15 @@ follows is planned while it runs, from what the record has told by then (`_exper
 """
 
 from dataclasses import dataclass
-from math import pi
+from math import pi, sqrt
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD
+from rigd.beam import SMALL_SLOPE_RAD, Beam, clamped_free_eigenvalues
 from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
-    SHARE_OF_LIMITS,
     Excitation,
     ExcitationError,
     frequency,
@@ -29,8 +28,19 @@ Real = NDArray[np.float64]
 PAUSE_S: Final = 0.5
 """Pause in which a fit is made, such as the first: it tells as much as the beam still rings."""
 _FADE_S: Final = 0.25
-_FIRST_SHARE: Final = 0.25
-"""Amplitude at the beginning of the scan over that at its end: low modes swing farthest."""
+_SHARE: Final = 0.8
+"""Share of the limits that the scan takes: the beam may be another than the profile says."""
+_AT_MODES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
+_SIZES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
+"""Amplitude of the scan at some frequencies over that of mode 1.
+
+Where the slope of the tip is limited, and a mode that was passed rings on, this gives each of the
+first three modes the share that tells the dampings of all alike. From random beams that differ by a
+fifth from the profile: after it, the worst damping is known to 0.63 times the deviation that is
+there with an amplitude that rises in a straight line.
+"""
+_BEND: Final = 1.25
+"""Power of the time with which the frequency rises: low modes take longer."""
 _EXAMPLE: Final = "--damping 1%"
 
 
@@ -42,6 +52,10 @@ class ScanRig(Protocol):
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
         """Largest slope of the free end that is predicted for a reference (n,)."""
+
+    @property
+    def beam(self) -> Beam:
+        """The specimen as the profile has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +108,8 @@ def until(
         Largest slope of the beam's free end, of which 90 % are used. Beyond the default, the linear
         model is not exact.
     amplitude_rad
-        Amplitude at the end of the scan, a quarter of it at its beginning; lower where the rig's
-        limits or the slope ask for it.
+        Largest amplitude of the scan, at its end; a sixth of it at mode 2, two fifths at mode 1.
+        Lower where the rig's limits or the slope ask for it.
     start_hz, stop_hz
         Band of the scan.
     scan_s
@@ -139,12 +153,13 @@ def until(
             f"{planned_ticks / rate_hz:g} s."
         )
     scan_rad = np.zeros(end)
-    scan_rad[first:] = amplitude_rad * _rising_chirp(end - first, rate_hz, start_hz, stop_hz)
+    beam = None if rig is None else rig.beam
+    scan_rad[first:] = amplitude_rad * _scan(end - first, rate_hz, start_hz, stop_hz, beam)
     if rig is not None:
         share = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
-        if share > SHARE_OF_LIMITS:
-            amplitude_rad *= SHARE_OF_LIMITS / share
-            scan_rad *= SHARE_OF_LIMITS / share
+        if share > _SHARE:
+            amplitude_rad *= _SHARE / share
+            scan_rad *= _SHARE / share
     reference_rad = np.zeros(ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
@@ -172,11 +187,18 @@ def until(
     )
 
 
-def _rising_chirp(n: int, rate_hz: float, start_hz: float, stop_hz: float) -> Real:
-    """Linear sweep whose amplitude rises to 1, (n,); at rest at both ends."""
+def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
+    """Sweep with an amplitude of 1 at most that suits a beam, (n,); at rest at both ends."""
     t = np.arange(n) / rate_hz
-    phase = 2.0 * pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2.0 * n / rate_hz))
-    size = np.linspace(_FIRST_SHARE, 1.0, n)
+    u = t * (rate_hz / n)
+    frequency_hz = start_hz + (stop_hz - start_hz) * u**_BEND
+    phase = 2.0 * pi * t * (start_hz + (stop_hz - start_hz) * u**_BEND / (_BEND + 1.0))
+    size = np.ones(n)
+    if beam is not None:
+        root = float(clamped_free_eigenvalues(1)[0]) / beam.length_m
+        first_hz = root**2 / (2.0 * pi * sqrt(beam.density_over_stiffness))
+        at_mode = np.maximum(frequency_hz / first_hz, _AT_MODES[0])
+        size = np.exp(np.interp(np.log(at_mode), np.log(_AT_MODES), np.log(_SIZES)))
     fade = quintic(_FADE_S, rate_hz)
     size[: fade.size] *= fade
     size[n - fade.size :] *= 1.0 - fade
