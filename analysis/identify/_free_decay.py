@@ -52,7 +52,9 @@ class Pole:
         return self.at_rad_s.imag != 0
 
 
-def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
+def mode_poles(
+    plant: Plant, count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
+) -> tuple[Pole, ...]:
     """Poles of the first `count` modes with their derivatives, without modes that have none.
 
     Parameters
@@ -61,14 +63,17 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
     count : int
     wrt : sequence of str
         Names that `ResponseGrid` knows; some do not move a pole.
+    near_rad_s : sequence of complex, optional
+        Where the poles are expected, if all of them are.
     """
+    near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm or not _OF_ENDS.isdisjoint(wrt):
-        return _loaded_poles(plant, count, wrt)
+        return _loaded_poles(plant, count, wrt, near)
     z = eigenvalues(count).copy()
     for mode, offset in enumerate(plant.stiffness_offsets[: count - 1], start=FIRST_OFFSET):
         z[mode - 1] *= (1 + offset) ** 0.25
     found = []
-    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping)):
+    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
         if np.isnan(pair[0]):
             continue
         stiffness = float((z[i] / plant.beam.length_m) ** 4)
@@ -78,14 +83,16 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
     return tuple(found)
 
 
-def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
+def _loaded_poles(
+    plant: Plant, count: int, wrt: Sequence[str], near: NDArray[np.complex128] | None
+) -> tuple[Pole, ...]:
     """Compute the same with a tip mass or an elastic clamp, on a uniform beam."""
     loaded = LoadedBeam(
         plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
     )
     found = [
         (mode, pole)
-        for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1)
+        for mode, pair in enumerate(loaded.poles(eigenvalues(count), near), start=1)
         if not np.isnan(pair).any()
         for pole in pair[: 1 if pair[0].imag else 2]
     ]

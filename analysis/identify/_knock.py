@@ -19,7 +19,6 @@ import numpy as np
 from analysis.identify._data import Knock, MeasurementError
 from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
-from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._refit import FEW, Refit
 from analysis.identify._residual_tests import largest_of, whiteness
@@ -244,7 +243,7 @@ def _scan(refit: Refit) -> int | None:
     decay from the first on, turned in time.
     """
     comparison, weight = refit.objective.comparison, refit.noise.weight
-    poles = mode_poles(refit.plant, comparison.visible_modes, ())
+    poles = comparison.poles(refit.plant)
     if not poles:
         return None
     residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
@@ -292,7 +291,7 @@ def _knock(refit: Refit, first: int, last: int) -> Knock:
     """Knock between two samples with the poles found, of no size."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
-    poles = mode_poles(refit.plant, comparison.visible_modes, ())
+    poles = comparison.poles(refit.plant)
     return Knock(
         first_s=comparison.first_s + first / rate_hz,
         last_s=comparison.first_s + last / rate_hz,

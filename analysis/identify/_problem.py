@@ -5,7 +5,7 @@ What of the motor's angle counts as input is told by `analysis.identify._instrum
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
@@ -82,6 +82,8 @@ class Comparison:
         The torque by drag that was taken out, and what it changes by with the beam.
     struck : ndarray of complex, shape (k, K), or None
         Spectra of the torque by knocks, of unknown sizes: beside what was taken out.
+    last_poles_rad_s : list of complex
+        Where the last plant had its poles: all that explain a record have them close by.
     """
 
     measurement: Measurement
@@ -102,6 +104,7 @@ class Comparison:
     rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
     struck: NDArray[np.complex128] | None = None
+    last_poles_rad_s: list[complex] = field(default_factory=list)
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -208,6 +211,19 @@ class Comparison:
     def samples(self) -> int:
         """Number of samples compared."""
         return int(self.kept.stop - self.kept.start)
+
+    def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
+        """Poles of a plant whose free decay is projected out, as `mode_poles` gives them.
+
+        Parameters
+        ----------
+        plant : Plant
+        wrt : sequence of str
+            Parameters to differentiate by.
+        """
+        found = mode_poles(plant, self.visible_modes, wrt, self.last_poles_rad_s)
+        self.last_poles_rad_s[:] = [pole.at_rad_s for pole in found]
+        return found
 
     def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
@@ -564,7 +580,7 @@ class Objective:
         chain = unknowns.gradient_by_unknowns(x)
         poles = tuple(
             Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
-            for pole in mode_poles(plant, comparison.visible_modes, names)
+            for pole in comparison.poles(plant, names)
         )
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
         jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)

@@ -23,6 +23,9 @@ Complex = NDArray[np.complexfloating]
 _HOMOTOPY_STEPS = (8, 64)
 """Steps in which damping grows: few, and more for the beams where that loses a path."""
 
+CLOSE_BY = 0.05
+"""Relative distance up to which a root is the one that was expected: modes lie far more apart."""
+
 _ON_THE_CUT = 1e-9
 """How far beyond pi an argument may be, by rounding, of a pole that is all but real."""
 
@@ -227,7 +230,9 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     return found
 
 
-def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
+def poles_for_eigenvalues(
+    z: Real, beam: Beam, damping: Damping, near_rad_s: Complex | None = None
+) -> Complex:
     """Both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as `poles` has them.
 
     With the roots of ``tan z = tanh z`` in place of the clamped–free eigenvalues these are the
@@ -239,6 +244,9 @@ def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
         Clamped–free eigenvalues, shape (m,), or others of the beam.
     beam, damping
         Parameters of the exact model.
+    near_rad_s
+        Where the roots in the upper half plane are expected, shape (m,). If all lie as close as
+        `CLOSE_BY`, they are not followed from those of the undamped beam, at a tenth of the price.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
     damper = damping.gamma / beam.density_over_stiffness
@@ -246,6 +254,12 @@ def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
     external_first_order = damping.gamma == 0 or damping.lambda_ == 1
     if internal_first_order and external_first_order:
         return _second_order_poles(omega_squared, damper + damping.zeta * omega_squared)
+    if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
+        start = np.log(near_rad_s)
+        found = _newton(start, omega_squared, damper, damping.zeta, damping)
+        if bool((np.abs(found - start) < CLOSE_BY).all()):
+            upper = np.exp(found)
+            return np.stack([upper, upper.conj()], axis=1)
     for steps in _HOMOTOPY_STEPS:
         upper = _continued_poles(omega_squared, damper, damping, steps)
         lost = np.isnan(upper)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
-from rigd.beam._modes import poles_for_eigenvalues
+from rigd.beam._modes import CLOSE_BY, poles_for_eigenvalues
 from rigd.beam._point_force import PointForceGrid
 
 Real = NDArray[np.float64]
@@ -30,13 +30,13 @@ Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 _POWERS = (-4.0) ** np.arange(10)
-_D = np.array([_POWERS[k] / math.factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
-_N = np.array(
+_SERIES = np.array(
     [
         [scale * _POWERS[k] / math.factorial(4 * k + last) for k in range(10)]
-        for scale, last in ((4.0, 3), (4.0, 2), (2.0, 1))
+        for scale, last in ((1.0, 0), (4.0, 3), (4.0, 2), (2.0, 1))
     ]
-)
+).T
+_SERIES[0, 0] += 1.0
 """Power series in q of ``1 + cos z cosh z`` and of the numerators of F, U and z² B over q."""
 
 _HOMOTOPY_STEPS = 12
@@ -269,7 +269,7 @@ class LoadedBeam:
         )
         return by_log_s / s
 
-    def poles(self, z: Real) -> Complex:
+    def poles(self, z: Real, near_rad_s: Complex | None = None) -> Complex:
         """Both poles of each mode with the rig's shaft held, shape (len(z), 2), in rad/s.
 
         Followed from those of the bare beam on a rigid clamp while mass and compliance grow.
@@ -278,12 +278,18 @@ class LoadedBeam:
         ----------
         z : ndarray
             Clamped-free eigenvalues of the modes.
+        near_rad_s : ndarray of complex, shape (len(z),), optional
+            As for `rigd.beam._modes.poles_for_eigenvalues`, in the order of the modes.
 
         Returns
         -------
         ndarray of complex
             As `rigd.beam._modes.poles_for_eigenvalues` has them; NaN where a path was lost.
         """
+        if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
+            found = self._newton(near_rad_s, _CONVERGED, zeros=False)
+            if bool((np.abs(found / near_rad_s - 1) < CLOSE_BY).all()):
+                return np.column_stack([found, found.conj()])
         return self._followed(z, zeros=False)
 
     def zeros(self, z: Real) -> Complex:
@@ -363,12 +369,14 @@ def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
     series = np.abs(q) < _SERIES_LIMIT
-    low = q[series]
-    divisor = np.polynomial.polynomial.polyval(low, _D)
-    for out, numerator in zip((f, u, b), _N, strict=True):
-        out[series] = low * np.polynomial.polynomial.polyval(low, numerator) / divisor
-    for out, values in zip((f, u, b), _scaled(q[~series]), strict=True):
-        out[~series] = values
+    if series.any():
+        low = q[series]
+        divisor, *numerators = np.polynomial.polynomial.polyval(low, _SERIES)
+        for out, numerator in zip((f, u, b), numerators, strict=True):
+            out[series] = low * numerator / divisor
+    if not series.all():
+        for out, values in zip((f, u, b), _scaled(q[~series]), strict=True):
+            out[~series] = values
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 

@@ -100,3 +100,34 @@ def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(
         assert np.isfinite(other.derivative).all()
         # Both make the mode slower.
         assert (other.derivative[2:].imag < 0).all()
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        Plant(BEAM, FRACTIONAL),
+        Plant(BEAM, Damping(zeta=1e-3, alpha=0.7)),
+        Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05)),
+        Plant(BEAM, FRACTIONAL, tip_mass_kg=2e-4),
+        Plant(BEAM, FRACTIONAL, root_compliance_rad_per_nm=0.01),
+        Plant(BEAM, Damping(), tip_mass_kg=2e-4),
+        Plant(BEAM, FRACTIONAL, tip_mass_kg=1e-12),
+    ],
+)
+def test_where_the_poles_are_expected_changes_none_of_them(plant):
+    found = mode_poles(plant, 3, ("zeta",))
+    first, second, third = (pole.at_rad_s for pole in found)
+    expectations = {
+        "close by": (first * (1.01 + 0.01j), second * 0.99, third * (1 - 0.02j)),
+        "exactly": (first, second, third),
+        "far away": (1.4 * first, second, third),
+        "real": (-1 + 0j, second, third),
+        "lost": (complex(np.nan, np.nan), second, third),
+        "too few": (first, second),
+    }
+    for name, near in expectations.items():
+        again = mode_poles(plant, 3, ("zeta",), near)
+        assert [pole.mode for pole in again] == [1, 2, 3], name
+        for one, other in zip(again, found, strict=True):
+            assert one.at_rad_s == pytest.approx(other.at_rad_s, rel=1e-10), name
+            np.testing.assert_allclose(one.derivative, other.derivative, rtol=1e-7, atol=1e-7)
