@@ -23,6 +23,8 @@ QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
 """What a precision can be asked of: damping ratio and frequency of modes, or a parameter."""
 
 _UNITS: Final = {"frequency": "Hz"}
+_NO_ANSWER: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
+"""Deviations, in units of the quantity, that tell nothing: who asks for one has forgotten the %."""
 _MOST_MODES: Final = 20
 _OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
 _KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
@@ -113,6 +115,12 @@ def parse_target(quantity: str, text: str) -> Target:
         raise ExcitationError(
             f"{option}: the standard deviation must be finite and more than 0; give for example "
             f"{example}."
+        )
+    most = _NO_ANSWER.get(quantity, inf)
+    if not relative and std >= most:
+        raise ExcitationError(
+            f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
+            f"not below {most:g}; for a share of the value write {text.strip()}%."
         )
     return Target(quantity, std, relative, mode)
 
