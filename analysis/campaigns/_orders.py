@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns._pooling import by_structure
-from analysis.identify import STRONG, WIDEST_SHARE
+from analysis.identify import ANOTHER_DAMPING, MODES_FOR_ONE_DAMPING, STRONG, WIDEST_SHARE
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -202,6 +202,8 @@ def _judged(
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
     if not several_modes:
         return "not identifiable", _FEW_MODES
+    if structure.internal != structure.external and modes < MODES_FOR_ONE_DAMPING:
+        return "not identifiable", ANOTHER_DAMPING
     if not structure.has(order):
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)

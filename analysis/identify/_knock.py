@@ -64,6 +64,11 @@ _ALL: Final = 0.95
 _RINGS: Final = 0.5
 """Least share of the squares that a knock saves by the decays after it, not while it lasts."""
 
+_OVERWHELMING: Final = 10.0
+"""Squares over those of the noise from which on what knock and beam could both explain counts as
+the knock's, beside which the beam was fitted. Of what a wrong model leaves, at most 3 times the
+noise, it counts as the beam's: else decays would explain all of that."""
+
 _QUIET_S: Final = 2.0
 _LOUDER: Final = 1.5
 """Largest power of the residual in that time before a knock, relative to the noise's."""
@@ -170,9 +175,9 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
             torque_nm=measurement.torque_nm[half],
             angle_known=measurement.angle_known[half],
             torque_known=measurement.torque_known[half],
-            reference_rad=(
-                None if measurement.reference_rad is None else measurement.reference_rad[half]
-            ),
+            # What rings since the knock may be far louder than what the reference asks for: from
+            # that alone, no beam is found.
+            reference_rad=None,
             knocks=(),
         )
         try:
@@ -272,8 +277,7 @@ def _scan(refit: Refit) -> int | None:
 
 def _cleaned(refit: Refit, first: int, last: int) -> Refit:
     """Fit with a knock between two samples, the noise being what remains then."""
-    comparison = refit.objective.comparison
-    before = refit.columns
+    comparison, before = refit.objective.comparison, refit.columns
     for _ in range(_ROUNDS):
         knock = _knock(refit, first, last)
         columns = np.concatenate([before, comparison.spectrum(_in_time(comparison, knock))])
@@ -365,15 +369,17 @@ def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
     in_time = _in_time(comparison, knock)
-    beside, residual = refit.beside(comparison.spectrum(in_time))
+    cost = refit.cost
+    expected = 2 * np.count_nonzero(refit.noise.counts) * comparison.measurement.torque_share
+    shared = bool(cost < _OVERWHELMING * expected)
+    beside, residual = refit.beside(comparison.spectrum(in_time), beam_free=shared)
     free = beside.view(np.float64)
     scale = np.linalg.norm(free, axis=1)
     scale[scale == 0] = 1.0
     free /= scale[:, None]
     sizes = -np.linalg.lstsq(free.T, residual.view(np.float64), rcond=1e-10)[0]
     left = (residual.view(np.float64) + sizes @ free).view(np.complex128)
-    cost, explained = (float(np.vdot(each, each).real) for each in (residual, left))
-    expected = 2 * np.count_nonzero(refit.noise.counts) * comparison.measurement.torque_share
+    explained = float(np.vdot(left, left).real)
     sizes /= scale
     torque_nm = sizes @ in_time
     after = slice(first, first + math.ceil(comparison.decimation.rate_hz))

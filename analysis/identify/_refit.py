@@ -230,13 +230,15 @@ class Refit:
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
     def beside(
-        self, columns: NDArray[np.complex128]
+        self, columns: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Whiten further columns and leave of them what nothing free already could explain.
 
         Parameters
         ----------
         columns : ndarray of complex, shape (c, K)
+        beam_free : bool
+            Whether the unknowns may explain a part as well; else only what is projected out may.
 
         Returns
         -------
@@ -246,7 +248,9 @@ class Refit:
         """
         weight, at = self.noise.weight, self.objective.linearise(self.x)
         projected = self.objective.project(at, weight)
-        known = np.concatenate([projected.jacobian, at.columns * weight])
+        known = at.columns * weight
+        if beam_free:
+            known = np.concatenate([projected.jacobian, known])
         return unexplained_part(columns * weight, known), projected.residual
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:

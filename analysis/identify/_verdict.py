@@ -41,6 +41,11 @@ of one rig, one had lambda four standard deviations off, with a drag that fell w
 # One order of the damping
 
 _MODES_FOR_AN_ORDER: Final = 2
+MODES_FOR_ONE_DAMPING: Final = 3
+"""Modes from which on it shows that there is no second damping: two loss factors are explained by
+coefficient and order of one damping as well as by two dampings."""
+
+ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,7 @@ class OrderVerdict:
     status : str
         "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
         doubtful but not excluded, or something else explains as much; "not identifiable": it could
-        be almost anything; "absent": such damping does not show, though the record would show it.
+        be almost anything; "absent": such damping does not show, though three modes would show it.
     value : float or None
         The estimate with the order free, where the order is identifiable.
     interval : tuple of float or None
@@ -116,6 +121,9 @@ def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
     if not freest.uniform and len(freest.structure.free) > len(visible):
         # The modes' frequencies say nothing of the damping here: a loss factor each is all.
         return f"on a non-uniform beam only {len(visible)} loss factors determine it"
+    one_damping = freest.structure.internal != freest.structure.external
+    if one_damping and len(visible) < MODES_FOR_ONE_DAMPING:
+        return ANOTHER_DAMPING
     return None
 
 
@@ -134,7 +142,7 @@ def _judged(
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     untold = untold_reason(field, visible)
-    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
+    if not freest.structure.has(order) and len(visible) >= MODES_FOR_ONE_DAMPING:
         return "absent", "no such damping shows"
     if untold is not None:
         return "not identifiable", untold

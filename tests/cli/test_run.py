@@ -16,7 +16,8 @@ import pytest
 from cases import further
 from processes import child_running, eventually, has_ended, ignored, ignores
 
-from rigd.beam import pressing_force_n
+from analysis import load, select
+from rigd.beam import modes, pressing_force_n
 from rigd.profile import load_profile
 from rigd.session import Status, read_controls, read_session
 
@@ -133,6 +134,28 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     sweep = record.samples["angle_reference_rad"][first:end]
     assert np.allclose(np.diff(sweep), 1e-5, atol=1e-9)
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
+
+
+def test_a_loud_knock_is_named_though_the_motor_turns_with_it(rigd, tmp_path):
+    """In mid-sweep, on the tip: the beam rings louder than the motor drives it, for half of it."""
+    rigd(
+        *("run", "chirp", "--duration", "20", "--stop-hz", "50", "--seed", "5", "--fast"),
+        *("--obstacle", "x=0.98,force=0.5,duration=0.01,at=10", "--no-look"),
+        *("--output", str(tmp_path)),
+    )
+    [path] = tmp_path.glob("*.mcap")
+    told = select(load(path))
+    assert told.verdict.adequate
+    [finding] = told.verdict.findings
+    assert finding.kind == "knock"
+    assert all(mode.damping_ratio.flag is None for mode in told.headline.modes)
+    rig = load_profile("sim").rig
+    for mode, true in zip(told.headline.modes, modes(rig.beam, rig.damping, 3), strict=True):
+        for quantity, value in (
+            (mode.frequency_hz, true.frequency_hz),
+            (mode.damping_ratio, true.damping_ratio),
+        ):
+            assert abs(quantity.value - value) < 4 * quantity.std
 
 
 @pytest.mark.further  # as test_touch.py has it
