@@ -106,9 +106,11 @@ def table(results: list[dict[str, Any]]) -> Iterator[str]:
     rows, kinds = [], Counter[str]()
     for each in told:
         first = each["touches"][0]
-        kinds[first.get("kind", "not told")] += 1
+        kind = first.get("kind", "not told")
+        kinds[kind] += 1
         place = first.get("x_m")
-        if place is None or place["std"] is None:
+        # Of what it cannot tell, it says the neighbourhood at most.
+        if kind == "unknown" or place is None or place["std"] is None:
             continue
         low, high = place["interval_95"]
         error = place["value"] - each["x_m"]

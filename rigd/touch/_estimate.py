@@ -72,6 +72,9 @@ _CLEAR = 16.0
 """Difference in the sum of squared residuals that decides between two kinds."""
 _WORSE = 3.5
 """By so many standard deviations may the sum of squared residuals exceed its expectation."""
+_WORSE_LATER = 2.5
+"""The same for what a longer record adds. Bounces make much of small errors of the model: where the
+later ones are explained less well, what the first told is nearer to the truth."""
 
 _RATES_M_PER_S = np.array([-1.5, -0.7, -0.3, -0.1, 0.1, 0.25, 0.5])
 _MOBILITIES = np.array([0.01, 0.04, 0.15, 0.6])
@@ -247,6 +250,7 @@ class _Estimation:
     def told(self, *, scan: bool) -> TouchEstimate:
         """Return what the touch was."""
         starts, covered_s = self.starts, 0.0
+        before: tuple[_Explanation, Window] | None = None
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         for seconds in (*stages, available_s):
@@ -259,6 +263,10 @@ class _Estimation:
                 self.deviations = self._deviations(starts[:1], covered_s)
             window = self.window(seconds)
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
+            if before is not None and self._later_is_worse(rest, window, *before):
+                rest, window = before
+                break
+            before = rest, window
             place = rest.posterior.mean(0)
             known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
             if seconds > FIRST_S and known:
@@ -445,10 +453,18 @@ class _Estimation:
         """Whether no more is left than noise leaves, which is itself known from few samples."""
         return bool(explanation.chi2 < self._most(window.data.size))
 
-    def _most(self, degrees: int) -> float:
+    def _most(self, degrees: int, worse: float = _WORSE) -> float:
         """Greatest sum of squared residuals that noise explains."""
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
-        return float(degrees + _WORSE * np.sqrt(2 * degrees + of_noise))
+        return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
+
+    def _later_is_worse(
+        self, longer: _Explanation, over: Window, shorter: _Explanation, until: Window
+    ) -> bool:
+        """Whether the shorter of two windows is explained, and not what the longer one adds."""
+        added = over.data.size - until.data.size
+        more = longer.chi2 - shorter.chi2
+        return self._fits(shorter, until) and more > self._most(added, _WORSE_LATER)
 
     def _changes(self, rest: _Explanation, window: Window) -> bool:
         """Whether the obstacle at rest becomes much likelier if it may move or give way."""
