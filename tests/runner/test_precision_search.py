@@ -17,6 +17,7 @@ from rigd.engine import (
 from rigd.excitation import Forecast, Piece, parse_target, until
 from rigd.excitation._targets import Precision
 from rigd.profile import load_profile
+from rigd.runner import LoopPreview
 from rigd.runner._precision_search import Search, in_words, stated, targets_json
 
 NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
@@ -82,7 +83,9 @@ class Bench:
 
     def __init__(self, profile, targets="damping 1%", at_most_s=60.0):
         self.profile = profile
-        excitation = until(rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s)
+        excitation = until(
+            rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s, rig=LoopPreview(profile)
+        )
         planned = excitation.search.planned_ticks
         spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
         self.board = SharedState.create(shared_memory_fd())
