@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -83,7 +84,7 @@ _SMALL: Final = 1e-5
 """Loss, relative to stiffness or inertia, at which a damping is brought in."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Unknowns:
     """Vector of unknowns of one structure: its damping, the free settings, offsets and extras.
 
@@ -139,12 +140,12 @@ class Unknowns:
         free_extras = tuple(name for name in EXTRAS if name in extras)
         return cls(structure, nominal, ordered, offsets, (first, second), free_extras)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in the vector's order."""
         return (*self.structure.free, *self.free, *self.offsets, *self.extras)
 
-    @property
+    @cached_property
     def gradient_names(self) -> tuple[str, ...]:
         """The same as the prediction names what it differentiates by."""
         return tuple(_GRADIENT_NAMES.get(name, name) for name in self.names)
@@ -228,7 +229,14 @@ class Unknowns:
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
         """Everything the prediction depends on, at `x`."""
-        values = self._values(x)[0]
+        return self._plant_of(self._values(x)[0])
+
+    def plant_and_gradient(self, x: NDArray[np.float64]) -> tuple[Plant, NDArray[np.float64]]:
+        """Compute `plant` and `gradient_by_unknowns` at `x` together."""
+        values, derivative = self._values(x)
+        return self._plant_of(values), self._scaled(values, derivative)
+
+    def _plant_of(self, values: Mapping[str, float]) -> Plant:
         ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
         return Plant(
             beam=Beam(self.nominal.beam.length_m, ratio * stiffness, stiffness),
@@ -244,11 +252,11 @@ class Unknowns:
         plant = self.plant(x)
         return plant.parameters | {name: plant.extras[name] for name in self.extras}
 
-    @property
-    def units(self) -> dict[str, float]:
+    @cached_property
+    def units(self) -> Mapping[str, float]:
         """What 1 stands for in the unknowns that are linear."""
         beam = self.nominal.beam
-        return {
+        units = {
             "delay_s": _DELAY_UNIT_S,
             "tool_inertia_kg_m2": beam.inertia_kg_m2,
             **dict.fromkeys(self.offsets, 1.0),
@@ -258,6 +266,18 @@ class Unknowns:
             "second_order_filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
             "clock_rate_difference": _CLOCK_UNIT,
         }
+        return MappingProxyType(units)
+
+    @cached_property
+    def _places(self) -> Mapping[str, int]:
+        """Place of each free parameter in the vector."""
+        return MappingProxyType({name: i for i, name in enumerate(self.names)})
+
+    @cached_property
+    def _given(self) -> Mapping[str, float]:
+        """Parameters before any is set free."""
+        fixed = dict(self.structure.fixed.items())
+        return MappingProxyType({**self.nominal.parameters, **self.nominal.extras, **fixed})
 
     def _linear(self, plant: Plant) -> dict[str, float]:
         """Unknowns of a plant that are linear, by name."""
@@ -277,21 +297,23 @@ class Unknowns:
 
         That is zeta and gamma themselves, not their logarithms.
         """
-        values, derivative = self._values(x)
-        coefficients = ("zeta", "gamma")
-        units = [values[name] if name in coefficients else 1.0 for name in self.names]
-        scaled: NDArray[np.float64] = derivative * np.array(units)[:, None]
+        return self._scaled(*self._values(x))
+
+    def _scaled(
+        self, values: Mapping[str, float], derivative: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Take the derivatives of zeta and gamma for those of their logarithms."""
+        scaled = derivative.copy()
+        for place, name in enumerate(self.names):
+            if name in ("zeta", "gamma"):
+                scaled[place] *= values[name]
         return scaled
 
     def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
         """All parameters at `x`, and `estimates_by_unknowns`."""
-        place = {name: i for i, name in enumerate(self.names)}
+        place = self._places
         given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
-        values: dict[str, float] = {
-            **self.nominal.parameters,
-            **self.nominal.extras,
-            **dict(self.structure.fixed.items()),
-        }
+        values: dict[str, float] = dict(self._given)
         derivative = np.eye(x.size)
         first, second = self.omega_rad_s
         # How much the damping adds to stiffness and inertia, as logarithms, and who moves that.
@@ -344,10 +366,10 @@ class Unknowns:
         square = 1 + 2 * size * math.cos(angle) + size * size
         by_ln_size = size * (math.cos(angle) + size) / square
         addition = np.zeros(len(self.names) + 1)
-        addition[self.names.index(coefficient)] = by_ln_size
-        if of in self.names:
+        addition[self._places[coefficient]] = by_ln_size
+        if of in self._places:
             turning = -_QUARTER_TURN * size * math.sin(angle) / square
-            addition[self.names.index(of)] = by_ln_size * slope + turning
+            addition[self._places[of]] = by_ln_size * slope + turning
         addition[-1] = math.log(square) / 2
         return addition
 

@@ -575,9 +575,9 @@ class Objective:
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
         comparison, unknowns = self.comparison, self.unknowns
-        plant, names = unknowns.plant(x), unknowns.gradient_names
+        names = unknowns.gradient_names
+        plant, chain = unknowns.plant_and_gradient(x)
         torque, gradient = comparison.prediction.torque(plant, names)
-        chain = unknowns.gradient_by_unknowns(x)
         poles = tuple(
             Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
             for pole in comparison.poles(plant, names)

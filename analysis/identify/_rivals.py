@@ -150,8 +150,11 @@ def _at_its_modes(
         return start
     places = [unknowns.names.index("density_over_stiffness"), start.size - 1]
 
+    near: list[complex] = []
+
     def missed(x: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        poles = {pole.mode: pole for pole in mode_poles(unknowns.plant(x), max(wanted), ())}
+        poles = {pole.mode: pole for pole in mode_poles(unknowns.plant(x), max(wanted), (), near)}
+        near[:] = [pole.at_rad_s for pole in poles.values()]
         if not wanted.keys() <= poles.keys():
             return None
         return np.array(

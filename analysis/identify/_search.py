@@ -139,9 +139,10 @@ class CoarseResponse:
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
         """Compute the same and its derivatives by the unknowns."""
-        response, *gradient = self._response.evaluate(unknowns.plant(x), unknowns.gradient_names)
+        plant, chain = unknowns.plant_and_gradient(x)
+        response, *gradient = self._response.evaluate(plant, unknowns.gradient_names)
         deviation = response - self._measured
-        jacobian = unknowns.gradient_by_unknowns(x).T @ np.array(gradient)
+        jacobian = chain.T @ np.array(gradient)
         weighted = jacobian.conj() * self._weights
         return NormalEquations(
             cost=self._mean_square(deviation),

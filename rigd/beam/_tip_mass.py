@@ -44,6 +44,8 @@ _SHARE_A_STEP = 0.02
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-10
 """Relative length of Newton's last step: the error is of the order of its square."""
+_CLOSELY = 1e-6
+"""The same from close by, where convergence is quadratic from the first step on."""
 _NEARLY = 1e-4
 """The same on the way to the whole mass."""
 _FARTHEST = 10.0
@@ -287,7 +289,7 @@ class LoadedBeam:
             As `rigd.beam._modes.poles_for_eigenvalues` has them; NaN where a path was lost.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            found = self._newton(near_rad_s, _CONVERGED, zeros=False)
+            found = self._newton(near_rad_s, _CLOSELY, zeros=False)
             if bool((np.abs(found / near_rad_s - 1) < CLOSE_BY).all()):
                 return np.column_stack([found, found.conj()])
         return self._followed(z, zeros=False)

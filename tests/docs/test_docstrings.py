@@ -13,6 +13,7 @@ import inspect
 import re
 import shutil
 import textwrap
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -93,7 +94,8 @@ def complaints_on_class(cls):
         yield from complaints_on_function(cls.__init__, text, may_be_in_summary=False)
     for name in vars(cls):
         method = getattr(cls, name)
-        if not name.startswith("_") and inspect.isroutine(method):
+        takes_arguments = inspect.isroutine(method) and not isinstance(method, cached_property)
+        if not name.startswith("_") and takes_arguments:
             for each in complaints_on_function(method, inspect.getdoc(method)):
                 yield f"{name}: {each}"
 
