@@ -64,7 +64,7 @@ def mode_poles(
     wrt : sequence of str
         Names that `ResponseGrid` knows; some do not move a pole.
     near_rad_s : sequence of complex, optional
-        Where the poles are expected, if all of them are.
+        Where the poles are expected, if all of them are; in the order of the modes.
     """
     near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm or not _OF_ENDS.isdisjoint(wrt):

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify._headline import ONE_MODE
-from analysis.identify._verdict import deviance_of_one
+from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
 from rigd.units import decimals
 
@@ -54,9 +54,10 @@ def of_headline(
     if len(told.visible_modes) < _SEVERAL:
         said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
     else:
-        said = [
-            f"{_DAMPING[free.name]}{beam}. Numbers are those of type {told.name}, all orders free."
-        ]
+        dampings = _DAMPING[free.name]
+        if any(each.reason == ANOTHER_DAMPING for each in orders):
+            dampings = dampings.replace("only", "alone would do")
+        said = [f"{dampings}{beam}. Numbers are those of type {told.name}, all orders free."]
         excluded = told.with_status("excluded")
         if told.explained and excluded:
             said.append(f"Excluded: {_types(excluded)}.")

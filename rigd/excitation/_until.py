@@ -117,7 +117,7 @@ def until(
     rest_s
         Time before it.
     rig
-        Limits the amplitude; without it, it is not limited.
+        Limits the amplitude and suits it to its modes; without it, it is one for all frequencies.
 
     Raises
     ------

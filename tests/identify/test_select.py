@@ -11,7 +11,7 @@ from analysis.identify._free_decay import mode_poles
 from analysis.identify._problem import Comparison
 from analysis.identify._profile_likelihood import CHI_SQUARE_95
 from analysis.identify._refit import resonances_kept
-from analysis.identify._verdict import EVEN
+from analysis.identify._verdict import ANOTHER_DAMPING, EVEN
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam
 
@@ -195,6 +195,23 @@ def test_one_mode_tells_no_order(one_mode):
     assert mode.damping_ratio.value == pytest.approx(0.01245, rel=0.03)
     assert any("excite the second mode" in what for what in one_mode.experiments)
     assert one_mode.findings == ()
+
+
+def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
+    """Its two numbers explain any two loss factors, those of two dampings too."""
+    done = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44), band_hz=(0.0, 30.0))
+    verdict, told = done.verdict, done.headline
+    assert verdict.visible_modes == (1, 2)
+    assert told.fit.structure.name == "IV"
+    for order in (verdict.alpha, verdict.lambda_):
+        assert (order.status, order.reason) == ("not identifiable", ANOTHER_DAMPING)
+    assert told.parameters["zeta"].flag == told.parameters["alpha"].flag == ANOTHER_DAMPING
+    assert all(each.size.flag for each in told.sizes)
+    assert all(mode.damping_ratio.flag is None for mode in told.modes)
+    assert verdict.sentences[0].startswith("Internal damping alone would do.")
+    three = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44)).verdict
+    assert three.alpha.status == "fractional"
+    assert three.lambda_.status == "absent"
 
 
 def test_what_cannot_be_told_apart_is_said(one_mode):
