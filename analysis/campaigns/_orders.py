@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns._pooling import by_structure
-from analysis.identify import ANOTHER_DAMPING, MODES_FOR_ONE_DAMPING, STRONG, WIDEST_SHARE
+from analysis.identify import STRONG, WIDEST_SHARE, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -108,8 +108,6 @@ _ADEQUATE: Final = 0.9
 _SURE: Final = 0.999
 """Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
 
-_FEW_MODES: Final = "a single mode determines the amount of damping, not its order"
-
 
 @dataclass(frozen=True, slots=True)
 class PooledOrder:
@@ -200,10 +198,8 @@ def _judged(
     structure = STRUCTURES[freest.structure]
     modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
-    if not several_modes:
-        return "not identifiable", _FEW_MODES
-    if structure.internal != structure.external and modes < MODES_FOR_ONE_DAMPING:
-        return "not identifiable", ANOTHER_DAMPING
+    if few := too_few_modes(structure, max(modes, 2) if several_modes else 1):
+        return "not identifiable", few
     if not structure.has(order):
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)

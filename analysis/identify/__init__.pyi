@@ -55,10 +55,9 @@ from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
-from ._verdict import ANOTHER_DAMPING as ANOTHER_DAMPING
 from ._verdict import EVEN as EVEN
-from ._verdict import MODES_FOR_ONE_DAMPING as MODES_FOR_ONE_DAMPING
 from ._verdict import STRONG as STRONG
 from ._verdict import OrderVerdict as OrderVerdict
 from ._verdict import Row as Row
 from ._verdict import Verdict as Verdict
+from ._verdict import too_few_modes as too_few_modes

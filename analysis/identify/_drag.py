@@ -25,7 +25,7 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
-from analysis.identify._refit import Refit, unexplained_part
+from analysis.identify._refit import Refit
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
@@ -182,15 +182,9 @@ def _promising(field: CandidateSet) -> bool:
             continue
         unknowns = field.unknowns(candidate.structure, candidate.uniform)
         plant = candidate.fit.plant
-        beside = Refit.descend(
-            field.comparison,
-            unknowns,
-            unknowns.vector(plant),
-            field.noise,
-            np.concatenate([field.columns, _first_order(field.comparison, plant)]),
-            max_evaluations=1,
-        )
-        size, saved, before = _last_amplitude(beside)
+        refit = field.descent(unknowns, unknowns.vector(plant), 1)
+        size, saved = _first_amplitude(refit)
+        before = refit.cost
         cost = max(before - saved, 1e-3 * before)
         gain = candidate.values * math.log(before / cost)
         if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
@@ -205,32 +199,21 @@ def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]
     return comparison.spectrum(response.first_order()[None, comparison.kept])
 
 
-def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
-    """Amplitude of the last column, all else free, the squares that it saves, and those without."""
-    at = refit.objective.linearise(refit.x)
-    weight = refit.noise.weight
-    without = replace(at, columns=at.columns[:-1])
-    projected = refit.objective.project(without, weight)
-    known = np.concatenate([projected.jacobian, without.columns * weight])
-    # The residual has nothing left of the decays; of the unknowns it may have, at no minimum.
-    both = np.stack([at.columns[-1] * weight, projected.residual])
-    column, residual = unexplained_part(both, known)
+def _first_amplitude(refit: Refit) -> tuple[float, float]:
+    """Size of a small drag beside a fit without it, all else free, and the squares it saves."""
+    (column,), residual = refit.beside(_first_order(refit.objective.comparison, refit.plant))
     square = float(np.vdot(column, column).real)
     if square <= 0:
-        return 0.0, 0.0, projected.cost
+        return 0.0, 0.0
     along = float(np.vdot(column, residual).real)
-    return -along / square, along**2 / square, projected.cost
+    return -along / square, along**2 / square
 
 
 def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
     """First order of the drag beside a fit without it; None if the air would have to push."""
     plant, structure = lead.fit.plant, lead.structure
-    columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
     unknowns = field.unknowns(structure, lead.uniform)
-    here = unknowns.vector(plant)
-    size, *_ = _last_amplitude(
-        Refit.descend(field.comparison, unknowns, here, field.noise, columns, max_evaluations=1)
-    )
+    size, _ = _first_amplitude(field.descent(unknowns, unknowns.vector(plant), 1))
     return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
 
 

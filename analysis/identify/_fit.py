@@ -223,6 +223,7 @@ def _compared_jacobian(
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
         return projected.jacobian
-    lost = comparison.lost_gradient(unknowns.plant(x), unknowns.gradient_names)
-    weighted = noise.weight * (unknowns.gradient_by_unknowns(x).T @ lost)
+    plant, chain = unknowns.plant_and_gradient(x)
+    lost = comparison.lost_gradient(plant, unknowns.gradient_names)
+    weighted = noise.weight * (chain.T @ lost)
     return projected.jacobian - weighted

@@ -13,13 +13,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
-from analysis.identify._verdict import (
-    ANOTHER_DAMPING,
-    BESIDE_DRAG,
-    EXCLUDED,
-    STRONG,
-    untold_reason,
-)
+from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -307,7 +301,7 @@ def headline(
         told = _doubted_by(told, other)
     if len(visible) < _MODES_TO_TELL_DAMPINGS:
         told = replace(told, sizes=tuple(each.flagged(ONE_MODE) for each in told.sizes))
-    if untold_reason(field, visible) == ANOTHER_DAMPING:
+    if ANOTHER_DAMPING in reasons.values():
         told = replace(told, sizes=tuple(each.flagged(ANOTHER_DAMPING) for each in told.sizes))
     return replace(told, structures=structures(field, fractional), simpler=simpler)
 

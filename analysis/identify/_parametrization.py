@@ -232,9 +232,16 @@ class Unknowns:
         return self._plant_of(self._values(x)[0])
 
     def plant_and_gradient(self, x: NDArray[np.float64]) -> tuple[Plant, NDArray[np.float64]]:
-        """Compute `plant` and `gradient_by_unknowns` at `x` together."""
+        """Give `plant` at `x`, and differentiate what the prediction is differentiated by.
+
+        That is `gradient_names` by `x`, shape (k, k): zeta and gamma themselves, not their
+        logarithms.
+        """
         values, derivative = self._values(x)
-        return self._plant_of(values), self._scaled(values, derivative)
+        for place, name in enumerate(self.names):
+            if name in ("zeta", "gamma"):
+                derivative[place] *= values[name]
+        return self._plant_of(values), derivative
 
     def _plant_of(self, values: Mapping[str, float]) -> Plant:
         ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
@@ -291,23 +298,6 @@ class Unknowns:
         """
         derivative: NDArray[np.float64] = self._values(x)[1]
         return derivative
-
-    def gradient_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Differentiate what the prediction is differentiated by (`gradient_names`).
-
-        That is zeta and gamma themselves, not their logarithms.
-        """
-        return self._scaled(*self._values(x))
-
-    def _scaled(
-        self, values: Mapping[str, float], derivative: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Take the derivatives of zeta and gamma for those of their logarithms."""
-        scaled = derivative.copy()
-        for place, name in enumerate(self.names):
-            if name in ("zeta", "gamma"):
-                scaled[place] *= values[name]
-        return scaled
 
     def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
         """All parameters at `x`, and `estimates_by_unknowns`."""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._profile_likelihood import Order, Profile
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
+    from analysis.models import Structure
 
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
@@ -41,7 +42,7 @@ of one rig, one had lambda four standard deviations off, with a drag that fell w
 # One order of the damping
 
 _MODES_FOR_AN_ORDER: Final = 2
-MODES_FOR_ONE_DAMPING: Final = 3
+_MODES_FOR_ONE_DAMPING: Final = 3
 """Modes from which on it shows that there is no second damping: two loss factors are explained by
 coefficient and order of one damping as well as by two dampings."""
 
@@ -114,15 +115,29 @@ def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
         Modes that the record shows.
     """
     freest = field.freest
-    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
-    # exactly the beam is uniform.
-    if len(visible) < _MODES_FOR_AN_ORDER:
-        return "a single mode determines the amount of damping, not its order"
+    if few := too_few_modes(freest.structure, len(visible)):
+        return few
     if not freest.uniform and len(freest.structure.free) > len(visible):
         # The modes' frequencies say nothing of the damping here: a loss factor each is all.
         return f"on a non-uniform beam only {len(visible)} loss factors determine it"
-    one_damping = freest.structure.internal != freest.structure.external
-    if one_damping and len(visible) < MODES_FOR_ONE_DAMPING:
+    return None
+
+
+def too_few_modes(structure: Structure, modes: int) -> str | None:
+    """Say why so many modes tell no order, whatever the likelihood says; None if they may.
+
+    Parameters
+    ----------
+    structure : Structure
+        The freest that the data support.
+    modes : int
+        How many show.
+    """
+    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
+    # exactly the beam is uniform.
+    if modes < _MODES_FOR_AN_ORDER:
+        return "a single mode determines the amount of damping, not its order"
+    if structure.internal != structure.external and modes < _MODES_FOR_ONE_DAMPING:
         return ANOTHER_DAMPING
     return None
 
@@ -142,10 +157,10 @@ def _judged(
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     untold = untold_reason(field, visible)
-    if not freest.structure.has(order) and len(visible) >= MODES_FOR_ONE_DAMPING:
-        return "absent", "no such damping shows"
     if untold is not None:
         return "not identifiable", untold
+    if not freest.structure.has(order):
+        return "absent", "no such damping shows"
     if not profile.identifiable:
         return "not identifiable", NOT_DETERMINED
     if doubt is not None:

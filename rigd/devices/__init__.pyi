@@ -2,6 +2,7 @@ from ._eds import Eds as Eds
 from ._eds import EdsEntry as EdsEntry
 from ._eds import EdsError as EdsError
 from ._eds import read_eds as read_eds
+from ._obstacles import NOT_BESIDE_FORCES as NOT_BESIDE_FORCES
 from ._obstacles import NOT_BESIDE_OBSTACLES as NOT_BESIDE_OBSTACLES
 from ._obstacles import Encounter as Encounter
 from ._obstacles import Knock as Knock

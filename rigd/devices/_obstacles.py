@@ -102,10 +102,11 @@ _KEYS: dict[type[Encounter], dict[str, _Key]] = {
     },
 }
 _WORDS = {"rigid": inf}
-NOT_BESIDE_OBSTACLES = (
-    "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "air_drag_m",
-    "stiffness_drift_per_s",
+NOT_BESIDE_FORCES = (
+    "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
 )  # fmt: skip
+"""Keys of ``[simulation]`` with which no force along the beam is simulated, whatever exerts it."""
+NOT_BESIDE_OBSTACLES = (*NOT_BESIDE_FORCES, "air_drag_m")
 """Keys of ``[simulation]`` with which no obstacle is simulated."""
 
 

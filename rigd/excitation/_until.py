@@ -5,13 +5,13 @@ follows is planned while it runs, from what the record has told by then (`_exper
 """
 
 from dataclasses import dataclass
-from math import pi, sqrt
+from math import pi
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, clamped_free_eigenvalues
+from rigd.beam import SMALL_SLOPE_RAD, Beam, undamped_frequencies_rad_s
 from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
     Excitation,
@@ -105,8 +105,8 @@ def until(
     at_most_s
         Longest record.
     tip_slope_rad
-        Largest slope of the beam's free end, of which 90 % are used. Beyond the default, the linear
-        model is not exact.
+        Largest slope of the beam's free end, of which the scan uses 80 % and pieces 90 %. Beyond
+        the default, the linear model is not exact.
     amplitude_rad
         Largest amplitude of the scan, at its end; a sixth of it at mode 2, two fifths at mode 1.
         Lower where the rig's limits or the slope ask for it.
@@ -195,8 +195,7 @@ def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | 
     phase = 2.0 * pi * t * (start_hz + (stop_hz - start_hz) * u**_BEND / (_BEND + 1.0))
     size = np.ones(n)
     if beam is not None:
-        root = float(clamped_free_eigenvalues(1)[0]) / beam.length_m
-        first_hz = root**2 / (2.0 * pi * sqrt(beam.density_over_stiffness))
+        first_hz = undamped_frequencies_rad_s(beam, 1)[0] / (2.0 * pi)
         at_mode = np.maximum(frequency_hz / first_hz, _AT_MODES[0])
         size = np.exp(np.interp(np.log(at_mode), np.log(_AT_MODES), np.log(_SIZES)))
     fade = quintic(_FADE_S, rate_hz)

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.devices import (
+    NOT_BESIDE_FORCES,
     NOT_BESIDE_OBSTACLES,
     AtiSerial,
     ObstacleError,
@@ -152,9 +153,7 @@ def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the simulated rig cannot have together with drag of the air."""
     if not values.get("simulation.air_drag_m"):
         return
-    for name in (
-        "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
-    ):  # fmt: skip
+    for name in NOT_BESIDE_FORCES:
         if values.get(f"simulation.{name}"):
             yield (
                 f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "

@@ -36,7 +36,7 @@ _STEP_STD: Final = 1 / sqrt(12)
 _READY_PATIENCE_S: Final = 20.0
 """Time for the estimator to prepare on a busy computer; nothing moves yet."""
 _LAST_PATIENCE_S: Final = 30.0
-"""Time for the last estimate after the end of a record; a slow computer takes a minute."""
+"""Time for the last estimate after the end of a record; one that takes longer is not told."""
 _POLL_S: Final = 0.05
 
 

@@ -11,9 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Realisation,
-)
+from rigd.beam import Realisation
 from rigd.devices import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake

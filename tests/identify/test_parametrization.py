@@ -31,7 +31,7 @@ def test_derivatives(name, free):
 
     for derivative, logarithmic in (
         (unknowns.estimates_by_unknowns(x), LOGARITHMIC),
-        (unknowns.gradient_by_unknowns(x), LOGARITHMIC - {"zeta", "gamma"}),
+        (unknowns.plant_and_gradient(x)[1], LOGARITHMIC - {"zeta", "gamma"}),
     ):
         numeric = np.array(
             [
@@ -48,7 +48,7 @@ def test_derivatives_with_offsets():
     x[-2:] = 0.03, -0.05
     assert unknowns.names[-2:] == ("stiffness_offset_2", "stiffness_offset_3")
     assert unknowns.plant(x).stiffness_offsets == (0.03, -0.05)
-    derivative = unknowns.gradient_by_unknowns(x)
+    derivative = unknowns.plant_and_gradient(x)[1]
     assert derivative[-2:, -2:] == pytest.approx(np.eye(2))
     assert not derivative[-2:, :-2].any()
     assert not derivative[:-2, -2:].any()
