@@ -1,8 +1,10 @@
 """Measured angle and torque as an estimator takes them: gaps interpolated, decimated to the band.
 
 A missing angle is interpolated, since the convolution with the response needs one at every tick; a
-missing torque is not compared. Decimation is by a linear-phase FIR filter (Kaiser window), so that
-all of the band is kept and neither channel is delayed against the other.
+missing torque is not compared. After a longer gap of the angle the beam may ring by what the motor
+did in it, and that is estimated as the free decay at a record's beginning is. Decimation is by a
+linear-phase FIR filter (Kaiser window), so that all of the band is kept and neither channel is
+delayed against the other.
 
 References
 ----------
@@ -13,17 +15,19 @@ Symp. Circuits and Systems (1974) 20-23.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify._plant import Plant
-from analysis.record_checks import longest_run, too_much_unknown
+from analysis.record_checks import MAX_GAP_S, longest_run, too_much_unknown
 from rigd.beam import Damping
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from analysis.record import Record
@@ -35,7 +39,13 @@ if TYPE_CHECKING:
 _SAME_INSTANT_S: Final = 1e-7
 
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
-"""Longest gap of the angle that is bridged, in periods of the band's upper end."""
+"""Longest gap of the angle that is told by its neighbours, in periods of the band's upper end."""
+
+MOST_LONG_GAPS: Final = 8
+"""Longer ones in one record: after each of them every mode has an unknown amplitude and phase."""
+
+_FILTERS_FORGET: Final = 5.0
+"""Time constants after which a filter has forgotten what was before."""
 
 MAX_TORQUE_GAP_S: Final = 1.0
 """Longest gap of the torque: a longer one may swallow a resonance."""
@@ -239,9 +249,8 @@ class Measurement:
             much = too_much_unknown(f"the {channel}", int(np.count_nonzero(~known)), n)
             if much:
                 raise MeasurementError(f"{self.name}: {much}")
-        bridged_s = MAX_ANGLE_GAP_PERIODS / highest_hz
         for channel, known, allowed_s in (
-            ("angle", self.angle_known, bridged_s),
+            ("angle", self.angle_known, MAX_GAP_S),
             ("torque", self.torque_known, MAX_TORQUE_GAP_S),
         ):
             run, start = longest_run(~known)
@@ -249,15 +258,60 @@ class Measurement:
                 raise MeasurementError(
                     f"{self.name}: the {channel} is missing or flagged for {run} ticks from tick "
                     f"{start} on ({1e3 * run / self.rate_hz:.3g} ms), longer than the "
-                    f"{1e3 * allowed_s:.3g} ms that a band up to {highest_hz:g} Hz tolerates; "
-                    "record the session again."
+                    f"{1e3 * allowed_s:.3g} ms that an analysis tolerates; record the session "
+                    "again."
                 )
+        gaps = len(self.long_gaps(highest_hz))
+        if gaps > MOST_LONG_GAPS:
+            raise MeasurementError(
+                f"{self.name}: the angle is missing or flagged {gaps} times for longer than the "
+                f"{1e3 * MAX_ANGLE_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
+                f"{highest_hz:g} Hz interpolates, more often than the {MOST_LONG_GAPS} times that "
+                "an analysis tolerates; record the session again or lower --band."
+            )
         angles = self.angle_rad[self.angle_known]
         if angles.size == 0 or np.ptp(angles) == 0:
             raise MeasurementError(
                 f"{self.name}: the angle never changes, so nothing was excited; check the encoder "
                 "and that the motor moved."
             )
+
+    def long_gaps(self, highest_hz: float) -> tuple[tuple[int, int], ...]:
+        """Gaps of the angle too long to be told by their neighbours: what moved in them may ring.
+
+        Parameters
+        ----------
+        highest_hz : float
+            End of the band.
+
+        Returns
+        -------
+        tuple of (int, int)
+            Of each its first tick, and the first after it of which the torque's channel, which is
+            late, has forgotten it.
+        """
+        told = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
+        late_s = abs(self.delay_s) + _FILTERS_FORGET * (
+            self.filter_time_constant_s + self.second_order_filter_time_constant_s
+        )
+        late = int(np.ceil(late_s * self.rate_hz))
+        return tuple(
+            (int(start), min(int(end) + late, len(self.angle_rad)))
+            for start, end in zip(*_runs(~self.angle_known), strict=True)
+            if end - start > told
+        )
+
+    def without_torque_in(self, gaps: Iterable[tuple[int, int]]) -> Measurement:
+        """Take the torque for unknown in some gaps, each from a first tick to one after its last.
+
+        Parameters
+        ----------
+        gaps : iterable of (int, int)
+        """
+        known = self.torque_known.copy()
+        for start, end in gaps:
+            known[start:end] = False
+        return replace(self, torque_known=known)
 
     @property
     def nominal(self) -> Plant:

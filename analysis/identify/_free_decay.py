@@ -1,8 +1,9 @@
 """Free decay of the beam's modes: its poles, how they move, and its spectrum over a record.
 
 A beam that already rings when the record begins adds to the torque a sum of decays whose amplitudes
-nobody knows but whose poles are the model's own. Their spectra over the samples compared are
-geometric sums, in closed form.
+nobody knows but whose poles are the model's own. So does one that was moved while nobody looked: in
+a gap of the measured angle. Their spectra over the samples compared are geometric sums, in closed
+form.
 """
 
 from __future__ import annotations
@@ -50,6 +51,11 @@ class Pole:
     def oscillates(self) -> bool:
         """Whether the decay is an oscillation: two columns, else one."""
         return self.at_rad_s.imag != 0
+
+
+def decay_columns(poles: Sequence[Pole]) -> int:
+    """Count the spectra of the decays of some poles: two of each that oscillates."""
+    return sum(1 + pole.oscillates for pole in poles)
 
 
 def mode_poles(
@@ -177,7 +183,7 @@ class DecaySpectra:
         self, poles: Sequence[Pole], upper: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
         """Spectra of the real and, if it oscillates, the imaginary part of a complex decay."""
-        rows = np.empty((sum(1 + pole.oscillates for pole in poles), self._turn.size), complex)
+        rows = np.empty((decay_columns(poles), self._turn.size), complex)
         place = 0
         for pole in poles:
             of_pole = upper(pole.at_rad_s)
@@ -206,4 +212,55 @@ class DecaySpectra:
         total *= (1 - over) * self._period_s
         total -= self._duration_s * over
         total *= reciprocal
+        return total
+
+
+class LaterDecaySpectra(DecaySpectra):
+    """The same of decays that begin at once, within the record, and pass its low-pass filter.
+
+    They begin at a tick of the record; what the samples compared have of that is the sum over the
+    record's ticks, since the filter has no effect in the band. They end with the samples.
+
+    Parameters
+    ----------
+    samples : int
+    rate_hz : float
+        Rate of the samples.
+    omega_rad_s : ndarray, shape (K,)
+    first_s : float
+        First tick of the decays since the first sample; there they have their amplitudes.
+    tick_s : float
+        Time between ticks.
+    """
+
+    __slots__ = ("_first", "_tick_s", "_turn_of_tick")
+
+    def __init__(
+        self,
+        samples: int,
+        rate_hz: float,
+        omega_rad_s: NDArray[np.float64],
+        first_s: float,
+        tick_s: float,
+    ) -> None:
+        super().__init__(samples, rate_hz, omega_rad_s)
+        self._duration_s -= first_s
+        self._tick_s = tick_s
+        self._turn_of_tick = np.exp(-1j * omega_rad_s * tick_s)
+        self._first = tick_s / self._period_s * np.exp(-1j * omega_rad_s * first_s)
+
+    def _sum(self, pole: complex) -> NDArray[np.complex128]:
+        begins = 1 - np.exp(pole * self._tick_s) * self._turn_of_tick
+        ends = 1 - np.exp(pole * self._period_s) * self._turn
+        total: NDArray[np.complex128] = (
+            self._first / begins - np.exp(pole * self._duration_s) / ends
+        )
+        return total
+
+    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
+        tick = np.exp(pole * self._tick_s) * self._turn_of_tick
+        ratio = np.exp(pole * self._period_s) * self._turn
+        over = np.exp(pole * self._duration_s)
+        total: NDArray[np.complex128] = self._first * self._tick_s * tick / (1 - tick) ** 2
+        total -= over * (self._duration_s + self._period_s * ratio / (1 - ratio)) / (1 - ratio)
         return total

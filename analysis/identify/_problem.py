@@ -13,7 +13,13 @@ import numpy as np
 
 from analysis.identify._data import Decimation, MeasurementError, fast_length_below
 from analysis.identify._drag_torque import DragExpansion, DragResponse
-from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
+from analysis.identify._free_decay import (
+    DecaySpectra,
+    LaterDecaySpectra,
+    Pole,
+    decay_columns,
+    mode_poles,
+)
 from analysis.identify._instrument import following
 from analysis.identify._predictor import Prediction
 from analysis.models import LARGEST_SHARE_OF_RATE
@@ -68,6 +74,9 @@ class Comparison:
     visible_modes : int
         Modes of the nominal beam within the band, whose free decay is projected out.
     decays : DecaySpectra
+        Of what rings at the beginning.
+    later_decays : tuple of LaterDecaySpectra
+        Of what rings after each gap of the angle that is too long to be interpolated.
     apart_nm : ndarray, shape (samples,)
         Torque that was taken out because it followed no reference, at the samples kept.
     apart_at_unknown_nm : ndarray, shape (u,)
@@ -96,6 +105,7 @@ class Comparison:
     frequency_hz: NDArray[np.float64]
     visible_modes: int
     decays: DecaySpectra
+    later_decays: tuple[LaterDecaySpectra, ...] = ()
     apart_nm: NDArray[np.float64] | float = 0.0
     apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
@@ -152,9 +162,13 @@ class Comparison:
         kept = slice(inside.start, inside.start + samples)
         frequency_hz = all_hz[bins]
         beam = measurement.beam
+        gaps = measurement.long_gaps(highest_hz)
+        if gaps:
+            measurement = measurement.without_torque_in(gaps)
         known, torque = measurement.torque_known, measurement.torque_nm
         ticks = np.arange(torque.size)
         interpolated = torque if known.all() else np.interp(ticks, ticks[known], torque[known])
+        omega_rad_s = 2 * np.pi * frequency_hz
         comparison = cls(
             measurement=measurement,
             angle_rad=angle_rad,
@@ -167,8 +181,17 @@ class Comparison:
             visible_modes=int(
                 np.sum(undamped_frequencies_rad_s(beam, 50) < 2 * np.pi * highest_hz)
             ),
-            decays=DecaySpectra(samples, decimation.rate_hz, 2 * np.pi * frequency_hz),
+            decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
         )
+        begin_s = [end / measurement.rate_hz - comparison.first_s for _, end in gaps]
+        later = tuple(
+            LaterDecaySpectra(
+                samples, decimation.rate_hz, omega_rad_s, first_s, 1 / measurement.rate_hz
+            )
+            for first_s in begin_s
+            if 0 < first_s < (samples - 1) / decimation.rate_hz
+        )
+        comparison = replace(comparison, later_decays=later)
         return comparison._struck() if measurement.knocks else comparison
 
     def _struck(self) -> Comparison:
@@ -412,13 +435,35 @@ class Comparison:
     def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Spectra of terms of unknown amplitude, shape (m, K).
 
-        Free decays, hum, knocks, and last a zero of the torque sensor that drifts in proportion to
-        time: the jump from the record's end to its beginning would leak into all bins.
+        Free decays, from the beginning on and from each long gap on, hum, knocks, and last a zero
+        of the torque sensor that drifts in proportion to time: the jump from the record's end to
+        its beginning would leak into all bins.
         """
         hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
         drift = _drift(self.samples)[None, self.bins]
         struck = drift[:0] if self.struck is None else self.struck
-        return np.concatenate([self.decays.columns(poles), hum, struck, drift])
+        decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
+        return np.concatenate([*decays, hum, struck, drift])
+
+    def decay_gradient(
+        self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Differentiate the free decays among ``amplitudes @ nuisance(poles)`` through the poles.
+
+        Parameters
+        ----------
+        poles : sequence of Pole
+        amplitudes : ndarray, shape (m,)
+
+        Returns
+        -------
+        ndarray of complex, shape (k, K)
+        """
+        total = self.decays.gradient(poles, amplitudes)
+        each = decay_columns(poles)
+        for number, later in enumerate(self.later_decays, start=1):
+            total += later.gradient(poles, amplitudes[number * each :])
+        return total
 
     def filled(self, plant: Plant) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.
@@ -615,7 +660,7 @@ class Objective:
         gram = columns @ columns.T
         inverse = np.linalg.inv(gram + 1e-12 * np.eye(scale.size))
         amplitudes = -inverse @ (columns @ _parts(residual))
-        jacobian += weight * self.comparison.decays.gradient(at.poles, amplitudes / scale)
+        jacobian += weight * self.comparison.decay_gradient(at.poles, amplitudes / scale)
         parts = _parts(jacobian)
         parts -= ((parts @ columns.T) @ inverse) @ columns
         return Projected(

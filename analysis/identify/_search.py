@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._free_decay import decay_columns
 from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
 from analysis.identify._noise import Noise, noise_of
 from analysis.identify._parametrization import Steps
@@ -257,7 +258,7 @@ class Descent:
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         amplitudes = self.objective.project(at, noise.weight).amplitudes
-        decays = sum(1 + pole.oscillates for pole in at.poles)
+        decays = decay_columns(at.poles) * (1 + len(comparison.later_decays))
         decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
         return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 

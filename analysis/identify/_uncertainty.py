@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._free_decay import decay_columns
 from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
 from analysis.statistics import NORMAL_95
@@ -278,7 +279,7 @@ def ringing(
     hum : ndarray of complex, shape (h, K)
         Those of the lines.
     """
-    count = sum(1 + pole.oscillates for pole in poles)
+    count = decay_columns(poles)
     columns, decays = columns[:count], projected.amplitudes[:count]
     explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
     if len(hum) and decays.size:

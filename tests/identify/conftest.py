@@ -84,13 +84,14 @@ def beyond_uniform(s, beam, damping, offsets):
     return more
 
 
-def response(reference, damping, beam, delay_s, tool_inertia_kg_m2, offsets):
+def response(reference, damping, beam, delay_s, tool_inertia_kg_m2, offsets, follows_at_once=False):
     n = reference.size
     padded = 4 * n
     decay = np.exp(-5.0 * np.arange(n) / n)
     s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
-    loop = 2 * np.pi * 20
-    angle = np.fft.rfft(reference * decay, padded) / (1 + 1.4 * s / loop + (s / loop) ** 2)
+    loop = s / (2 * np.pi * 20)
+    lag = 1 if follows_at_once else 1 + 1.4 * loop + loop**2
+    angle = np.fft.rfft(reference * decay, padded) / lag
     g = transfer(s, beam, damping) + beyond_uniform(s, beam, damping, offsets)
     torque = angle * (g + tool_inertia_kg_m2 * s**2)
     torque *= np.exp(-s * delay_s)
@@ -139,6 +140,21 @@ def session(
 def sessions():
     """Make a session of one of the `PLANTS`: see `session`."""
     return session
+
+
+@pytest.fixture(scope="session")
+def moved_unseen():
+    """Make a session in which the motor also makes a bump of a size in each of some gaps."""
+
+    def moved(name: str, gaps: tuple[tuple[int, int], ...], size_rad: float) -> Session:
+        whole = session(name)
+        bump_rad = np.zeros(whole.angle_rad.size)
+        for first, end in gaps:
+            bump_rad[first:end] = size_rad * np.hanning(end - first)
+        also = response(bump_rad, PLANTS[name], LINK, 0.0, 0.0, (), follows_at_once=True)
+        return Session(whole.angle_rad + also.angle_rad, whole.torque_nm + also.torque_nm)
+
+    return moved
 
 
 @pytest.fixture(scope="session")

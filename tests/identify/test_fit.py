@@ -7,6 +7,7 @@ from cases import further
 from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
 from analysis.identify._parametrization import Steps, Unknowns
 from analysis.identify._problem import Comparison, Objective
+from analysis.identify._residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, modes
@@ -368,7 +369,11 @@ def test_a_narrower_band(sessions, true_parameters):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        ({"unknown_angle": np.arange(900, 920)}, "angle is missing.*20 ticks from tick 900"),
+        ({"unknown_angle": np.arange(900, 1010)}, "angle is missing.*110 ticks from tick 900"),
+        (
+            {"unknown_angle": np.concatenate([np.arange(i, i + 12) for i in range(0, 9000, 1000)])},
+            "angle is missing or flagged 9 times for longer than the 8 ms.*the 8 times",
+        ),
         ({"unknown_torque": np.arange(900, 2901)}, "torque is missing.*2001 ticks.*tolerates"),
         ({"unknown_torque": np.arange(0, 71_000, 10)}, r"\(10 %\) of the torque are missing"),
     ],
@@ -376,6 +381,22 @@ def test_a_narrower_band(sessions, true_parameters):
 def test_too_much_unknown(sessions, spoil, message):
     with pytest.raises(MeasurementError, match=rf"session.mcap.*{message}"):
         fit(sessions("VI").measured(**spoil), "III")
+
+
+def test_what_moved_in_a_gap_of_the_angle_biases_nothing(sessions, moved_unseen, true_parameters):
+    gaps = ((9000, 9012), (21_000, 21_040), (40_000, 40_100))
+    ticks = np.concatenate([np.arange(*gap) for gap in gaps])
+    unseen = {"unknown_angle": ticks, "unknown_torque": ticks}
+    moved = moved_unseen("VI", gaps, 3e-3)
+    analysis = fit_record(moved.measured(noise_nm=5e-4, **unseen), [STRUCTURES["VI"]])
+    (found,) = analysis.fits
+    assert_within(found, true_parameters("VI"))
+    counts = analysis.noise.counts
+    assert whiteness(found.residual[counts], analysis.comparison.frequency_hz[counts]).white
+    # Nothing of what moved counts as noise.
+    at_rest = fit(sessions("VI").measured(noise_nm=5e-4, **unseen), "VI")
+    for name in found.determined:
+        assert found.std[name] == pytest.approx(at_rest.std[name], rel=0.1)
 
 
 def test_values_that_are_not_finite(sessions):

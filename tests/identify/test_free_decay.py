@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import Plant
-from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
+from analysis.identify._data import Decimation
+from analysis.identify._free_decay import DecaySpectra, LaterDecaySpectra, Pole, mode_poles
 from rigd.beam import Beam, Damping, poles
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
@@ -69,6 +70,10 @@ def test_spectra_are_those_of_the_decays():
     expected = np.fft.rfft([wave for pole in some for wave in signal(pole, t)])[:, bins]
     assert spectra.columns(some) == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
+    assert_gradient(spectra, some)
+
+
+def assert_gradient(spectra, some):
     amplitudes = np.array([0.7, -0.4, 1.2])
     gradient = spectra.gradient(some, amplitudes)
     for k in range(3):
@@ -78,6 +83,30 @@ def test_spectra_are_those_of_the_decays():
         )
         numeric = amplitudes @ (spectra.columns(after) - spectra.columns(before)) / 2e-6
         assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-5)
+
+
+def test_spectra_of_decays_that_begin_within_a_filtered_record():
+    rate_hz, begin = 1000.0, 2345
+    decimation = Decimation.to_band(rate_hz, 50.0)
+    inside = decimation.inside(7000)
+    samples = inside.stop - inside.start
+    hz = np.fft.rfftfreq(samples, 1 / decimation.rate_hz)
+    bins = slice(1, int(np.searchsorted(hz, 50.0)))
+    first_s = (begin - (inside.start - decimation.reach) * decimation.factor) / rate_hz
+    spectra = LaterDecaySpectra(
+        samples, decimation.rate_hz, 2 * np.pi * hz[bins], first_s, 1 / rate_hz
+    )
+    derivative = np.array([1 + 2j, -0.5j, 0.3])
+    some = [Pole(1, -0.15 + 16j, derivative), Pole(2, -4.0 + 0j, derivative.real + 0j)]
+    since_s = (np.arange(7000) - begin) / rate_hz
+    expected = [
+        np.fft.rfft(decimation.apply(np.where(since_s >= 0, wave, 0.0))[inside])[bins]
+        for pole in some
+        for wave in signal(pole, np.maximum(since_s, 0.0))
+    ]
+    columns = spectra.columns(some)
+    assert np.abs(columns - expected).max() < 1e-4 * np.abs(columns).max()
+    assert_gradient(spectra, some)
 
 
 def test_no_mode_no_column():
