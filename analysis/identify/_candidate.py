@@ -18,6 +18,9 @@ Kind = tuple[bool, tuple[str, ...]]
 """Kind of rig: whether the beam is uniform, and what else is free."""
 
 
+MODES_FREE: Final = "modes free"
+"""What tables call a beam whose modes have stiffnesses of their own."""
+
 EXTRA_WORDS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "root_compliance_rad_per_nm": "elastic clamp",
@@ -87,6 +90,6 @@ class Candidate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        beside = [] if self.uniform else ["modes free"]
+        beside = [] if self.uniform else [MODES_FREE]
         beside += [EXTRA_WORDS[name] for name in self.extras]
         return ", ".join([self.structure.name, *beside])

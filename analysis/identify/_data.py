@@ -287,7 +287,7 @@ class Measurement:
         Returns
         -------
         tuple of (int, int)
-            Of each its first tick, and the first after it of which the torque's channel, which is
+            First tick of each, and the first after it of which the torque's channel, which is
             late, has forgotten it.
         """
         told = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz

@@ -299,10 +299,6 @@ def headline(
     simpler = _simpler(field, fractional) if unexplained is None else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)
-    if len(visible) < _MODES_TO_TELL_DAMPINGS:
-        told = replace(told, sizes=tuple(each.flagged(ONE_MODE) for each in told.sizes))
-    if ANOTHER_DAMPING in reasons.values():
-        told = replace(told, sizes=tuple(each.flagged(ANOTHER_DAMPING) for each in told.sizes))
     return replace(told, structures=structures(field, fractional), simpler=simpler)
 
 
@@ -334,6 +330,9 @@ def of_fit(
         The same with both dampings (`CandidateSet.with_both_dampings`), which tells the modes.
     """
     with_both, bounded = both or (fit, False)
+    few = ONE_MODE if len(visible) < _MODES_TO_TELL_DAMPINGS else None
+    if ANOTHER_DAMPING in reasons.values():
+        few = ANOTHER_DAMPING
     flags: dict[str, str] = {
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
@@ -350,7 +349,9 @@ def of_fit(
             _size(
                 each,
                 size,
-                unexplained or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None),
+                unexplained
+                or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None)
+                or few,
             )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None

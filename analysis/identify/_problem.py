@@ -74,9 +74,9 @@ class Comparison:
     visible_modes : int
         Modes of the nominal beam within the band, whose free decay is projected out.
     decays : DecaySpectra
-        Of what rings at the beginning.
+        Spectra of what rings at the beginning.
     later_decays : tuple of LaterDecaySpectra
-        Of what rings after each gap of the angle that is too long to be interpolated.
+        Spectra of what rings after each gap of the angle that is too long to be interpolated.
     apart_nm : ndarray, shape (samples,)
         Torque that was taken out because it followed no reference, at the samples kept.
     apart_at_unknown_nm : ndarray, shape (u,)

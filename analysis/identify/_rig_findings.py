@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._candidate import Candidate
+from analysis.identify._candidate import MODES_FREE, Candidate
 from analysis.identify._finding import Finding
 from analysis.identify._verdict import STRONG
 from analysis.statistics import NORMAL_95
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from analysis.identify._candidates import CandidateSet
-
-
-_MODES_FREE: Final = "modes free"
 
 
 def of_rig(field: CandidateSet) -> Iterator[Finding]:
@@ -48,7 +45,7 @@ def of_rig(field: CandidateSet) -> Iterator[Finding]:
 
 def _beside(candidate: Candidate) -> str:
     """One of the extras, "modes free", or "" for a uniform beam and nothing beside it."""
-    return "".join(candidate.extras) or ("" if candidate.uniform else _MODES_FREE)
+    return "".join(candidate.extras) or ("" if candidate.uniform else MODES_FREE)
 
 
 def _beside_a_uniform_beam(others: tuple[Candidate, ...]) -> Iterator[Finding]:
@@ -69,7 +66,7 @@ def _beside_a_uniform_beam(others: tuple[Candidate, ...]) -> Iterator[Finding]:
 def _alone(candidate: Candidate) -> Finding:
     """Name what alone explains the record."""
     kind = _beside(candidate)
-    if kind == _MODES_FREE:
+    if kind == MODES_FREE:
         return _not_uniform(candidate)
     value = candidate.fit.parameters[kind]
     interval = candidate.fit.interval[kind] or (value, value)
@@ -79,7 +76,7 @@ def _alone(candidate: Candidate) -> Finding:
 def _about(candidate: Candidate) -> str:
     """Name one of several explanations, with its size."""
     kind = _beside(candidate)
-    if kind == _MODES_FREE:
+    if kind == MODES_FREE:
         return "a stiffness correction per mode"
     value = candidate.fit.parameters[kind]
     return {

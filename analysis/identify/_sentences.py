@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from analysis.identify._candidate import MODES_FREE
 from analysis.identify._headline import ONE_MODE
 from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
@@ -29,7 +30,6 @@ _DAMPING: Final = {
     "VII": "Internal and external damping",
 }
 _SEVERAL: Final = 2
-_FREE: Final = "modes free"
 _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 
 
@@ -48,9 +48,9 @@ def of_headline(
     """
     free = told.fit.structure
     kind = told.name.partition(", ")[2]
-    beam = ", on a non-uniform beam (stiffness correction per mode)" if kind == _FREE else ""
-    if kind and not beam:
-        beam = f", beside {kind}"
+    beam = f", beside {kind}" if kind else ""
+    if kind == MODES_FREE:
+        beam = ", on a non-uniform beam (stiffness correction per mode)"
     if len(told.visible_modes) < _SEVERAL:
         said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
     else:
