@@ -33,6 +33,10 @@ _NOT_DETERMINED: Final = "not identifiable from this record"
 _AT_EDGE: Final = "at the edge of the range searched"
 
 _MODES_TO_TELL_DAMPINGS: Final = 2
+_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+_NOT_APART: Final = "not separable from a damping of unknown order"
+"""Damping of a low order is a stiffness, of an order near 2 an inertia."""
+
 ONE_MODE: Final = "one mode alone does not separate internal from external damping"
 
 _LAW_ASSUMED: Final = (
@@ -336,6 +340,8 @@ def of_fit(
     flags: dict[str, str] = {
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
+    if few or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
+        flags |= dict.fromkeys(_BEAM, _NOT_APART)
     return Headline(
         name=name,
         fit=fit,

@@ -63,7 +63,6 @@ INTEGER: Final = STRUCTURES["III"]
 """Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
 no valleys there, and no damping that is a stiffness or an inertia in truth."""
 
-_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
 _NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
 """What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
@@ -311,17 +310,6 @@ def _freest_alone(
         both=None if misread else field.with_both_dampings(field.best),
     )
     told = told.doubted(_CLIPPED) if "clipping" in kinds else told
-    if not misread and (
-        untold_reason(field, visible) or not COEFFICIENT_OF.keys().isdisjoint(told.fit.at_bounds)
-    ):
-        # Damping of a low order is a stiffness, of an order near 2 an inertia: they are not apart.
-        told = replace(
-            told,
-            parameters={
-                name: each.flagged(NOT_DETERMINED) if name in _BEAM else each
-                for name, each in told.parameters.items()
-            },
-        )
     others = (each.fit for each in field.candidates if each.structure is INTEGER)
     analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
     return _Told((told, found, analysis), field, explained, kinds)

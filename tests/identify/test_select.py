@@ -190,6 +190,11 @@ def test_one_mode_tells_no_order(one_mode):
     for name in told.parameters.keys() & {"zeta", "alpha", "gamma", "lambda"}:
         assert "a single mode determines" in told.parameters[name].flag
     assert all("one mode alone" in each.size.flag for each in told.sizes)
+    # Nor is a stiffness told from a damping of a low order, or an inertia from one of a high order.
+    for name in ("density_over_stiffness", "bending_stiffness_n_m2"):
+        assert "damping of unknown order" in told.parameters[name].flag
+        assert told.parameters[name].interval_95 is not None
+    assert told.modes[0].frequency_hz.flag is None
     (mode,) = told.modes
     assert mode.damping_ratio.flag is None
     assert mode.damping_ratio.value == pytest.approx(0.01245, rel=0.03)
