@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns import CampaignResult, NominalModel, PooledParameter
+    from analysis.campaigns import CampaignResult, NominalModel, PooledParameter, SessionResult
 
 _PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),
@@ -93,15 +93,12 @@ def index_figure(campaign: CampaignResult) -> Figure:
         Line2D([], [], color="#C00000", label="median"),
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
     ]
-    figure.legend(
-        handles=[*keys, *marks], loc="upper left", ncols=len(keys) + 2, borderaxespad=0.0,
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
-    )  # fmt: skip
+    style.legend(figure, [*keys, *marks], columns=len(keys) + 2)
     return figure
 
 
 _COLUMNS: Final = 4
-_POOLED: Final = "#C3DCED"
+INTERVAL: Final = "#C3DCED"
 """Colour of an interval: the pooled line's blue, but light and opaque."""
 
 
@@ -138,17 +135,14 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
         _panel(campaign, estimate.name, parameter, axes, reported=parameter.name not in doubtful)
         if number + _COLUMNS >= len(estimate.parameters):
             axes.set_xlabel("Session", labelpad=1)
-    figure.legend(
-        handles=[
-            Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
-                   label="session, ± 1.96 of its standard deviation"),
-            Line2D([], [], color=style.BLUE, label="pooled"),
-            Patch(facecolor=_POOLED, label="its 95 % interval"),
-            Patch(facecolor=style.SHADE, label="95 % prediction interval"),
-        ],
-        loc="upper left", ncols=4, borderaxespad=0.0,
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
-    )  # fmt: skip
+    marks = [
+        Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
+               label="session, ± 1.96 of its standard deviation"),
+        Line2D([], [], color=style.BLUE, label="pooled"),
+        Patch(facecolor=INTERVAL, label="its 95 % interval"),
+        Patch(facecolor=style.SHADE, label="95 % prediction interval"),
+    ]  # fmt: skip
+    style.legend(figure, marks, columns=4)
     return figure
 
 
@@ -167,7 +161,7 @@ def _panel(
     axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
     axes.axhspan(
         *(factor * end for end in parameter.interval),
-        color=_POOLED if reported else style.FAINT,
+        color=INTERVAL if reported else style.FAINT,
         zorder=0.6,
     )
     ink, line = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
@@ -187,10 +181,8 @@ _MOST_POINTS: Final = 500
 _WIDE_COLUMNS: Final = 1500
 _MOST_LINES: Final = 40
 """Most sessions drawn: more would not be told apart."""
-_SYMBOLS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
-_MEASURED: Final[dict[str, Any]] = {
-    "color": "#A8A8A8", "linewidth": 0.5, "alpha": 0.7, "rasterized": True,
-}  # fmt: skip
+SESSION: Final = "#A8A8A8"
+"""Colour of a single session's response."""
 _PAIR: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (4, 2))},
@@ -209,23 +201,17 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
         top=1 - 1.15 / height_in, bottom=0.55 / height_in, wspace=0.12, hspace=0.24,
     )  # fmt: skip
     lines = line_styles(campaign.settings.weightings)
-    limits = _db_limits(campaign, campaign.nominal)
     handles: dict[str, Line2D] = {}
-    for number, name in enumerate(types):
-        row, column = divmod(number, columns)
-        cell = grid[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
-        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
+    panels = style.type_panels(
+        figure, grid, types, campaign.settings.band_hz, _db_limits(campaign, campaign.nominal)
+    )
+    for name, magnitude, phase in panels:
         models = [model for model in campaign.nominal if model.structure == name]
         looks = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
         handles |= _response_panel(campaign, magnitude, phase, models, looks, _MOST_POINTS)
-        free = ", ".join(_SYMBOLS[p] for p in STRUCTURES[name].free)
-        magnitude.set_title(f"Type {name}   {free}")
-        _dress(campaign, magnitude, phase, limits, bottom=number >= len(types) - columns)
-        for axes in (magnitude, phase):
-            axes.tick_params(labelleft=column == 0)
-            if column:
-                axes.set_ylabel("")
-    _legend(figure, handles, width_in, height_in)
+    for phase in figure.axes[1::2][-columns:]:
+        phase.set_xlabel("Frequency (Hz)", labelpad=1)
+    _legend(figure, handles)
     return figure
 
 
@@ -245,8 +231,12 @@ def best_figure(campaign: CampaignResult) -> Figure:
         for m, look in zip(models, _PAIR, strict=False)
     ]
     handles = _response_panel(campaign, magnitude, phase, models, looks, _WIDE_COLUMNS)
-    _dress(campaign, magnitude, phase, _db_limits(campaign, models), bottom=True)
-    _legend(figure, handles, width_in, height_in)
+    magnitude.set_ylim(_db_limits(campaign, models))
+    style.response_axes(magnitude, phase)
+    style.frequency_axis(magnitude, campaign.settings.band_hz, labels=False)
+    style.frequency_axis(phase, campaign.settings.band_hz)
+    phase.set_xlabel("Frequency (Hz)", labelpad=1)
+    _legend(figure, handles)
     return figure
 
 
@@ -270,20 +260,11 @@ def _response_panel(
     columns: int,
 ) -> dict[str, Line2D]:
     handles: dict[str, Line2D] = {}
-    sessions = campaign.sessions
-    frequency_hz = sessions[0].frequency_hz
-    chosen = np.unique(np.linspace(0, len(sessions) - 1, _MOST_LINES).round().astype(int))
-    few = style.spread(frequency_hz, 2 * columns)
-    for number in chosen:
-        response = sessions[number].response
-        (handles["measured, every session"],) = magnitude.plot(
-            *_line(frequency_hz, magnitude_db(response), columns), **_MEASURED
+    frequency_hz = campaign.sessions[0].frequency_hz
+    for session in shown_sessions(campaign):
+        handles["measured, every session"] = draw_session(
+            magnitude, phase, frequency_hz, session.response, columns, 2 * columns, alpha=0.7
         )
-        # Dots: a line would run up and down wherever noise wraps the phase.
-        phase.plot(
-            frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8,
-            color=_MEASURED["color"], rasterized=True,
-        )  # fmt: skip
     for model, (name, look) in zip(models, looks, strict=True):
         (handles[name],) = magnitude.plot(
             *_line(frequency_hz, magnitude_db(model.response), columns), **look, linewidth=1.3
@@ -292,47 +273,50 @@ def _response_panel(
     return handles
 
 
+def shown_sessions(campaign: CampaignResult) -> list[SessionResult]:
+    """Choose sessions to be drawn beside each other, spread over the campaign."""
+    last = len(campaign.sessions) - 1
+    chosen = np.unique(np.linspace(0, last, _MOST_LINES).round().astype(int))
+    return [campaign.sessions[number] for number in chosen]
+
+
+def draw_session(
+    magnitude: Axes,
+    phase: Axes,
+    frequency_hz: NDArray[np.float64],
+    response: NDArray[np.complex128],
+    columns: int,
+    dots: int,
+    alpha: float = 1.0,
+) -> Line2D:
+    """Draw one session's response behind what is told of all; return the line of its magnitude."""
+    (line,) = magnitude.plot(
+        *_line(frequency_hz, magnitude_db(response), columns), color=SESSION, linewidth=0.5,
+        alpha=alpha, rasterized=True,
+    )  # fmt: skip
+    few = style.spread(frequency_hz, dots)
+    # Dots: a line would run up and down wherever noise wraps the phase.
+    phase.plot(
+        frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8, color=SESSION,
+        rasterized=True,
+    )  # fmt: skip
+    return line
+
+
 def _line(
     frequency_hz: NDArray[np.float64], values: NDArray[np.float64], columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return style.envelope(frequency_hz, values, columns, logarithmic=True)
 
 
-def _dress(
-    campaign: CampaignResult,
-    magnitude: Axes,
-    phase: Axes,
-    limits: tuple[float, float],
-    *,
-    bottom: bool,
-) -> None:
-    band = campaign.settings.band_hz
-    magnitude.set_ylim(limits)
-    phase.set_ylim(-60, 240)
-    phase.set_yticks((0, 90, 180))
-    style.frequency_axis(magnitude, band, labels=False)
-    style.frequency_axis(phase, band, labels=bottom)
-    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
-    phase.set_ylabel("Phase (°)")
-    if bottom:
-        phase.set_xlabel("Frequency (Hz)", labelpad=1)
-
-
-def _legend(figure: Figure, handles: dict[str, Line2D], width_in: float, height_in: float) -> None:
-    legend = figure.legend(
-        list(handles.values()), list(handles), loc="upper left",
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in), ncols=len(handles),
-        borderaxespad=0.0,
-    )  # fmt: skip
+def _legend(figure: Figure, handles: dict[str, Line2D]) -> None:
+    legend = style.legend(figure, list(handles.values()), list(handles), columns=len(handles))
     legend.get_lines()[0].set_linewidth(1.5)
 
 
 def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
-    """Limits that hold the measured responses and the models' peaks, not every zero's depth."""
-    measured = np.concatenate([magnitude_db(s.response) for s in campaign.sessions])
-    peaks = max(float(magnitude_db(model.response).max()) for model in models)
-    top = float(measured.max())
-    return float(np.quantile(measured, 0.002)) - 4.0, min(max(peaks, top), top + 15.0) + 3.0
+    measured = [session.response for session in campaign.sessions]
+    return style.db_limits(measured, [model.response for model in models], room_db=3.0)
 
 
 _ROW_IN: Final = 0.27
@@ -381,10 +365,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
         *(Line2D([], [], color=colors[w], marker="o", linestyle="", markersize=3.5,
                  label=f"nominal model, weights {w}") for w in weightings),
     ]  # fmt: skip
-    figure.legend(
-        handles=handles, loc="upper left", ncols=2, borderaxespad=0.0,
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.6 / height_in),
-    )  # fmt: skip
+    style.legend(figure, handles, columns=2)
     return figure
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from analysis.models import ESTIMATOR_WORDS
 from analysis.report import _style as style
+from rigd.view import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +30,6 @@ _MORE_LINES: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.PURPLE, "linestyle": (0, (5, 1.5, 1, 1.5))},
     {"color": style.ORANGE, "linestyle": "-"},
 )
-_DAMPINGS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
 
 
 def frf_figure(analysis: WelchAnalysis) -> Figure:
@@ -53,34 +53,21 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
         height_ratios=(*(1.0,) * rows, 0.22),
     )  # fmt: skip
     lines = line_styles(settings.weightings)
-    db_limits = _db_limits(analysis)
+    # Room for the scores above the highest peak.
+    limits_db = style.db_limits(
+        [analysis.response.response], [model.response for model in analysis.models],
+        room_db=5.0 * len(settings.weightings),
+    )  # fmt: skip
     handles: dict[str, Line2D] = {}
-    for number, name in enumerate(types):
-        row, column = divmod(number, columns)
-        cell = grid[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
-        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
+    panels = style.type_panels(figure, grid, types, settings.band_hz, limits_db)
+    for name, magnitude, phase in panels:
         models = [m for m in analysis.models if m.fit.structure.name == name]
         handles |= _panel(analysis, models, magnitude, phase, lines)
-        free = models[0].fit.structure.free
-        magnitude.set_title(f"Type {name}   {', '.join(_DAMPINGS[p] for p in free)}")
         _scores(magnitude, models, lines)
-        magnitude.set_ylim(db_limits)
-        phase.set_ylim(-60, 240)
-        phase.set_yticks((0, 90, 180))
-        style.frequency_axis(magnitude, settings.band_hz, labels=False)
-        style.frequency_axis(phase, settings.band_hz, labels=number >= len(types) - columns)
-        for axes in (magnitude, phase):
-            axes.tick_params(labelleft=column == 0)
-        if column == 0:
-            magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
-            phase.set_ylabel("Phase (°)")
     strip = figure.add_subplot(grid[rows, :])
     _coherence(strip, analysis)
-    figure.legend(
-        list(handles.values()), list(handles), loc="upper left",
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.66 / height_in),
-        ncols=min(len(handles), _LEGEND_COLUMNS), borderaxespad=0.0,
-    )  # fmt: skip
+    columns = min(len(handles), _LEGEND_COLUMNS)
+    style.legend(figure, list(handles.values()), list(handles), columns=columns)
     return figure
 
 
@@ -137,16 +124,17 @@ def _panel(
     for label, frequency_hz, response, look in curves:
         known = np.isfinite(response) & (response != 0)
         at_hz, values = frequency_hz[known], response[known]
-        magnitude_db, phase_deg = 20 * np.log10(np.abs(values)), style.phase_deg(values)
         (handles[label],) = magnitude.plot(
-            *style.envelope(at_hz, magnitude_db, _COLUMNS, logarithmic=True), **look
+            *style.envelope(at_hz, magnitude_db(values), _COLUMNS, logarithmic=True), **look
         )
         if label.startswith("measured"):
             # Dots: a line would run up and down wherever noise wraps the phase.
             few = style.spread(at_hz, 2 * _COLUMNS)
-            style.dots(phase, at_hz[few], phase_deg[few], size_pt=1.8, color=look["color"])
+            style.dots(phase, at_hz[few], phase_deg(values[few]), size_pt=1.8, color=look["color"])
         else:
-            phase.plot(*style.envelope(at_hz, phase_deg, _COLUMNS, logarithmic=True), **look)
+            phase.plot(
+                *style.envelope(at_hz, phase_deg(values), _COLUMNS, logarithmic=True), **look
+            )
     for peak in analysis.peaks:
         if peak is not None:
             for axes in (magnitude, phase):
@@ -164,19 +152,6 @@ def _scores(axes: Axes, models: list[FittedModel], lines: dict[str, dict[str, An
             color=lines[model.fit.weighting]["color"],
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
-
-
-def _db_limits(analysis: WelchAnalysis) -> tuple[float, float]:
-    """Limits that hold the measured response and the models' peaks, not the depth of every zero."""
-    measured_db = 20 * np.log10(np.abs(analysis.response.response) + 1e-300)
-    top = max(
-        float(measured_db.max()),
-        *(float(20 * np.log10(np.abs(model.response).max())) for model in analysis.models),
-    )
-    bottom = float(np.quantile(measured_db, 0.002))
-    # Room for the scores above the highest peak.
-    scores = 5.0 * len(analysis.settings.weightings)
-    return bottom - 4.0, min(top, float(measured_db.max()) + 15.0) + scores
 
 
 def _coherence(axes: Axes, analysis: WelchAnalysis) -> None:

@@ -11,6 +11,7 @@ from analysis.campaigns import title
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._bands import dense_grid, loss_factors, response_band
+from analysis.report._campaign_figures import INTERVAL, SESSION, draw_session, shown_sessions
 from analysis.report._pooled_tables import used
 from analysis.statistics import NORMAL_95, student_t_quantile
 from rigd.view import magnitude_db, phase_deg
@@ -26,13 +27,8 @@ if TYPE_CHECKING:
     from analysis.identify import ModeEstimate, Plant
     from analysis.models import Structure
 
-_BAND: Final = "#C3DCED"
-"""Colour of intervals: the blue of the pooled line, but light and opaque."""
-_SESSION: Final = "#A8A8A8"
 _POINTS: Final = 400
 _COLUMNS: Final = 1500
-_MOST_LINES: Final = 40
-"""Most sessions drawn: more would not be told apart."""
 _BESIDE: Final = 1.6
 """Ratio of the axis's ends to the outermost modes."""
 
@@ -105,16 +101,13 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     axes.margins(y=0.1)
     axes.set_ylabel("Damping ratio (%)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
-    figure.legend(
-        handles=[
-            Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
-                   label="session, ± 1.96 of its standard deviation"),
-            Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
-            Patch(facecolor=_BAND, label="its 95 % interval"),
-        ],
-        loc="upper left", ncols=3, borderaxespad=0.0,
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
-    )  # fmt: skip
+    marks = [
+        Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
+               label="session, ± 1.96 of its standard deviation"),
+        Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
+        Patch(facecolor=INTERVAL, label="its 95 % interval"),
+    ]  # fmt: skip
+    style.legend(figure, marks, columns=3)
     return figure
 
 
@@ -140,15 +133,15 @@ def _curve(axes: Axes, pooled: PooledEstimate) -> None:
     )
     total = loss_factors(_PooledFit.of(pooled), frequency_hz).total
     low, high = total.limits()
-    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=_BAND, linewidth=0)
+    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL, linewidth=0)
     axes.plot(frequency_hz, 50 * total.value, color=style.BLUE)
 
 
-def _pooled_mode(axes: Axes, mode: PooledMode, sessions: int, *, origin_hz: float = 0.0) -> None:
+def _pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
     """Draw a pooled mode with the 95 % interval of its damping ratio."""
     half = 100 * student_t_quantile(0.95, sessions - 1) * mode.damping_ratio_std
     axes.errorbar(
-        [mode.frequency_hz - origin_hz], [100 * mode.damping_ratio], yerr=[half], fmt="D",
+        [mode.frequency_hz], [100 * mode.damping_ratio], yerr=[half], fmt="D",
         color=style.BLUE, markersize=4.0, capsize=3.0, elinewidth=1.0, zorder=4,
     )  # fmt: skip
 
@@ -162,7 +155,7 @@ def _enlarged(axes: Axes, mode: PooledMode, own: Sequence[ModeEstimate], session
     axes.add_patch(
         Rectangle(
             (-half_mhz, 100 * mode.damping_ratio - half), 2 * half_mhz, 2 * half,
-            facecolor=_BAND, edgecolor="none", zorder=1,
+            facecolor=INTERVAL, edgecolor="none", zorder=1,
         )
     )  # fmt: skip
     axes.errorbar(
@@ -218,15 +211,12 @@ def response_figure(campaign: CampaignResult) -> Figure:
     lowest_db = _draw_sessions(campaign, pooled, magnitude, phase, band.frequency_hz)
     low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
     modelled_db = magnitude_db(band.response)
-    magnitude.fill_between(band.frequency_hz, low, high, color=_BAND, linewidth=0)
+    magnitude.fill_between(band.frequency_hz, low, high, color=INTERVAL, linewidth=0)
     magnitude.plot(band.frequency_hz, modelled_db, color=style.BLUE)
     magnitude.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
                        float(modelled_db.max()) + 5)  # fmt: skip
-    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
     phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
-    phase.set_ylim(-60, 240)
-    phase.set_yticks((0, 90, 180))
-    phase.set_ylabel("Phase (°)")
+    style.response_axes(magnitude, phase)
     width.plot(band.frequency_hz, 100 * NORMAL_95 * band.log_magnitude_std, color=style.BLUE)
     width.set_ylim(bottom=0.0)
     width.set_ylabel("Band (± %)")
@@ -234,16 +224,13 @@ def response_figure(campaign: CampaignResult) -> Figure:
     for axes in (magnitude, phase, width):
         style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
     figure.align_ylabels()
-    figure.legend(
-        handles=[
-            Line2D([], [], color=_SESSION, linewidth=1.5,
-                   label=f"sessions, {'measured' if measured else 'each by its own fit'}"),
-            Line2D([], [], color=style.BLUE, label="pooled"),
-            Patch(facecolor=_BAND, label="its 95 % band"),
-        ],
-        loc="upper left", ncols=3, borderaxespad=0.0,
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
-    )  # fmt: skip
+    marks = [
+        Line2D([], [], color=SESSION, linewidth=1.5,
+               label=f"sessions, {'measured' if measured else 'each by its own fit'}"),
+        Line2D([], [], color=style.BLUE, label="pooled"),
+        Patch(facecolor=INTERVAL, label="its 95 % band"),
+    ]  # fmt: skip
+    style.legend(figure, marks, columns=3)
     return figure
 
 
@@ -264,10 +251,8 @@ def _draw_sessions(
     """Draw what each session has; return the least magnitude worth showing, in dB."""
     from analysis.identify import ResponseGrid
 
-    sessions = campaign.sessions
-    chosen = np.unique(np.linspace(0, len(sessions) - 1, _MOST_LINES).round().astype(int))
     lowest = np.inf
-    for session in (sessions[number] for number in chosen):
+    for session in shown_sessions(campaign):
         frequency_hz, response = session.frequency_hz, session.response
         if not frequency_hz.size:
             own = [each for each in session.record_estimates if each.name == pooled.name]
@@ -275,16 +260,6 @@ def _draw_sessions(
                 continue
             frequency_hz = grid_hz
             response = ResponseGrid(2j * np.pi * grid_hz).evaluate(own[0].plant, ())[0]
-        db = magnitude_db(response)
-        lowest = min(lowest, float(np.quantile(db, 0.005)))
-        magnitude.plot(
-            *style.envelope(frequency_hz, db, _COLUMNS, logarithmic=True), color=_SESSION,
-            linewidth=0.5, rasterized=True,
-        )  # fmt: skip
-        few = style.spread(frequency_hz, _COLUMNS)
-        # Dots: a line would run up and down wherever noise wraps the phase.
-        phase.plot(
-            frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8, color=_SESSION,
-            rasterized=True,
-        )  # fmt: skip
+        lowest = min(lowest, float(np.quantile(magnitude_db(response), 0.005)))
+        draw_session(magnitude, phase, frequency_hz, response, _COLUMNS, _COLUMNS)
     return lowest

@@ -25,6 +25,7 @@ from analysis.report._bands import dense_grid, loss_factors, response_band, supp
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
+from rigd.view import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -88,18 +89,17 @@ def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
     whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
     magnitude, phase, width = (figure.add_subplot(whole[row]) for row in range(3))
     _magnitude(magnitude, measured.frequency_hz, seen, band, _PALE)
-    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
-    modelled_db = _db(band.response)
-    bottom = min(float(np.quantile(_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05)))
+    modelled_db = magnitude_db(band.response)
+    bottom = min(
+        float(np.quantile(magnitude_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05))
+    )
     magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
     few = style.spread(measured.frequency_hz, _POINTS)
     style.dots(
-        phase, measured.frequency_hz[few], style.phase_deg(seen[few]), size_pt=2.0, color=style.GREY
+        phase, measured.frequency_hz[few], phase_deg(seen[few]), size_pt=2.0, color=style.GREY
     )
-    phase.plot(band.frequency_hz, style.phase_deg(band.response), color=style.BLUE)
-    phase.set_ylabel("Phase (°)")
-    phase.set_ylim(-60, 240)
-    phase.set_yticks((0, 90, 180))
+    phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
+    style.response_axes(magnitude, phase)
     half_percent = 100 * NORMAL_95 * band.log_magnitude_std
     width.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
     plain_logarithmic(width, 0.8 * half_percent.min(), 1.4 * half_percent.max())
@@ -114,7 +114,7 @@ def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
         close = response_band(fit, np.linspace(*limits, _DETAIL_POINTS))
         _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
         detail.set_xlim(limits)
-        detail.set_ylim(style.limits(_db(seen[near]), _db(close.response)))
+        detail.set_ylim(style.limits(magnitude_db(seen[near]), magnitude_db(close.response)))
         detail.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
         detail.set_facecolor("#FCFAF4")
         detail.set_xlabel("Frequency (Hz)", labelpad=1)
@@ -136,15 +136,18 @@ def _magnitude(
 ) -> None:
     """Draw the measured magnitude, the model's over it, and its band."""
     axes.plot(
-        *style.envelope(frequency_hz, _db(measured), _POINTS, logarithmic=True),
+        *style.envelope(frequency_hz, magnitude_db(measured), _POINTS, logarithmic=True),
         color=color, linewidth=0.8, label="measured",
     )  # fmt: skip
-    low, high = band.magnitude_limits()
+    low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
     axes.fill_between(
-        band.frequency_hz, _db(low), _db(high), color=_BAND, linewidth=0, alpha=0.6,
+        band.frequency_hz, low, high, color=_BAND, linewidth=0, alpha=0.6,
         label="95 % band of the model",
     )  # fmt: skip
-    axes.plot(band.frequency_hz, _db(band.response), color=style.BLUE, linewidth=1.1, label="model")
+    axes.plot(
+        band.frequency_hz, magnitude_db(band.response), color=style.BLUE, linewidth=1.1,
+        label="model",
+    )  # fmt: skip
 
 
 def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
@@ -154,10 +157,6 @@ def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[floa
     half_hz = max(share * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
-
-
-def _db(values: NDArray[np.complex128] | NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(20 * np.log10(np.maximum(np.abs(values), 1e-300)))
 
 
 _LOSS_POINTS: Final = 400

@@ -22,14 +22,19 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
+from analysis.models import QUANTITIES, STRUCTURES
 from analysis.report._folder import write_new
 from analysis.results import FIGURE_FORMATS
+from rigd.view import magnitude_db
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.gridspec import GridSpec
+    from matplotlib.legend import Legend
     from numpy.typing import NDArray
 
     from analysis.results import FigureFormat
@@ -310,9 +315,60 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = T
     axes.tick_params(axis="x", which="both", labelbottom=labels)
 
 
-def phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
-    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
+def response_axes(magnitude: Axes, phase: Axes, *, labels: bool = True) -> None:
+    """Label the axes of a torque over an angle; its phase lies between 0 and 180°, well inside."""
+    phase.set_ylim(-60, 240)
+    phase.set_yticks((0, 90, 180))
+    if labels:
+        magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+        phase.set_ylabel("Phase (°)")
+
+
+def type_panels(
+    figure: Figure,
+    cells: GridSpec,
+    types: Sequence[str],
+    band_hz: tuple[float, float],
+    db_limits: tuple[float, float],
+) -> Iterator[tuple[str, Axes, Axes]]:
+    """Make a panel of magnitude and phase for each model type, in the first cells of a grid."""
+    for number, name in enumerate(types):
+        row, column = divmod(number, cells.ncols)
+        cell = cells[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
+        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
+        symbols = ", ".join(QUANTITIES[each][0] for each in STRUCTURES[name].free)
+        magnitude.set_title(f"Type {name}   {symbols}")
+        magnitude.set_ylim(db_limits)
+        response_axes(magnitude, phase, labels=column == 0)
+        frequency_axis(magnitude, band_hz, labels=False)
+        frequency_axis(phase, band_hz, labels=number >= len(types) - cells.ncols)
+        for axes in (magnitude, phase):
+            axes.tick_params(labelleft=column == 0)
+        yield name, magnitude, phase
+
+
+def db_limits(
+    measured: Sequence[NDArray[np.complex128]],
+    models: Sequence[NDArray[np.complex128]],
+    room_db: float,
+) -> tuple[float, float]:
+    """Limits that hold measured responses and the models' peaks, not the depth of every zero."""
+    measured_db = magnitude_db(np.concatenate(measured) + 1e-300)
+    top_db = float(measured_db.max())
+    peaks_db = max(float(magnitude_db(model).max()) for model in models)
+    low_db = float(np.quantile(measured_db, 0.002)) - 4.0
+    return low_db, min(max(top_db, peaks_db), top_db + 15.0) + room_db
+
+
+def legend(
+    figure: Figure, handles: Sequence[Artist], names: Sequence[str] | None = None, *, columns: int
+) -> Legend:
+    """Explain lines under the subtitle, by their labels or by names."""
+    width_in, height_in = figure.get_size_inches()
+    return figure.legend(
+        handles=handles, labels=names, loc="upper left", ncols=columns, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
 
 
 def limits(*values: NDArray[np.float64]) -> tuple[float, float]:
