@@ -76,8 +76,8 @@ Model = Annotated[
 ]
 
 
-Parameters = Callable[..., "dict[str, Value]"]
-"""Makes an excitation's parameters, by the names they have everywhere else, from its options."""
+Parameters = Callable[..., "Mapping[str, Value | None]"]
+"""Makes an excitation's parameters from its options, which have their names wherever they can."""
 
 
 def excitation_command(parameters: Parameters) -> Parameters:
@@ -97,7 +97,8 @@ def _register(app: typer.Typer, perform: Callable[..., None], parameters: Parame
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
         shared = {parameter.name: options.pop(parameter.name) for parameter in common}
-        perform(kind, parameters(**options), **shared)
+        given = {name: value for name, value in parameters(**options).items() if value is not None}
+        perform(kind, given, **shared)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *common)]
@@ -174,69 +175,56 @@ def run_sessions(
 
 @excitation_command
 def chirp(
-    amplitude: Amplitude = 0.025,
+    amplitude_rad: Amplitude = 0.025,
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
-    duration: Duration = 120.0,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 15.0,
-    taper: Taper = 0.0,
+    duration_s: Duration = 120.0,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 15.0,
+    taper_s: Taper = 0.0,
 ) -> "dict[str, Value]":
     """Sweep linearly through a band, by default as in the paper.
 
     Example: rigd run chirp --stop-hz 20 --repeat 5
     """
-    return {
-        "amplitude_rad": amplitude,
-        "start_hz": start_hz,
-        "stop_hz": stop_hz,
-        "duration_s": duration,
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-        "taper_s": taper,
-    }
+    return locals()
 
 
 @excitation_command
 def hold(
-    duration: Duration = 10.0, rest: Rest = 1.0, ring_down: RingDown = 0.0
+    duration_s: Duration = 10.0, rest_s: Rest = 1.0, ring_down_s: RingDown = 0.0
 ) -> "dict[str, Value]":
     """Hold the motor at its start angle, to measure noise and drift.
 
     Example: rigd run hold --duration 30
     """
-    return {"duration_s": duration, "rest_s": rest, "ring_down_s": ring_down}
+    return locals()
 
 
 @excitation_command
 def step(
-    amplitude: Amplitude = 0.025,
-    duration: Duration = 10.0,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 15.0,
+    amplitude_rad: Amplitude = 0.025,
+    duration_s: Duration = 10.0,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 15.0,
 ) -> "dict[str, Value]":
     """Apply a step to the reference.
 
     Example: rigd run step --amplitude 0.01
     """
-    return {
-        "amplitude_rad": amplitude,
-        "duration_s": duration,
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-    }
+    return locals()
 
 
 @excitation_command
 def multisine(
-    amplitude: Amplitude = 0.025,
+    amplitude_rad: Amplitude = 0.025,
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
-    period: Annotated[float, typer.Option("--period", help="Period of the signal (s).")] = 20.0,
-    duration: Duration = 120.0,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 15.0,
-    taper: Taper = 0.0,
+    period_s: Annotated[float, typer.Option("--period", help="Period of the signal (s).")] = 20.0,
+    duration_s: Duration = 120.0,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 15.0,
+    taper_s: Taper = 0.0,
     phase_seed: Annotated[
         int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
     ] = 0,
@@ -247,17 +235,9 @@ def multisine(
 
     Example: rigd run multisine --amplitude 0.01 --period 20
     """
-    return {
-        "amplitude_rad": amplitude,
-        "start_hz": start_hz,
-        "stop_hz": stop_hz,
-        "period_s": period,
-        "duration_s": duration,
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-        "taper_s": taper,
-        "seed": phase_seed,
-    }
+    options = locals()
+    options["seed"] = options.pop("phase_seed")
+    return options
 
 
 @excitation_command
@@ -268,14 +248,14 @@ def file(
             metavar="CSV", readable=False, help="Columns time_s and angle_rad, or angles only."
         ),
     ],
-    rest: Rest = 1.0,
-    ring_down: RingDown = 15.0,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 15.0,
 ) -> "dict[str, Value]":
     """Follow a reference from a CSV file.
 
     Example: rigd run file reference.csv
     """
-    return {"path": path, "rest_s": rest, "ring_down_s": ring_down}
+    return locals()
 
 
 @excitation_command
@@ -284,7 +264,7 @@ def modes(
         Path,
         typer.Argument(metavar="JSON", readable=False, help="Modes written by analyze --json."),
     ],
-    amplitude: Annotated[
+    amplitude_rad: Annotated[
         float,
         typer.Option(
             "--amplitude", help="Amplitude in each band, lower where limits require (rad)."
@@ -296,10 +276,10 @@ def modes(
     widths: Annotated[
         float, typer.Option("--widths", help="Band half-width, in half-power widths of its mode.")
     ] = 1.0,
-    duration: Duration = 120.0,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 15.0,
-    taper: Annotated[
+    duration_s: Duration = 120.0,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 15.0,
+    taper_s: Annotated[
         float, typer.Option("--taper", help="Fade-in and fade-out time of each sweep (s).")
     ] = 1.0,
 ) -> "dict[str, Value]":
@@ -309,39 +289,32 @@ def modes(
 
     Example: rigd run modes fits.json --repeat 5
     """
-    return {
-        "path": path,
-        "amplitude_rad": amplitude,
-        "stop_hz": stop_hz,
-        "widths": widths,
-        "duration_s": duration,
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-        "taper_s": taper,
-    }
+    return locals()
 
 
 @excitation_command
 def touch(
-    angle: Annotated[
+    angle_rad: Annotated[
         float, typer.Argument(metavar="ANGLE", help="Farthest angle from the rig's zero (rad).")
     ],
-    speed: Annotated[float, typer.Option("--speed", help="Speed on the way out (rad/s).")] = 1.0,
-    acceleration: Annotated[
+    speed_rad_s: Annotated[
+        float, typer.Option("--speed", help="Speed on the way out (rad/s).")
+    ] = 1.0,
+    acceleration_rad_s2: Annotated[
         float,
         typer.Option("--acceleration", help="Acceleration at most (rad/s²)."),
     ] = 20.0,
     passes: Annotated[int, typer.Option("--passes", min=1, help="Number of passes.")] = 1,
-    hold: Annotated[
+    hold_s: Annotated[
         float, typer.Option("--hold", help="Time from a touch to the way back (s).")
     ] = 0.5,
-    settle: Annotated[float, typer.Option("--settle", help="Rest before each pass (s).")] = 1.0,
-    force_limit: Annotated[
+    settle_s: Annotated[float, typer.Option("--settle", help="Rest before each pass (s).")] = 1.0,
+    force_limit_n: Annotated[
         float, typer.Option("--force-limit", help="Largest contact force; more is a fault (N).")
     ] = 10.0,
-    model: Model = None,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 1.0,
+    path: Model = None,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 1.0,
 ) -> "dict[str, Value]":
     """Slew until the beam meets something; brake, hold and withdraw.
 
@@ -349,54 +322,30 @@ def touch(
 
     Example: rigd run touch 0.8 --speed 0.5 --passes 3
     """
-    parameters: dict[str, Value] = {
-        "angle_rad": angle,
-        "speed_rad_s": speed,
-        "acceleration_rad_s2": acceleration,
-        "passes": passes,
-        "hold_s": hold,
-        "settle_s": settle,
-        "force_limit_n": force_limit,
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-    }
-    if model is not None:
-        parameters["path"] = model
-    return parameters
+    return locals()
 
 
 @excitation_command
 def move(
-    angle: Annotated[
+    angle_rad: Annotated[
         float | None, typer.Argument(metavar="ANGLE", help="Angle from the rig's zero (rad).")
     ] = None,
-    by: Annotated[
+    by_rad: Annotated[
         float | None, typer.Option("--by", help="Angle from where the motor stands (rad).")
     ] = None,
     robust: Annotated[
         bool,
         typer.Option("--robust", help="Bear frequencies that are wrong by 1 %; takes longer."),
     ] = False,
-    model: Model = None,
-    rest: Rest = 1.0,
-    ring_down: RingDown = 5.0,
+    path: Model = None,
+    rest_s: Rest = 1.0,
+    ring_down_s: RingDown = 5.0,
 ) -> "dict[str, Value]":
     """Move to an angle without leaving a vibration, and stay there.
 
     Example: rigd run move 0.5
     """
-    parameters: dict[str, Value] = {
-        "robust": int(robust),
-        "rest_s": rest,
-        "ring_down_s": ring_down,
-    }
-    if angle is not None:
-        parameters["angle_rad"] = angle
-    if by is not None:
-        parameters["by_rad"] = by
-    if model is not None:
-        parameters["path"] = model
-    return parameters
+    return locals() | {"robust": int(robust)}
 
 
 @excitation_command
@@ -430,15 +379,15 @@ def until(
     lambda_: Annotated[
         str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.01.")
     ] = None,
-    at_most: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
-    tip_slope: Annotated[
+    at_most_s: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
+    tip_slope_rad: Annotated[
         float,
         typer.Option(
             "--tip-slope",
             help="Largest slope of the free end; beyond 0.14 the linear model is not exact (rad).",
         ),
     ] = 0.14,
-    amplitude: Annotated[
+    amplitude_rad: Annotated[
         float,
         typer.Option(
             "--amplitude", help="Amplitude of the scan, lower where limits require (rad)."
@@ -450,8 +399,8 @@ def until(
     stop_hz: Annotated[
         float, typer.Option("--stop-hz", help="Frequency where the scan ends (Hz).")
     ] = 52.0,
-    scan: Annotated[float, typer.Option("--scan", help="Duration of the scan (s).")] = 5.0,
-    rest: Rest = 1.0,
+    scan_s: Annotated[float, typer.Option("--scan", help="Duration of the scan (s).")] = 5.0,
+    rest_s: Rest = 1.0,
 ) -> "dict[str, Value]":
     """Excite what tells most until a precision is reached.
 
@@ -466,13 +415,13 @@ def until(
     ]
     return {
         "targets": "; ".join(f"{name} {text}" for name, text in asked if text is not None),
-        "at_most_s": at_most,
-        "tip_slope_rad": tip_slope,
-        "amplitude_rad": amplitude,
+        "at_most_s": at_most_s,
+        "tip_slope_rad": tip_slope_rad,
+        "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
         "stop_hz": stop_hz,
-        "scan_s": scan,
-        "rest_s": rest,
+        "scan_s": scan_s,
+        "rest_s": rest_s,
     }
 
 

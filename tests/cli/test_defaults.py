@@ -6,16 +6,7 @@ import pytest
 
 from rigd import excitation
 from rigd.cli import run
-
-OTHER_NAMES = {
-    "amplitude": "amplitude_rad",
-    "duration": "duration_s",
-    "rest": "rest_s",
-    "ring_down": "ring_down_s",
-    "taper": "taper_s",
-    "period": "period_s",
-    "phase_seed": "seed",
-}
+from rigd.excitation import FROM_THE_RIG
 
 
 @pytest.mark.parametrize(
@@ -26,16 +17,17 @@ OTHER_NAMES = {
         (run.step, excitation.step),
         (run.multisine, excitation.multisine),
         (run.file, excitation.from_csv),
+        (run.modes, excitation.modes),
+        (run.move, excitation.move),
+        (run.touch, excitation.touch),
     ],
 )
 def test_defaults_agree(command, function):
-    options = {
-        OTHER_NAMES.get(name, name): parameter.default
-        for name, parameter in inspect.signature(command).parameters.items()
-    }
-    parameters = {
-        name: parameter.default
-        for name, parameter in inspect.signature(function).parameters.items()
-        if name != "rate_hz"
-    }
-    assert options == parameters
+    def defaults(thing):
+        return {
+            name.replace("phase_seed", "seed"): parameter.default
+            for name, parameter in inspect.signature(thing).parameters.items()
+            if name not in {*FROM_THE_RIG, "path"}  # no file: None here, "" there
+        }
+
+    assert defaults(command) == defaults(function)

@@ -1,6 +1,5 @@
 """Narrow sweeps: joints, bands, duration, limits, and what the split of the time is worth."""
 
-import inspect
 import json
 from dataclasses import replace
 
@@ -9,9 +8,8 @@ import pytest
 
 from rigd import excitation
 from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
-from rigd.cli import run
 from rigd.excitation import ExcitationError
-from rigd.excitation._named import FROM_THE_RIG, KINDS, make_excitation
+from rigd.excitation._named import KINDS, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
 from rigd.runner._planning import LoopPreview, excitation_for, plan_session
 
@@ -208,16 +206,6 @@ def test_absurd_options_are_refused(document, options, words):
     with pytest.raises(ExcitationError) as refused:
         excitation.modes(rate_hz=1000.0, path=document(), **options)
     assert all(word in str(refused.value) for word in words), str(refused.value)
-
-
-def test_the_command_has_the_excitations_defaults():
-    own = {
-        {"amplitude_rad": "amplitude"}.get(name, name.removesuffix("_s")): parameter
-        for name, parameter in inspect.signature(excitation.modes).parameters.items()
-        if name not in FROM_THE_RIG
-    }
-    options = inspect.signature(run.modes).parameters
-    assert {n: p.default for n, p in options.items()} == {n: p.default for n, p in own.items()}
 
 
 def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document):
