@@ -8,12 +8,12 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Executor
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
@@ -41,12 +41,11 @@ from rigd.runner import (
     NoRoomError,
     QuickLook,
     QuickLooks,
+    Rig,
     RigError,
     RigStatus,
     Series,
     SessionFailedError,
-    SessionRig,
-    SignalBlock,
     excitation_for,
     what_is_kept,
 )
@@ -66,38 +65,6 @@ _SHUTTING_DOWN = "The daemon is being shut down."
 T = TypeVar("T")
 
 _log = logging.getLogger(NAME)
-
-
-class RigControl(SessionRig, Protocol):
-    """Part of :class:`rigd.runner.Rig` that the daemon uses."""
-
-    connected: bool
-    zero_lost: bool
-
-    @property
-    def calibration(self) -> Mapping[str, Any] | None:
-        """Identity and calibration of the connected sensor."""
-
-    def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
-        """Connect the devices."""
-
-    def tare(self) -> dict[str, Any]:
-        """Average the sensor at rest."""
-
-    def zero(self) -> dict[str, Any]:
-        """Make the present angle the zero."""
-
-    def watch(self) -> None:
-        """Check whether all is well between sessions."""
-
-    def status(self) -> RigStatus | None:
-        """Read the status from shared memory, from any thread."""
-
-    def signals(self) -> list[SignalBlock]:
-        """Return what has come of the record since the last call."""
-
-    def disconnect(self) -> None:
-        """Close everything."""
 
 
 class Service:
@@ -130,7 +97,7 @@ class Service:
 
     def __init__(
         self,
-        rig: RigControl,
+        rig: Rig,
         profile: Profile,
         folder: Path,
         worker: Executor,

@@ -22,7 +22,6 @@ from ._request import what_is_kept as what_is_kept
 from ._rig import Rig as Rig
 from ._rig import RigError as RigError
 from ._series import Series as Series
-from ._series import SessionRig as SessionRig
 from ._session import SessionFailedError as SessionFailedError
 from ._session import SessionProgress as SessionProgress
 from ._session import SessionResult as SessionResult

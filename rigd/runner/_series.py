@@ -21,7 +21,8 @@ from rigd.runner._planning import (
 )
 from rigd.runner._quick_looks import QuickLooks
 from rigd.runner._request import Order, check_required, choose_path, make_room
-from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
+from rigd.runner._rig import Rig
+from rigd.runner._session import SessionProgress, SessionResult, always
 from rigd.runner._touch_search import touch_search
 from rigd.runtime import StopRequest
 
@@ -29,50 +30,6 @@ _LOOK_PATIENCE_S: Final = 8.0
 """Longest pause between two sessions of a series for the quick look at the first: two or three
 seconds are enough for most. What is not done by then is suspended."""
 _POLL_S: Final = 0.05
-
-
-class SessionRig(Protocol):
-    """Part of :class:`rigd.runner.Rig` that runs sessions."""
-
-    def run(
-        self,
-        order: Order,
-        stop: StopRequest,
-        watcher: Watcher,
-        listens: Callable[[], bool] = always,
-    ) -> SessionResult:
-        """Run one session.
-
-        Parameters
-        ----------
-        order
-            Session to run.
-        stop
-            The operator's, which ends it.
-        watcher
-            Called some twenty times a second with the progress and the events since the last call.
-        listens
-            Whether a stop would be heard; if not, the supervisor gives no heartbeat.
-        """
-
-    def show(self, order: Order, stop: StopRequest) -> str:
-        """Show a session that is about to be run in the live view.
-
-        Parameters
-        ----------
-        order
-            Session to show.
-        stop
-            The operator's; the wait for the live view ends with it.
-
-        Returns
-        -------
-        str
-            Its address, or why there is none, for the operator.
-        """
-
-    def watch(self) -> None:
-        """Check whether the rig is well; called some times a second between sessions."""
 
 
 class SeriesWatcher(Protocol):
@@ -169,7 +126,7 @@ class Series:
 
     def run(
         self,
-        rig: SessionRig,
+        rig: Rig,
         stop: StopRequest,
         watcher: SeriesWatcher,
         *,
@@ -239,7 +196,7 @@ class Series:
         make_room(self._folder, self._excitation, self._profile.limits)
 
 
-def _await_look(looks: QuickLooks, rig: SessionRig, stop: StopRequest) -> None:
+def _await_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
     """Give the quick look at the last session its time, before the next one suspends it."""
     deadline_s = time.monotonic() + _LOOK_PATIENCE_S
     while looks.busy and not stop.requested and time.monotonic() < deadline_s:
