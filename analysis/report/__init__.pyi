@@ -1,8 +1,8 @@
 from ._bands import loss_factors as loss_factors
 from ._bands import response_band as response_band
 from ._campaign_document import campaign_document as campaign_document
-from ._campaign_text import campaign_tables as campaign_tables
-from ._campaign_write import write_campaign as write_campaign
+from ._campaign_report import campaign_tables as campaign_tables
+from ._campaign_report import write_campaign as write_campaign
 from ._document import document as document
 from ._document import document_text as document_text
 from ._folder import OutputError as OutputError
@@ -14,6 +14,8 @@ from ._folder import write_new as write_new
 from ._frf_figure import frf_figure as frf_figure
 from ._record_figures import FIGURES as FIGURES
 from ._record_figures import illustrations as illustrations
+from ._record_report import figures_of_paper as figures_of_paper
+from ._record_report import write_report as write_report
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
 from ._table import terminal_table as terminal_table
@@ -21,9 +23,7 @@ from ._text import analysis_tables as analysis_tables
 from ._text import record_text as record_text
 from ._text import result_text as result_text
 from ._text import summary_table as summary_table
-from ._touch_page import write_touch_report as write_touch_report
-from ._touch_tables import session_lines as session_lines
-from ._touch_tables import touches_document as touches_document
-from ._touch_tables import touches_table as touches_table
-from ._write import figures_of_paper as figures_of_paper
-from ._write import write_report as write_report
+from ._touch_report import session_lines as session_lines
+from ._touch_report import touches_document as touches_document
+from ._touch_report import touches_table as touches_table
+from ._touch_report import write_touch_report as write_touch_report

@@ -13,12 +13,13 @@ import numpy as np
 from analysis.campaigns import by_model, label, lost_trials
 from analysis.report._paper_tables import NAMES, paper_tables
 from analysis.report._pooled_tables import (
+    homogeneity_table,
     likely_estimates,
     modes_table,
     pooled_table,
+    specimens_table,
     structures_table,
 )
-from analysis.report._specimen_tables import homogeneity_table, specimens_table
 from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
 from rigd.session import META_PREFIX
 from rigd.units import suffix_of, unit_of

@@ -16,9 +16,8 @@ from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
 from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_report import campaign_tables, campaign_text, write_campaign
 from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
-from analysis.report._campaign_text import campaign_tables, campaign_text
-from analysis.report._campaign_write import write_campaign
 from analysis.report._table import json_rows
 from analysis.report._text import as_text
 from analysis.results import whole_record

@@ -15,8 +15,7 @@ from analysis.cli.sessions import Outputs
 from analysis.identify import BAND_HZ
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_figures import validation_figure
-from analysis.report._campaign_page import campaign_page
-from analysis.report._campaign_text import campaign_text
+from analysis.report._campaign_report import campaign_page, campaign_text
 
 
 def ends_at_one(path, tried, band_hz):

@@ -12,9 +12,7 @@ from analysis.campaigns import campaign
 from analysis.campaigns._campaign import _of_one_experiment
 from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
-from analysis.report._campaign_page import campaign_page
-from analysis.report._campaign_text import campaign_text
-from analysis.report._campaign_write import write_campaign
+from analysis.report._campaign_report import campaign_page, campaign_text, write_campaign
 
 
 @pytest.fixture(scope="module")

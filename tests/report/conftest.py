@@ -1,7 +1,6 @@
 """One session with everything a report can be of, and its report."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import pytest
 
@@ -17,12 +16,11 @@ from analysis.identify import (
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report._write import _write_page
+from analysis.report._record_report import _write_page
 from analysis.results import RecordResult, WholeRecord
 
 TYPES = ("I", "III", "VI", "VII")
 HOSTILE = "<script>alert('note')</script> & \"quotes\" $x^2$"
-MADE_AT = datetime(2026, 11, 20, 12, 0, tzinfo=UTC)
 
 
 @pytest.fixture(scope="session")
@@ -87,5 +85,5 @@ def report(record_result, tmp_path_factory):
     """Folder of the written page with its figures and tables."""
     folder = tmp_path_factory.mktemp("reports") / "report"
     folder.mkdir()
-    _write_page(record_result, record_result.whole, folder, lambda _done: None, MADE_AT)
+    _write_page(record_result, record_result.whole, folder, lambda _done: None)
     return folder

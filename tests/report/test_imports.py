@@ -6,8 +6,7 @@ import sys
 import pytest
 from cases import further
 
-PAGES = ("jinja2", "analysis.report._page", "analysis.report._record_page",
-         "analysis.report._campaign_page")  # fmt: skip
+PAGES = ("jinja2", "analysis.report._page")
 ASK = "import sys; from analysis.report import {names}; print(*sys.modules)"
 
 
@@ -63,6 +62,6 @@ def test_the_way_from_file_to_page_is_short(write_session, make_signals, tmp_pat
     assert (tmp_path / "report" / "report.html").exists()
     ours = {name for name in modules if name.partition(".")[0] == "analysis"}
     estimators = {name for name in ours if name.split(".")[1:2] in (["identify"], ["paper"])}
-    assert {"analysis.results", "analysis.report._record_page"} <= ours
+    assert {"analysis.results", "analysis.report._record_report"} <= ours
     assert len(ours - estimators) <= MOST
     assert not [name for name in ours if "campaign" in name]

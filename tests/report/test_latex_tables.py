@@ -5,8 +5,8 @@ import re
 import pytest
 from matplotlib.mathtext import MathTextParser
 
+from analysis.report._record_report import report_tables
 from analysis.report._table import Cell, Column, Table, latex_table, latex_text
-from analysis.report._write import report_tables
 
 
 @pytest.mark.parametrize(

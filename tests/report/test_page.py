@@ -20,10 +20,9 @@ from analysis.report import _style as style
 from analysis.report._document import record_entries
 from analysis.report._folder import OutputExistsError
 from analysis.report._record_figures import FIGURES, illustrations
-from analysis.report._record_page import record_page
+from analysis.report._record_report import _write_page, record_page, report_tables
 from analysis.report._style import Picture
 from analysis.report._text import damping_sentences
-from analysis.report._write import _write_page, report_tables
 from analysis.results import finite
 
 VOID = {"meta", "br", "img"}
@@ -308,7 +307,7 @@ def test_figures_are_there_as_png_and_svg(report):
 def test_a_taken_name_is_told_and_left_alone(report, record_result):
     before = (report / "report.html").stat().st_mtime_ns
     with pytest.raises(OutputExistsError, match=r"record_frf\.png exists"):
-        _write_page(record_result, record_result.whole, report, lambda _done: None, None)
+        _write_page(record_result, record_result.whole, report, lambda _done: None)
     assert (report / "report.html").stat().st_mtime_ns == before
 
 

@@ -1,17 +1,21 @@
-"""Touches of sessions as a table, and as a document."""
+"""Touches told: as a table, a document and lines, and as a folder with page and figures."""
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from analysis.report._document import versions
-from analysis.report._table import WORDS, Cell, Column, Entry, Table, number
-from analysis.results import finite
+from analysis.report._document import document_text, versions
+from analysis.report._folder import write_new
+from analysis.report._table import WORDS, Cell, Column, Entry, Table, csv_text, number
+from analysis.results import DEFAULT_FORMATS, finite
 from rigd.units import decimals, with_half_width
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
+    from analysis.report._page import Facts
     from analysis.touch import Touch, TouchedSession
     from rigd.touch import Estimated
 
@@ -146,3 +150,103 @@ def touches_document(
         }
     )
     return content
+
+
+# Folder
+
+
+def write_touch_report(
+    sessions: Sequence[TouchedSession],
+    errors: Mapping[str, str],
+    folder: Path,
+) -> None:
+    """Write ``report.html``, ``figures/``, ``tables/touches.csv`` and ``touches.json``.
+
+    Parameters
+    ----------
+    sessions : sequence of TouchedSession
+        One or more.
+    errors : mapping of str to str
+        Message for each file that could not be analysed.
+    folder : Path
+        An existing folder without these files.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+        If a file exists, or cannot be written.
+    """
+    from analysis.report import _page as pages
+    from analysis.report import _style as style
+    from analysis.report._touch_figures import touch_illustrations
+
+    pictures = []
+    with style.styled():
+        for shown in touch_illustrations(sessions):
+            stem = folder / "figures" / shown.name
+            picture = style.save_picture(shown.figure, stem, shown.description, DEFAULT_FORMATS)
+            pictures.append(picture)
+    table = touches_table(sessions)
+    write_new(folder / "tables" / "touches.csv", csv_text(table))
+    write_new(folder / "touches.json", document_text(touches_document(sessions, errors)))
+    text = pages.page(
+        "touch.html",
+        title=sessions[0].path.stem if len(sessions) == 1 else f"{len(sessions)} sessions",
+        files=", ".join(session.path.name for session in sessions),
+        first=(),
+        sentences=[line for session in sessions for line in session_lines(session)[:1]],
+        experiments=(),
+        warnings=[
+            *(f"{each.path.name}: {sentence}" for each in sessions for sentence in each.warnings),
+            *(f"Left out: {message}" for message in errors.values()),
+        ],
+        pictures=pictures,
+        tables=(table,) if table.rows else (),
+        paper_pictures=(),
+        paper_tables=(),
+        how=[*_how(sessions), pages.versions(datetime.now().astimezone())],
+    )
+    write_new(folder / "report.html", text)
+
+
+def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
+    """Collect what is known of sessions, model and estimator."""
+    return [
+        (
+            "Sessions",
+            [
+                (
+                    str(each.path),
+                    f"{each.rate_hz:g} Hz, "
+                    + ("torque and base shear" if each.has_shear else "torque alone"),
+                )
+                for each in sessions
+            ],
+        ),
+        ("Model", sorted({(model_words(each), _beam(each)) for each in sessions})),
+        (
+            "Estimate",
+            [
+                (
+                    "innovations",
+                    "measured torque and base shear minus those of the free exact model for the "
+                    "measured angle, the vibration from before the touch fitted",
+                ),
+                (
+                    "contact",
+                    "springy obstacle at rest, marched through its bounces; posterior of point, "
+                    "instant and stiffness by population Monte Carlo, with the model's uncertainty",
+                ),
+                ("log-likelihood", "of each point with any force history (white prior)"),
+                ("intervals", "95 %"),
+            ],
+        ),
+    ]
+
+
+def _beam(session: TouchedSession) -> str:
+    beam = session.model.beam
+    return (
+        f"length {beam.length_m:g} m, density {beam.density_kg_per_m:.5g} kg/m, bending stiffness "
+        f"{beam.bending_stiffness_n_m2:.5g} N·m²"
+    )
