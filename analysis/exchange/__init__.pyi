@@ -5,7 +5,7 @@ from ._export import export_frf as export_frf
 from ._export import export_record as export_record
 from ._import_record import ImportPlan as ImportPlan
 from ._import_record import import_record as import_record
-from ._session_file import write_session as write_session
+from ._import_record import write_session as write_session
 from ._source import ExchangeError as ExchangeError
 from ._source import TargetError as TargetError
 from ._specimen import read_specimen as read_specimen

@@ -22,15 +22,14 @@ from analysis.exchange._channels import (
     unit_in_brackets,
     unit_in_suffix,
 )
-from analysis.exchange._session_file import write_session
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
 from rigd.printable import printable
-from rigd.session import Status
+from rigd.session import SessionWriter, Status, encode_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -515,3 +514,61 @@ def unlikely_torque(
             "the reaction with --reverse-torque."
         )
     return None
+
+
+# Session file
+
+_BLOCK: Final = 25_000
+"""Samples that are packed at a time."""
+
+
+def write_session(
+    path: Path,
+    samples: Mapping[str, NDArray[np.generic]],
+    rate_hz: float,
+    start_utc_ns: int,
+    metadata: Mapping[str, str],
+    segments: Mapping[str, tuple[int, int]],
+    warnings: Sequence[str],
+) -> None:
+    """Write a session that was recorded elsewhere.
+
+    How it ended is not known, so the outcome has the counts and nothing else. If it cannot be
+    written, nothing is left behind.
+
+    Parameters
+    ----------
+    path : Path
+        Its final name, which must not exist.
+    samples : mapping of str to ndarray, shape (n,)
+        Fields of a sample, ``tick`` among them; those that are absent are 0.
+    rate_hz, start_utc_ns, metadata, segments
+        As the format has them (docs/session_format.md).
+    warnings : sequence of str
+        Written as events.
+
+    Raises
+    ------
+    rigd.session.SessionError
+        If the file exists or cannot be written.
+    """
+    ticks = samples["tick"]
+    writer = SessionWriter(path)
+    try:
+        writer.begin(start_utc_ns, metadata, segments, {})
+        for warning in warnings:
+            writer.log(0, "warning", warning, "import")
+        for begin in range(0, len(ticks), _BLOCK):
+            part = slice(begin, begin + _BLOCK)
+            block = {name: values[part] for name, values in samples.items()}
+            block["t_ns"] = np.rint(np.multiply(block["tick"], 1e9 / rate_hz))
+            writer.write_samples(encode_samples(block))
+        scheduled = int(ticks[-1]) + 1
+        counts = {"scheduled": scheduled, "recorded": len(ticks), "missed": 0}
+        counts["lost"] = scheduled - len(ticks)
+        writer.close({name: str(count) for name, count in counts.items()})
+    except BaseException:
+        # Unlike a recording, the source is still there: an incomplete copy of it is useless.
+        writer.abandon()
+        writer.part.unlink(missing_ok=True)
+        raise

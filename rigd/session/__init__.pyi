@@ -13,6 +13,7 @@ from ._format import Status as Status
 from ._format import decode_samples as decode_samples
 from ._format import decode_timings as decode_timings
 from ._format import decode_touches as decode_touches
+from ._format import encode_samples as encode_samples
 from ._format import field_tag as field_tag
 from ._format import pack_control_into as pack_control_into
 from ._format import pack_sample_into as pack_sample_into

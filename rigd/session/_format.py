@@ -11,7 +11,7 @@ only.
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntFlag
 from functools import cache
 from typing import Final
@@ -159,21 +159,18 @@ SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
 """A sample as it stands in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
 
-CONTROL_FIELDS: Final = tuple(CONTROL_TYPES)
 CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
 """A decoded message of the controller's terms."""
 CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
 """A control message as it stands in the file: each field after its tag byte ``tag_NAME``."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 
-TIMING_FIELDS: Final = tuple(TIMING_TYPES)
 TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
 """A decoded message of the readings' ages."""
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
 """A timing message as it stands in the file: each field after its tag byte ``tag_NAME``."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
 
-TOUCH_FIELDS: Final = tuple(TOUCH_TYPES)
 TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
 """A decoded touch."""
 TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
@@ -354,10 +351,34 @@ def pack_touch(
         t_ns, tick, x_m, x_std_m, force_n, force_std_n, stiffness_n_per_m, stiffness_std_n_per_m,
         TOUCH_KINDS.index(kind) if kind in TOUCH_KINDS else 0,
     )  # fmt: skip
-    wire = np.zeros(1, TOUCH_WIRE_DTYPE)
-    for number, (name, value) in enumerate(zip(TOUCH_FIELDS, values, strict=True), start=1):
-        wire[f"tag_{name}"] = field_tag(number, TOUCH_TYPES[name])
-        wire[name] = value
+    return _encode(dict(zip(TOUCH_TYPES, values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE)
+
+
+def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
+    """Encode samples in the fixed layout, as `decode_samples` reads them.
+
+    Parameters
+    ----------
+    columns : mapping of str to array (n,)
+        Fields of a sample, ``tick`` among them; those that are absent are 0.
+
+    Examples
+    --------
+    >>> from rigd.session import decode_samples, encode_samples
+    >>> decode_samples(encode_samples({"tick": [0, 1], "angle_rad": [0.1, 0.2]}))["angle_rad"]
+    array([0.1, 0.2])
+    """
+    return _encode(columns, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
+
+
+def _encode(
+    columns: Mapping[str, npt.ArrayLike], types: dict[str, str], wire_dtype: np.dtype[np.void]
+) -> bytes:
+    wire = np.zeros(np.size(columns["tick"]), wire_dtype)
+    for number, (name, kind) in enumerate(types.items(), start=1):
+        wire[f"tag_{name}"] = field_tag(number, kind)
+        if name in columns:
+            wire[name] = columns[name]
     return wire.tobytes()
 
 

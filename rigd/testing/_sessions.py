@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam import Beam, Damping, transfer
-from rigd.session import SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SessionWriter, field_tag
+from rigd.session import SessionWriter, encode_samples
 
 PAPER_BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 """The paper's antenna (Table 1)."""
@@ -235,16 +235,15 @@ def write_session(
     >>> len(session.samples), session.number("beam_length_m")
     (13000, 0.98)
     """
-    count = len(signals.angle_rad)
-    wire = np.zeros(count, SAMPLE_WIRE_DTYPE)
-    for number, (name, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
-        wire[f"tag_{name}"] = field_tag(number, kind)
-    wire["tick"] = np.arange(count) if ticks is None else ticks
-    wire["t_ns"] = np.rint(wire["tick"] * (1e9 / signals.rate_hz)) if t_ns is None else t_ns
-    wire["angle_reference_rad"] = signals.reference_rad
-    wire["angle_rad"] = signals.angle_rad
-    wire["coupling_torque_nm"] = signals.torque_nm
-    wire["status"] = status
+    at = np.arange(len(signals.angle_rad)) if ticks is None else np.asarray(ticks)
+    samples = {
+        "tick": at,
+        "t_ns": np.rint(at * (1e9 / signals.rate_hz)) if t_ns is None else t_ns,
+        "angle_reference_rad": signals.reference_rad,
+        "angle_rad": signals.angle_rad,
+        "coupling_torque_nm": signals.torque_nm,
+        "status": status,
+    }
     stated = {
         "rate_hz": repr(signals.rate_hz),
         "beam_length_m": repr(beam.length_m),
@@ -258,7 +257,7 @@ def write_session(
         dict(signals.segments if segments is None else segments),
         {},
     )
-    writer.write_samples(wire.tobytes())
+    writer.write_samples(encode_samples(samples))
     return writer.close({"outcome": outcome})
 
 

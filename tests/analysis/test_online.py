@@ -17,11 +17,9 @@ from analysis.results import whole_record
 from analysis.suited import record_band_hz
 from rigd.beam import Beam, Damping, LoadedBeam, modes
 from rigd.session import (
-    SAMPLE_TYPES,
-    SAMPLE_WIRE_DTYPE,
     EstimateRequest,
     StreamStart,
-    field_tag,
+    encode_samples,
     read_session,
     write_request,
     write_samples,
@@ -223,10 +221,7 @@ def test_damping_that_does_not_show_counts_as_uncertainty(session):
 
 
 def wire(samples) -> bytes:
-    found = np.zeros(samples.size, SAMPLE_WIRE_DTYPE)
-    for number, (name, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
-        found[f"tag_{name}"], found[name] = field_tag(number, kind), samples[name]
-    return found.tobytes()
+    return encode_samples({name: samples[name] for name in samples.dtype.names})
 
 
 @pytest.fixture

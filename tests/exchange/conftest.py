@@ -8,8 +8,7 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 from analysis.exchange._channels import parse_choice
-from analysis.exchange._import_record import ImportPlan
-from analysis.exchange._session_file import write_session
+from analysis.exchange._import_record import ImportPlan, write_session
 from analysis.exchange._specimen import Specimen
 from rigd.beam import Beam
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rigd.session import SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SessionWriter, field_tag
+from rigd.session import SessionWriter, encode_samples
 
 DAY_NS = 86_400 * 10**9
 START_UTC_NS = 1_700_000_000_000_000_000
@@ -16,14 +16,10 @@ def record_briefly(tmp_path):
     """Write a session of a second to the folder, with what its metadata is to say."""
 
     def write(name, *, day=0.0, outcome="complete", **metadata):
-        block = np.zeros(1000, SAMPLE_WIRE_DTYPE)
-        for number, (field, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
-            block[f"tag_{field}"] = field_tag(number, kind)
-        block["tick"] = np.arange(1000)
         writer = SessionWriter(tmp_path / f"{name}.mcap")
         stated = {"rate_hz": "1000.0", "excitation": "chirp", "profile": "sim"} | metadata
         writer.begin(START_UTC_NS + int(day * DAY_NS), stated, {}, {})
-        writer.write_samples(block.tobytes())
+        writer.write_samples(encode_samples({"tick": np.arange(1000)}))
         counts = {"scheduled": "1010", "missed": "7", "lost": "3", "late": "2"}
         return writer.close({"outcome": outcome, "reason": "", **counts})
 

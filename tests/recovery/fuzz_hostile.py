@@ -109,20 +109,21 @@ def session_file(*parts, session=SESSION, end=True):
 
 def sample_records(first, count, *, permuted=False):
     """Make message records of samples, as bytes; `permuted` puts the tick before the time."""
-    from rigd.session._format import SAMPLE_DTYPE, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
+    from rigd.session import SAMPLE_WIRE_DTYPE, encode_samples
 
-    wire = np.zeros(count, SAMPLE_WIRE_DTYPE)
-    for number, (name, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
-        wire[f"tag_{name}"] = field_tag(number, kind)
-    wire["tick"] = first + np.arange(count)
-    wire["t_ns"] = wire["tick"].astype(np.int64) * 1_000_000
-    wire["angle_reference_rad"] = wire["angle_rad"] = 0.02 * np.sin(0.05 * wire["tick"])
-    wire["coupling_torque_nm"] = 0.1 * np.sin(0.05 * wire["tick"] + 0.2)
-    assert SAMPLE_DTYPE.names
+    tick = first + np.arange(count)
+    angle_rad = 0.02 * np.sin(0.05 * tick)
+    samples = {
+        "tick": tick,
+        "t_ns": tick * 1_000_000,
+        "angle_reference_rad": angle_rad,
+        "angle_rad": angle_rad,
+        "coupling_torque_nm": 0.1 * np.sin(0.05 * tick + 0.2),
+    }
     size = SAMPLE_WIRE_DTYPE.itemsize
     rows = np.empty((count, 31 + size), np.uint8)
     rows[:, :31] = np.frombuffer(message(1, bytes(size))[:31], np.uint8)
-    fields = wire.view(np.uint8).reshape(count, size)
+    fields = np.frombuffer(encode_samples(samples), np.uint8).reshape(count, size)
     rows[:, 31:] = (
         np.concatenate([fields[:, 9:14], fields[:, :9], fields[:, 14:]], 1)
         if (permuted)

@@ -9,18 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.session._format import (
-    CONTROL_FIELDS,
     CONTROL_SIZE,
+    CONTROL_TYPES,
     SAMPLE_DTYPE,
     SAMPLE_FIELDS,
     SAMPLE_SIZE,
     SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
-    TIMING_FIELDS,
     TIMING_SIZE,
-    TOUCH_FIELDS,
+    TIMING_TYPES,
     TOUCH_KINDS,
     TOUCH_SIZE,
+    TOUCH_TYPES,
     Status,
     decode_controls,
     decode_samples,
@@ -82,7 +82,7 @@ def test_a_packed_touch_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack_touch(*values)
     expected = (*values[:-1], TOUCH_KINDS.index(values[-1]))
     assert len(data) == TOUCH_SIZE
-    assert all(map(same, protobuf_fields(TOUCH_SCHEMA, data, TOUCH_FIELDS), expected))
+    assert all(map(same, protobuf_fields(TOUCH_SCHEMA, data, TOUCH_TYPES), expected))
     assert all(map(same, decode_touches(data)[0].item(), expected))
 
 
@@ -100,14 +100,14 @@ def test_a_packed_sample_is_decoded_by_protobuf_and_by_numpy(values):
 @given(CONTROLS)
 def test_a_packed_control_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_control_into, CONTROL_SIZE, values)
-    assert all(map(same, protobuf_fields(CONTROL_SCHEMA, data, CONTROL_FIELDS), values))
+    assert all(map(same, protobuf_fields(CONTROL_SCHEMA, data, CONTROL_TYPES), values))
     assert all(map(same, decode_controls(data)[0].item(), values))
 
 
 @given(TIMINGS)
 def test_a_packed_timing_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_timing_into, TIMING_SIZE, values)
-    assert all(map(same, protobuf_fields(TIMING_SCHEMA, data, TIMING_FIELDS), values))
+    assert all(map(same, protobuf_fields(TIMING_SCHEMA, data, TIMING_TYPES), values))
     assert all(map(same, decode_timings(data)[0].item(), values))
 
 
