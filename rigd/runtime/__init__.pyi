@@ -3,6 +3,7 @@ from ._addresses import announce as announce
 from ._addresses import answers as answers
 from ._addresses import file_name as file_name
 from ._addresses import read_address as read_address
+from ._addresses import runtime_folder as runtime_folder
 from ._addresses import started_at as started_at
 from ._background import SINGLE_THREADED as SINGLE_THREADED
 from ._background import begin_background as begin_background
@@ -10,7 +11,6 @@ from ._background import end_with as end_with
 from ._background import give_way as give_way
 from ._background import killed_first as killed_first
 from ._background import use_one_thread as use_one_thread
-from ._folder import runtime_folder as runtime_folder
 from ._locks import HeldError as HeldError
 from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError

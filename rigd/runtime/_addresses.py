@@ -5,18 +5,47 @@ file that it announces. What a dead process left is recognised by nobody listeni
 by that process being gone (`started_at`).
 """
 
+import itertools
 import json
 import os
 import socket
+import stat
+import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.runtime._folder import runtime_folder
-
 _PROBE_S: Final = 1.0
 _MOST_BYTES: Final = 65_536
+
+
+# Folder
+
+
+def runtime_folder() -> Path:
+    """Return the folder for sockets and addresses: of this user, gone after a restart."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    if base and Path(base).is_dir():
+        return Path(base) / "rigd"
+    return _own_folder(Path(tempfile.gettempdir()) / f"rigd-{os.getuid()}")
+
+
+def _own_folder(path: Path) -> Path:
+    """Make a folder where everybody may; a name that somebody else took is passed over."""
+    for number in itertools.count(1):
+        with suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        status = path.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid():
+            if status.st_mode & 0o077:
+                path.chmod(0o700)
+            return path
+        path = path.with_name(f"rigd-{os.getuid()}-{number}")
+    raise AssertionError("never reached")
+
+
+# Files and sockets in it
 
 
 def file_name(rig: str) -> str:

@@ -6,7 +6,7 @@ import tempfile
 
 import pytest
 
-from rigd.runtime._folder import runtime_folder
+from rigd.runtime._addresses import runtime_folder
 from rigd.runtime._locks import HeldFile
 
 
