@@ -213,10 +213,6 @@ def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
 
     With one label alone, a session without it is taken for the same specimen. With several nobody
     knows which of them it is.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
     """
     if len({each.label for each in experiments if each.label}) < 2:
         return list(experiments)

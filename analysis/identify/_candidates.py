@@ -417,10 +417,6 @@ class CandidateSet:
         other damping is estimated beside, with order 1. One whose order rests on the edge of its
         range is an inertia or a stiffness, and counts as absent, too.
 
-        Parameters
-        ----------
-        candidate : Candidate
-
         Returns
         -------
         fit : RecordFit

@@ -368,12 +368,7 @@ class DampingAt:
 
 
 def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
-    """Damping of the first modes that show at several amplitudes; nothing without drag.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    """
+    """Damping of the first modes that show at several amplitudes; nothing without drag."""
     drag = field.drag
     if drag is None:
         return ()
@@ -407,13 +402,7 @@ def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
 def by_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Damping ratio by the air over the two numbers of a `DragLaw`, shape (2,).
-
-    Parameters
-    ----------
-    mode : int
-    omega_rad_s, tip_amplitude_m, density_kg_per_m : float
-    """
+    """Damping ratio by the air over the two numbers of a `DragLaw`, shape (2,)."""
     node, weight = np.polynomial.legendre.leggauss(_POINTS)
     shape = np.abs(mode_shape(mode, 0.5 * (node + 1)) / mode_shape(mode, 1.0))
     speed = tip_amplitude_m * omega_rad_s

@@ -108,10 +108,6 @@ def knocks_in(field: CandidateSet) -> Iterator[FoundKnock]:
     A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
     But one half of the record it has spared, or left a free decay at its start: so it is searched
     also in what a beam leaves that was fitted to one half.
-
-    Parameters
-    ----------
-    field : CandidateSet
     """
     if field.misread or len(field.comparison.measurement.knocks) == MOST_KNOCKS:
         return
@@ -128,12 +124,7 @@ def knocks_in(field: CandidateSet) -> Iterator[FoundKnock]:
 
 
 def knock_in(field: CandidateSet) -> FoundKnock | None:
-    """Search for a knock in what the likeliest candidate leaves.
-
-    Parameters
-    ----------
-    field : CandidateSet
-    """
+    """Search for a knock in what the likeliest candidate leaves."""
     likeliest = min(field.candidates, key=lambda each: each.fit.cost)
     return _knock_in(field.refit(likeliest, 1))
 
@@ -198,13 +189,7 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
 
 
 def with_knock(measurement: Measurement, found: FoundKnock) -> Measurement:
-    """Take a knock for known.
-
-    Parameters
-    ----------
-    measurement : Measurement
-    found : FoundKnock
-    """
+    """Take a knock for known."""
     return replace(measurement, knocks=(*measurement.knocks, found.knock))
 
 

@@ -74,12 +74,7 @@ def of_headline(
 
 
 def order(verdict: OrderVerdict) -> str:
-    """Say what is known of one order.
-
-    Parameters
-    ----------
-    verdict : OrderVerdict
-    """
+    """Say what is known of one order."""
     profile = verdict.profile
     low, high = profile.interval
     name, of = verdict.order, _OF[verdict.order]

@@ -94,10 +94,6 @@ class Change:
 def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
     """Find what changes along the record; refit all with it if nothing else explains it as well.
 
-    Parameters
-    ----------
-    field : CandidateSet
-
     Returns
     -------
     field : CandidateSet

@@ -78,13 +78,7 @@ def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple
 
 
 def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
-    """Whether the motor was driven near one frequency nearly as much as near another.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    frequency_hz, relative_to_hz : float
-    """
+    """Whether the motor was driven near one frequency nearly as much as near another."""
     measurement = comparison.measurement
     asked = measurement.reference_rad
     asked_rad = measurement.angle_from_rest(1.0) if asked is None else asked - asked[0]

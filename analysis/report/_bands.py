@@ -36,10 +36,6 @@ def supported_band_hz(whole: WholeRecord) -> Band | None:
     beyond them, as far as the beam was excited; one with an order that they do not support only
     interpolates between the modes that show.
 
-    Parameters
-    ----------
-    whole : WholeRecord
-
     Returns
     -------
     tuple of float or None

@@ -148,10 +148,6 @@ def _measured(fit: RecordFit) -> Formula:
 def equations(whole: WholeRecord) -> tuple[Formula, ...]:
     """Write the model of the fit that the headline is of.
 
-    Parameters
-    ----------
-    whole : WholeRecord
-
     Returns
     -------
     tuple of Formula
@@ -173,12 +169,7 @@ _EXTRAS: Final = {
 
 
 def definitions(whole: WholeRecord) -> str:
-    """Say what the letters of the equations are that no table has.
-
-    Parameters
-    ----------
-    whole : WholeRecord
-    """
+    """Say what the letters of the equations are that no table has."""
     parts = [
         "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
@@ -194,12 +185,7 @@ def definitions(whole: WholeRecord) -> str:
 
 
 def types_table(whole: WholeRecord) -> Table:
-    """Say what damping each type has: the terms, and how many parameters that is.
-
-    Parameters
-    ----------
-    whole : WholeRecord
-    """
+    """Say what damping each type has: the terms, and how many parameters that is."""
     words = {False: "fractional", True: "integer"}
 
     def rows() -> Iterator[tuple[str, str, str, str]]:
@@ -237,12 +223,7 @@ def types_table(whole: WholeRecord) -> Table:
 
 
 def mathml(formula: Formula) -> str:
-    """Write a formula for a page, with its LaTeX as annotation.
-
-    Parameters
-    ----------
-    formula : Formula
-    """
+    """Write a formula for a page, with its LaTeX as annotation."""
     return (
         f'<math display="block"><semantics><mrow>{formula.mathml}</mrow>'
         f'<annotation encoding="application/x-tex">{formula.tex}</annotation></semantics></math>'
@@ -250,12 +231,7 @@ def mathml(formula: Formula) -> str:
 
 
 def latex(formulas: tuple[Formula, ...]) -> str:
-    r"""Write formulas as a block ``align`` of LaTeX's amsmath.
-
-    Parameters
-    ----------
-    formulas : tuple of Formula
-    """
+    r"""Write formulas as a block ``align`` of LaTeX's amsmath."""
     lines = (each.tex.replace(" = ", " &= ", 1) for each in formulas)
     body = " \\\\\n  ".join(lines)
     return f"\\begin{{align}}\n  {body}\n\\end{{align}}\n"

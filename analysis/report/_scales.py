@@ -18,12 +18,7 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 
 
 def scale_notes(whole: WholeRecord) -> Iterator[str]:
-    """Say what statistical intervals leave out, and what those with scales include.
-
-    Parameters
-    ----------
-    whole : WholeRecord
-    """
+    """Say what statistical intervals leave out, and what those with scales include."""
     if not scales_absorbed(whole.fit):
         held = ", ".join(QUANTITIES[name][0] for name in whole.fixed)
         yield (

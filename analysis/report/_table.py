@@ -252,10 +252,6 @@ _PIECES: Final = re.compile(
 def latex_text(text: str) -> str:
     r"""Write a cell's text for LaTeX: letters of formulas as mathematics, the rest escaped.
 
-    Parameters
-    ----------
-    text : str
-
     Examples
     --------
     >>> from analysis.report._table import latex_text
@@ -288,10 +284,6 @@ def latex_table(table: Table) -> str:
     r"""Write a table as LaTeX's ``table``, with the rules of the package booktabs.
 
     Notes stand under it.
-
-    Parameters
-    ----------
-    table : Table
     """
     columns = table.shown_columns
     alignment = "".join("r" if column.numeric else "l" for column in columns)

@@ -185,10 +185,6 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
     antenna's. Where part of the record is unexplained the numbers are named as what they would be,
     without intervals.
 
-    Parameters
-    ----------
-    told : Headline
-
     Returns
     -------
     tuple of str

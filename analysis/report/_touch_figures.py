@@ -32,12 +32,7 @@ _COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.
 
 
 def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustration]:
-    """Draw the map and the evidence of every touch; within `style.styled`.
-
-    Parameters
-    ----------
-    sessions : sequence of TouchedSession
-    """
+    """Draw the map and the evidence of every touch; within `style.styled`."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
             "map",

@@ -112,12 +112,7 @@ def session_lines(session: TouchedSession) -> list[str]:
 
 
 def model_words(session: TouchedSession) -> str:
-    """Say where the model of the beam comes from.
-
-    Parameters
-    ----------
-    session : TouchedSession
-    """
+    """Say where the model of the beam comes from."""
     source = session.model.source
     return "the nominal beam of the attached profile" if source == "profile" else source
 
