@@ -236,13 +236,15 @@ def band_limited(
     return np.asarray(np.fft.irfft(spectrum, padded)[: len(values)])
 
 
-def loudest_moment_s(
-    values: NDArray[np.float64], rate_hz: float, frequency_hz: float, *, bandwidth: float = 0.1
-) -> float:
+_NEAR: Final = 0.1
+"""Half the width of the band whose envelope is looked at, as a share of its middle."""
+
+
+def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: float) -> float:
     """Time at which the oscillation near a frequency is largest.
 
-    The envelope is the magnitude of the analytic signal in ``frequency_hz (1 ± bandwidth)``, so
-    it works for a chirp as for any other excitation.
+    The envelope is the magnitude of the analytic signal in ``frequency_hz (1 ± 0.1)``, so it works
+    for a chirp as for any other excitation.
 
     Parameters
     ----------
@@ -252,8 +254,6 @@ def loudest_moment_s(
         Its sampling rate.
     frequency_hz : float
         Middle of the band.
-    bandwidth : float
-        Half the width of the band, as a share of its middle.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def loudest_moment_s(
     """
     padded = 1 << (len(values) - 1).bit_length()
     frequencies_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
-    near = np.abs(frequencies_hz / frequency_hz - 1.0) <= bandwidth
+    near = np.abs(frequencies_hz / frequency_hz - 1.0) <= _NEAR
     analytic = np.zeros(padded, dtype=np.complex128)
     analytic[: len(frequencies_hz)][near] = np.fft.rfft(values, padded)[near]
     envelope = np.abs(np.fft.ifft(analytic)[: len(values)])

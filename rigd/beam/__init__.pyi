@@ -22,7 +22,6 @@ from ._modes import poles_for_eigenvalues as poles_for_eigenvalues
 from ._modes import root_shear_ratio as root_shear_ratio
 from ._modes import undamped_frequencies_rad_s as undamped_frequencies_rad_s
 from ._point_force import PointForceGrid as PointForceGrid
-from ._point_force import pressing_force_n as pressing_force_n
 from ._realisation import CoupledModel as CoupledModel
 from ._realisation import Realisation as Realisation
 from ._realisation import RealisationError as RealisationError

@@ -24,7 +24,7 @@ K. F. Graff, Wave Motion in Elastic Solids (1975), chapter 3.
 """
 
 from dataclasses import dataclass
-from math import factorial, inf
+from math import factorial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -162,26 +162,6 @@ class PointForceGrid:
         at = np.asarray(force_at_m, dtype=np.float64)
         return self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
 
-    def force_per_angle(self, obstacle_at_m: ArrayLike, stiffness_n_per_m: float = inf) -> Complex:
-        """Force of an obstacle that the beam stays in touch with, per angle.
-
-        Parameters
-        ----------
-        obstacle_at_m
-            Where it is.
-        stiffness_n_per_m
-            Its own stiffness; infinite if it does not yield at all.
-
-        Returns
-        -------
-        complex ndarray, shape of s, then of `obstacle_at_m`
-            In N/rad; by it the response to the angle becomes ``per_angle + force · per_force``.
-        """
-        at = np.asarray(obstacle_at_m, dtype=np.float64)
-        yielding = self.per_force(at, at) + 1 / stiffness_n_per_m
-        force: Complex = -self.per_angle(at) / yielding
-        return force
-
     def _stiffness(self, axes: int = 0) -> Complex:
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
@@ -285,34 +265,3 @@ class _Waves:
             start=np.zeros((b.shape[0], x.size), dtype=np.complex128),
         )
         return total
-
-
-def pressing_force_n(
-    beam: Beam, obstacle_at_m: float, angle_rad: float, stiffness_n_per_m: float = inf
-) -> float:
-    """Force that a beam at rest exerts on an obstacle.
-
-    Parameters
-    ----------
-    beam
-    obstacle_at_m
-        Distance of the obstacle from the motor's axis.
-    angle_rad
-        By how much the motor has turned beyond the angle at which the straight beam touches.
-    stiffness_n_per_m
-        Stiffness of the obstacle; infinite if it does not yield at all.
-
-    Returns
-    -------
-    float
-        In N; not negative. An obstacle at rest does not pull.
-
-    Examples
-    --------
-    >>> from rigd.beam import Beam, pressing_force_n
-    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> print(f"{pressing_force_n(beam, 0.5, angle_rad=0.1):.4f} N")
-    0.1084 N
-    """
-    compliance_m_per_n = obstacle_at_m**3 / (3 * beam.bending_stiffness_n_m2)
-    return max(0.0, obstacle_at_m * angle_rad / (compliance_m_per_n + 1 / stiffness_n_per_m))

@@ -209,25 +209,18 @@ class PidController:
         self._lowpass_decay, self._lowpass_gain = lowpass_coefficients(settings, rate_hz)
         self.reset(0.0)
 
-    def reset(self, angle_rad: float, torque_nm: float = 0.0) -> None:
-        """Take over without a bump from rest at ``angle_rad`` under ``torque_nm``.
+    def reset(self, angle_rad: float) -> None:
+        """Take over without a bump from rest at an angle.
 
-        The next step returns ``torque_nm`` if reference and angle are still ``angle_rad`` and the
-        coupling torque is zero.
-
-        Parameters
-        ----------
-        angle_rad
-            Angle at which the motor rests.
-        torque_nm
-            Torque that holds it there.
+        The next step returns no torque if reference and angle are still there and the coupling
+        torque is zero.
         """
         self.proportional_nm = self._kp * (self._b_p - 1.0) * angle_rad
-        self.integral_nm = torque_nm - self.proportional_nm
+        self.integral_nm = -self.proportional_nm
         self.derivative_nm = 0.0
         self.feedforward_nm = 0.0
         self.friction_nm = 0.0
-        self.unlimited_torque_nm = torque_nm
+        self.unlimited_torque_nm = 0.0
         self.saturated = False
         self._error = 0.0
         self._weighted_error = (self._b_d - 1.0) * angle_rad

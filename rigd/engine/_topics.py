@@ -35,8 +35,6 @@ class Topic:
     """The recorder writes each of them into the file."""
     live: bool
     """The live publisher looks at them, as far as it can keep up."""
-    ages_only: bool = False
-    """Not under the virtual clock, where no reading has an age."""
 
     def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
         """Return how many records its ring holds."""
@@ -49,7 +47,7 @@ class Topic:
 
 EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
 CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
-TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True, ages_only=True)
+TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True)
 SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)

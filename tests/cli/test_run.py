@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from cases import further
 from processes import child_running, eventually, has_ended, ignored, ignores
+from resting_beams import pressing_force_n
 
 from analysis import load, select
-from rigd.beam import modes, pressing_force_n
+from rigd.beam import modes
 from rigd.profile import load_profile
 from rigd.session import Status, read_controls, read_session
 

@@ -12,8 +12,9 @@ import pytest
 from cases import further
 from hypothesis import given
 from hypothesis import strategies as st
+from resting_beams import pressing_force_n
 
-from rigd.beam import Damping, PointForceGrid, pressing_force_n
+from rigd.beam import Damping, PointForceGrid
 from rigd.devices import ObstacleError
 from rigd.profile import load_profile
 from rigd.sim._obstacle import _Wall
