@@ -15,7 +15,7 @@ from analysis.exchange._source import (
     ExchangeError,
     SourceChannel,
     check_samples,
-    no_such_channel,
+    place_of,
 )
 from rigd.printable import printable
 
@@ -101,7 +101,7 @@ def _channels(
         header = titles if len(titles) == count else _numbers(count)
     else:
         header = cells
-    columns = {name: _column(path, name, header) for name in names}
+    columns = {name: place_of(path, name, header, "columns are named") for name in names}
     values = {name: array("d") for name in columns}
     wanted = [(column, values[name].append, name) for name, column in columns.items()]
     for row in rows:
@@ -152,21 +152,6 @@ def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
                 "sample and few channels. Export the session's channels alone."
             )
         yield line
-
-
-def _column(path: Path, name: str, header: Sequence[str]) -> int:
-    count = header.count(name)
-    if count == 1:
-        return header.index(name)
-    if count > 1:
-        raise ExchangeError(
-            f"{path}: {count} columns are named '{name}'; give the column's number, such as "
-            f"#{header.index(name) + 1} for the first of them."
-        )
-    number = name.removeprefix("#")
-    if name != number and number.isdecimal() and 0 < int(number) <= len(header):
-        return int(number) - 1
-    raise no_such_channel(path, name, header)
 
 
 def _odd_cell(

@@ -215,6 +215,44 @@ def no_such_channel(path: Path, name: str, available: Iterable[str]) -> Exchange
     )
 
 
+def place_of(
+    path: Path, name: str, titles: Sequence[str], several: str, *, numbered: bool = False
+) -> int:
+    """Find a channel by its title, or by its number as in ``#3``; return its place from 0 on.
+
+    Parameters
+    ----------
+    path
+        File, for messages.
+    name
+        What the user calls the channel.
+    titles
+        Titles of all channels in the file.
+    several
+        What several channels of one title are, such as "columns are named".
+    numbered
+        Whether a message lists the titles with their numbers.
+
+    Raises
+    ------
+    ExchangeError
+        If there is no such channel, or more than one.
+    """
+    count = titles.count(name)
+    if count == 1:
+        return titles.index(name)
+    if count > 1:
+        raise ExchangeError(
+            f"{path}: {count} {several} '{name}'; give the number, such as "
+            f"#{titles.index(name) + 1} for the first of them."
+        )
+    number = name.removeprefix("#")
+    if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
+        return int(number) - 1
+    listed = [f"#{place} {each}" for place, each in enumerate(titles, 1)] if numbered else titles
+    raise no_such_channel(path, name, listed)
+
+
 def as_column(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return real numbers (n,) as floats; anything else is refused."""
     if values.dtype.kind == "c":

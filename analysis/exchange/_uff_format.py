@@ -18,8 +18,8 @@ from analysis.exchange._source import (
     bounded_memory,
     check_samples,
     missing_library,
-    no_such_channel,
     not_in_time,
+    place_of,
 )
 from rigd.printable import printable
 
@@ -72,7 +72,11 @@ def _functions(
     file = open_file(str(path))
     places = [place for place, kind in enumerate(file.get_set_types()) if kind == 58]
     titles = [file.read_sets(place, header_only=True)["id1"] for place in places]
-    numbers = {name: _number(path, name, titles) for name in names if name != ABSCISSA}
+    numbers = {
+        name: place_of(path, name, titles, "data sets have the title", numbered=True)
+        for name in names
+        if name != ABSCISSA
+    }
     if not numbers:
         raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was asked for.")
     channels, times = {}, []
@@ -91,23 +95,6 @@ def _check_marks(path: Path) -> None:
         raise ExchangeError(
             f"{path}: has more than {_MOST_SETS} data sets; export the session's channels alone."
         )
-
-
-def _number(path: Path, name: str, titles: Sequence[str]) -> int:
-    count = titles.count(name)
-    if count == 1:
-        return titles.index(name)
-    if count > 1:
-        raise ExchangeError(
-            f"{path}: {count} data sets have the title '{name}'; give the number, such as "
-            f"#{titles.index(name) + 1} for the first of them."
-        )
-    number = name.removeprefix("#")
-    if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
-        return int(number) - 1
-    raise no_such_channel(
-        path, name, (f"#{place} {title}" for place, title in enumerate(titles, start=1))
-    )
 
 
 def _channel(path: Path, name: str, function: Mapping[str, Any]) -> SourceChannel:
