@@ -3,13 +3,14 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
-from typing import Any, Final, TypeGuard
+from typing import Any, Final
 
 from rigd.beam import Beam, Damping
 from rigd.errors import UserError
 from rigd.runtime import open_plain_file
+from rigd.units import finite_number
 
 _MOST_BYTES: Final = 64_000_000
 _NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
@@ -112,12 +113,11 @@ def _parameters(path: Path) -> Mapping[str, Any]:
 def _value(path: Path, name: str, entry: object) -> float:
     """Return the value of a parameter, of a size that the exact model takes."""
     given = entry.get("value") if isinstance(entry, dict) else None
+    value = finite_number(given)
     below = _BELOW.get(name, inf)
     least = -inf if name == "delay_s" else 0.0
-    if isinstance(given, int | float) and not isinstance(given, bool) and isfinite(given):
-        value = float(given)
-        if least <= value < below and (value > 0.0 or name not in _NEEDED):
-            return value
+    if value is not None and least <= value < below and (value > 0.0 or name not in _NEEDED):
+        return value
     bound = "more than 0" if name in _NEEDED else "any size" if least < 0 else "0 or more"
     if below < inf:
         bound += f" below {below:g}"
@@ -130,11 +130,9 @@ def _value(path: Path, name: str, entry: object) -> float:
 
 def _deviation(entry: Mapping[str, Any]) -> float | None:
     """Half of the 95 % interval over 1.96, which holds over all structures; else the std."""
-    ends, std = entry.get("interval_95"), entry.get("std")
-    if isinstance(ends, list) and len(ends) == 2 and all(map(_is_number, ends)):
-        return float(abs(ends[1] - ends[0]) / (2 * _TWO_SIDED_95))
-    return float(std) if _is_number(std) and std > 0 else None
-
-
-def _is_number(value: Any) -> TypeGuard[float]:  # noqa: ANN401 - whatever JSON has
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+    ends, std = entry.get("interval_95"), finite_number(entry.get("std"))
+    if isinstance(ends, list) and len(ends) == 2:
+        low, high = map(finite_number, ends)
+        if low is not None and high is not None:
+            return abs(high - low) / (2 * _TWO_SIDED_95)
+    return std if std is not None and std > 0 else None

@@ -1,7 +1,7 @@
-"""Units: which one a key's ending names, and how many digits an uncertain number is shown with."""
+"""Units and numbers: the unit that a key's ending names, numbers of documents, digits shown."""
 
 from collections.abc import Sequence
-from math import floor, inf, log10
+from math import floor, inf, isfinite, log10
 from types import MappingProxyType
 from typing import Final
 
@@ -112,3 +112,21 @@ def decimals(uncertainty: float) -> int:
     (3, 0)
     """
     return max(1 - floor(log10(uncertainty)), 0)
+
+
+def finite_number(value: object) -> float | None:
+    """Return a number that a document holds; None of anything else, and if it is not finite.
+
+    Examples
+    --------
+    >>> from rigd.units import finite_number
+    >>> finite_number(3), finite_number("3"), finite_number(True), finite_number(10**400)
+    (3.0, None, None, None)
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if isfinite(number) else None

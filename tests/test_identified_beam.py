@@ -28,6 +28,7 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
         ({"alpha": {"value": 2.5, "std": 0.0}}, r"alpha\.value = 2\.5 must be .* below 2"),
         ({"bending_stiffness_n_m2": {"value": 0, "std": 0}}, "more than 0 N·m²"),
         ({"gamma": 3}, r"gamma\.value = null"),
+        ({"gamma": {"value": 10**400, "std": 0.0}}, r"gamma\.value = 1000.* must be"),
     ],
 )
 def test_what_is_wrong_with_the_document_is_said(analysed, other, says):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from analysis.exchange._source import ExchangeError
 from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
 from rigd.beam import Beam
-from rigd.units import unit_of
+from rigd.units import finite_number, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -123,6 +122,7 @@ def _number(path: Path, name: str, section: Mapping[str, Any], key: str) -> floa
         value = value.get("value")
     if value is None:
         raise ExchangeError(f"{path}: has no {name}.{key}; state it in {unit} in section [{name}].")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = finite_number(value)
+    if number is None:
         raise ExchangeError(f"{path}: {name}.{key} is {value!r}, but must be a number in {unit}.")
-    return float(value)
+    return number

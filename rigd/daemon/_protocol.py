@@ -5,7 +5,6 @@ Whatever comes in is untrusted. A refusal names what is wrong; docs/control_sock
 
 import inspect
 import json
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
@@ -14,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from rigd.errors import RigdError
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
 from rigd.session import NOTES, MetadataError, metadata_keys
+from rigd.units import finite_number
 
 LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""
@@ -274,14 +274,10 @@ def _value(name: str, given: object, wanted: object) -> Value:
 
 
 def _number(name: str, given: object) -> float:
-    if isinstance(given, int | float) and not isinstance(given, bool):
-        try:
-            number = float(given)
-        except OverflowError:
-            number = float("inf")
-        if isfinite(number):
-            return number
-    raise RequestError(f"parameters.{name} = {_shown(given)} is not a finite number.")
+    number = finite_number(given)
+    if number is None:
+        raise RequestError(f"parameters.{name} = {_shown(given)} is not a finite number.")
+    return number
 
 
 def _shown(value: object) -> str:

@@ -8,11 +8,11 @@ session file has of its record.
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.units import finite_number
 
 Document = dict[str, Any]
 
@@ -192,7 +192,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     try:
         text = (outcome or {})["fit"]
         found = json.loads(text, parse_constant=lambda _: None, parse_float=_parsed)
-        duration_s = _finite(found["duration_s"])
+        duration_s = finite_number(found["duration_s"])
         parameters = {
             _text(name): _quantity(value) for name, value in found.get("parameters", {}).items()
         }
@@ -215,7 +215,9 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
 def _targets(documents: object) -> Iterator[Document]:
     for target in documents if isinstance(documents, list) else ():
         if isinstance(target, dict):
-            numbers = {name: _finite(target.get(name)) for name in ("value", "std", "asked_std")}
+            numbers = {
+                name: finite_number(target.get(name)) for name in ("value", "std", "asked_std")
+            }
             if numbers["asked_std"] is not None:
                 mode = target.get("mode")
                 yield {
@@ -228,14 +230,16 @@ def _targets(documents: object) -> Iterator[Document]:
 
 
 def _quantity(document: object) -> Document | None:
-    if not isinstance(document, dict) or (value := _finite(document.get("value"))) is None:
+    if not isinstance(document, dict) or (value := finite_number(document.get("value"))) is None:
         return None
     ends = document.get("interval_95")
-    interval = [_finite(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
+    interval = (
+        [finite_number(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
+    )
     flag = document.get("flag")
     return {
         "value": value,
-        "std": _finite(document.get("std")),
+        "std": finite_number(document.get("std")),
         "interval_95": None if interval is None or None in interval else interval,
         "flag": _text(flag) if isinstance(flag, str) else None,
     }
@@ -255,22 +259,12 @@ def _response(document: object) -> Document | None:
 
 def _finite_numbers(values: object) -> list[float]:
     """Return numbers; none at all if anything else is among them."""
-    numbers = [_finite(value) for value in values] if isinstance(values, list) else []
+    numbers = [finite_number(value) for value in values] if isinstance(values, list) else []
     return [] if None in numbers else numbers  # type: ignore[return-value]
 
 
 def _parsed(text: str) -> float | None:
-    return _finite(float(text))
-
-
-def _finite(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if isfinite(number) else None
+    return finite_number(float(text))
 
 
 def _text(value: object) -> str:

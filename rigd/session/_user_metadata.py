@@ -5,11 +5,10 @@ The ending of a name is the unit: a name that ends in one has a finite number, a
 
 import re
 from collections.abc import Mapping
-from math import isfinite
 from typing import Final
 
 from rigd.errors import UserError
-from rigd.units import unit_of
+from rigd.units import finite_number, unit_of
 
 NOTES: Final = ("operator", "specimen", "note")
 """Texts with separate options and keys."""
@@ -110,13 +109,10 @@ def _number(name: str, value: object) -> str:
 
 def _as_number(value: object) -> float | None:
     """Return a finite number, of itself or from its text; None if there is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return None
     try:
-        number = float(value)
-    except (ValueError, OverflowError):
+        return finite_number(float(value) if isinstance(value, str) else value)
+    except ValueError:
         return None
-    return number if isfinite(number) else None
 
 
 def _text(name: str, value: object) -> str:
