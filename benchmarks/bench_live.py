@@ -85,13 +85,13 @@ def run(seconds: float, *, live: bool) -> tuple[Measurement, str, float]:
     text, percent = "", 0.0
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        loops.connected(profile, live=live) as (rig, crew),
+        loops.connected(profile, live=live) as (rig, group),
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
         if live:
             rig.show(order, stop)
-            pid = crew[LIVE].pid
+            pid = group[LIVE].pid
             meters = [Meter(pid), Meter(child_of(pid))]
 
         def watch(progress: object, _: object) -> None:

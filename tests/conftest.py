@@ -206,13 +206,13 @@ class Done:
 def rigd_here(tmp_path, monkeypatch):
     """Run `rigd` in this process, as far as it comes without any other."""
     from rigd.cli.app import app
-    from rigd.runtime._signals import StopRequest
+    from rigd.runtime._stop_signals import StopRequest
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
-    no_crew = StopRequest(), contextlib.nullcontext()
+    no_group = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
-        monkeypatch.setattr(f"rigd.cli.{command}.start_processes", lambda **_: no_crew)
+        monkeypatch.setattr(f"rigd.cli.{command}.start_processes", lambda **_: no_group)
     monkeypatch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)

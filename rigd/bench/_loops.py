@@ -96,13 +96,13 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Pr
         If they do not start.
     """
     try:
-        with ProcessGroup(live=live) as crew, ExitStack() as connection:
-            rig = Rig(profile, crew=crew)
+        with ProcessGroup(live=live) as group, ExitStack() as connection:
+            rig = Rig(profile, group=group)
             rig.connect()
             # It also gives back the precedence that supervision has, of which what is measured
             # next, such as cyclictest, would inherit the cores.
             connection.callback(rig.disconnect)
-            yield rig, crew
+            yield rig, group
     except (FailureError, OSError) as error:
         raise LoopError(str(error)) from error
 
@@ -127,17 +127,17 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
         If the session does not go well.
     """
     rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
-    with connected(profile) as (_, crew):
-        channels, board = crew.channels, crew.channels.board
-        meter = UsageMeter(crew.control.pid)
+    with connected(profile) as (_, group):
+        channels, board = group.channels, group.channels.board
+        meter = UsageMeter(group.control.pid)
         board[Word.STOP] = Stop.NO
         board[Word.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
-        crew.control.send(SessionJob(profile, reference))
+        group.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
         while not isinstance(finished, Finished):
-            finished = crew.control.poll(LOOK_S)
+            finished = group.control.poll(LOOK_S)
             board.beat(Word.SUPERVISOR_BEAT)
             meter.look(Phase(board[Word.PHASE]))
             while block := channels.samples.take(_BLOCK):
@@ -176,10 +176,10 @@ def run_session(
     excitation = _excitation(profile, seconds)
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        connected(profile, live=live) as (rig, crew),
+        connected(profile, live=live) as (rig, group),
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
-        meter = UsageMeter(crew.control.pid)
+        meter = UsageMeter(group.control.pid)
         stop = StopRequest()
         if live:
             rig.show(order, stop)

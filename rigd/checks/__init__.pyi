@@ -1,7 +1,7 @@
+from ._check import check_beside as check_beside
+from ._check import check_rig as check_rig
 from ._machine import settings_granted as settings_granted
 from ._on_paper import eds_rows as eds_rows
-from ._rig import check_beside as check_beside
-from ._rig import check_rig as check_rig
 from ._rows import OF_A_RIG as OF_A_RIG
 from ._rows import OF_AN_EDS as OF_AN_EDS
 from ._rows import Row as Row

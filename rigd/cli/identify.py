@@ -133,7 +133,7 @@ def _run_sessions(
 
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
-    stop, crew = start_processes(live=False)
+    stop, group = start_processes(live=False)
     from rigd.identification import (
         cautious,
         multisine_session,
@@ -144,13 +144,13 @@ def _run_sessions(
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
 
-    def run(session: "Session", prepare: "Prepare", number: int, crew: ProcessGroup) -> Path:
+    def run(session: "Session", prepare: "Prepare", number: int, group: ProcessGroup) -> Path:
         def build(profile: "Profile") -> "Excitation":
             return session(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
         results = run_in_foreground(
             build,
-            crew,
+            group,
             stop,
             profile_name=profile_name,
             folder=folder,
@@ -172,7 +172,7 @@ def _run_sessions(
         return path
 
     try:
-        trial = run(trial_session, cautious, 0, crew)
+        trial = run(trial_session, cautious, 0, group)
         estimate = _estimate([trial], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":

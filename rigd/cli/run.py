@@ -133,14 +133,14 @@ def run_sessions(
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note, meta)
     fit = watch_fit or kind == "until"
-    stop, crew = start_processes(live=live, touch=kind == "touch", fit=fit)
+    stop, group = start_processes(live=live, touch=kind == "touch", fit=fit)
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
 
     try:
         results = run_in_foreground(
             partial(excitation_for, kind=kind, parameters=parameters),
-            crew,
+            group,
             stop,
             profile_name=profile,
             folder=output,

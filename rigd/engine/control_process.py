@@ -104,7 +104,7 @@ def attend(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
+        attendance = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
         channels.board[Word.PHASE] = Phase.OFF
         attendance.take_up_standstill()
         parent.send(
@@ -126,7 +126,7 @@ def attend(
     parent.send(Ended(f"{failure} {devices.drive.off_doubt}".strip()))
 
 
-class _Attendance:
+class _ControlServer:
     """Connected devices, and the requests of the supervisor."""
 
     def __init__(

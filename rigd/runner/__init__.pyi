@@ -26,6 +26,6 @@ from ._session import SessionFailedError as SessionFailedError
 from ._session import SessionProgress as SessionProgress
 from ._session import SessionResult as SessionResult
 from ._session import results_document as results_document
-from ._signals import SignalBlock as SignalBlock
+from ._signal_blocks import SignalBlock as SignalBlock
 from ._status import ProcessStatus as ProcessStatus
 from ._status import RigStatus as RigStatus

@@ -53,7 +53,7 @@ class SeriesFailedError(FailureError):
 
 def run_in_foreground(
     build: Callable[..., Excitation],
-    crew: ProcessGroup,
+    group: ProcessGroup,
     stop: StopRequest,
     *,
     profile_name: str,
@@ -78,7 +78,7 @@ def run_in_foreground(
     ----------
     build
         Makes the excitation for a rig, from its profile.
-    crew
+    group
         The processes, started but not yet needed; ended when this returns.
     stop
         The operator's.
@@ -121,7 +121,7 @@ def run_in_foreground(
     looks = QuickLooks(told) if look else None
     try:
         # The rig is given up last, when no process uses the devices any more.
-        with contextlib.ExitStack() as reserved, crew:
+        with contextlib.ExitStack() as reserved, group:
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
@@ -134,7 +134,7 @@ def run_in_foreground(
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
             mounted = with_specimen(profile, notes.get("specimen", ""))
-            rig = Rig(profile, fast=fast, crew=crew)
+            rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
                 rig.connect(moving)
                 build = partial(build, start_rad=rig.angle_rad)

@@ -35,7 +35,7 @@ class LiveView:
 
     Parameters
     ----------
-    crew
+    group
         Processes with a publisher, their memory laid out.
     rig
         The profile's name.
@@ -48,11 +48,11 @@ class LiveView:
         Address of the view, as far as it is known.
     """
 
-    def __init__(self, crew: ProcessGroup, rig: str, *, fast: bool = False) -> None:
+    def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
         self._fast = fast
         self.address: LiveAddress | None = None
-        self._crew = crew
-        self._job = LiveJob(rig, crew.channels.specs)
+        self._group = group
+        self._job = LiveJob(rig, group.channels.specs)
         self._session: LiveSession | None = None
         self._untold: list[Event] = []
         self._restarts = 0
@@ -79,7 +79,7 @@ class LiveView:
         if self._lost:  # perhaps not any more
             self._start()
         self._await(lambda: self._heard, _PATIENCE_S, stop)
-        begins = tuple(ring.written for ring in self._crew.channels.rings)
+        begins = tuple(ring.written for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast), str(uuid.uuid4()), begins, order.path.parent
         )
@@ -120,7 +120,7 @@ class LiveView:
         """Note the end of the session that is shown; its outcome may be unknown."""
         if self._session is not None:
             self._session = None
-            ends = tuple(ring.written for ring in self._crew.channels.rings)
+            ends = tuple(ring.written for ring in self._group.channels.rings)
             self._send(LiveEnd(ends, outcome, reason))
 
     def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
@@ -135,7 +135,7 @@ class LiveView:
         self._lost = ""
         self._pulse = Pulse()
         try:
-            self._crew.fresh(LIVE)
+            self._group.fresh(LIVE)
         except ChildError as error:
             self._lost, self.address = str(error), None
             return
@@ -147,13 +147,13 @@ class LiveView:
         if self._lost:
             return
         try:
-            self._crew[LIVE].send(message)
+            self._group[LIVE].send(message)
         except ChildError as error:
             self._restart(str(error))
 
     def _listen(self, patience_s: float) -> None:
         try:
-            answer = self._crew[LIVE].poll(patience_s)
+            answer = self._group[LIVE].poll(patience_s)
         except ChildError as error:
             self._restart(str(error))
         else:
@@ -178,7 +178,7 @@ class LiveView:
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
         patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
-        beat = self._crew.channels.board[Word.LIVE_BEAT]
+        beat = self._group.channels.board[Word.LIVE_BEAT]
         if self._pulse.look(beat, time.monotonic()) > patience_s:
             self._restart(f"The live process was killed: no response for {patience_s:g} s.")
 
@@ -189,7 +189,7 @@ class LiveView:
             self._note("warning", f"{why} It is not restarted; the session continues.")
             return
         self._note("warning", f"{why} It is restarted; the session continues.")
-        self._crew[LIVE].kill()
+        self._group[LIVE].kill()
         self._start()
 
     def _note(self, level: Level, message: str) -> None:

@@ -49,7 +49,7 @@ class OnlineFit:
 
     Parameters
     ----------
-    crew
+    group
         Processes of the rig, their memory laid out.
     profile
         Profile of the rig.
@@ -69,14 +69,14 @@ class OnlineFit:
 
     def __init__(
         self,
-        crew: "ProcessGroup",
+        group: "ProcessGroup",
         profile: "Profile",
         reference: "ReferenceSpec",
         search: "PrecisionSearch | None",
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
-        self._crew = crew
-        self._board = crew.channels.board
+        self._group = group
+        self._board = group.channels.board
         self._search = search
         self._events: list[Event] = []
         self._news: list[Mapping[str, Any]] = []
@@ -88,10 +88,10 @@ class OnlineFit:
         self._pulse = Pulse()
         self._segments: Mapping[str, tuple[int, int]] = {}
         self.shortcoming = ""
-        first = crew.channels.samples.written
-        job = FitJob(crew.channels.specs, first, profile, reference, search, realtime)
+        first = group.channels.samples.written
+        job = FitJob(group.channels.specs, first, profile, reference, search, realtime)
         try:
-            crew.fresh(FIT).start(job)
+            group.fresh(FIT).start(job)
         except ChildError as error:
             self._lose(str(error))
 
@@ -128,7 +128,7 @@ class OnlineFit:
         assert FIT.hung_after_s is not None
         still_s = self._pulse.look(self._board[Word.FIT_BEAT], time.monotonic())
         if still_s > FIT.hung_after_s:
-            self._crew[FIT].kill()
+            self._group[FIT].kill()
             self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
 
     def news(self) -> list[Mapping[str, Any]]:
@@ -210,7 +210,7 @@ class OnlineFit:
         if self._lost:
             return
         try:
-            self._crew[FIT].send(message)
+            self._group[FIT].send(message)
         except ChildError as error:
             self._lose(str(error))
 
@@ -218,7 +218,7 @@ class OnlineFit:
         if self._lost:
             return
         try:
-            for message in self._crew[FIT].messages(patience_s):
+            for message in self._group[FIT].messages(patience_s):
                 self._take(message)
         except ChildError as error:
             self._lose(str(error))

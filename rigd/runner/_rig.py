@@ -32,7 +32,7 @@ from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
-from rigd.runner._signals import SignalBlock, SignalReader
+from rigd.runner._signal_blocks import SignalBlock, SignalReader
 from rigd.runner._status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
 
@@ -59,7 +59,7 @@ class Rig:
         Run under the virtual clock.
     live
         Show each session in a live view.
-    crew
+    group
         Processes that have been started already, for the first connection.
 
     Attributes
@@ -76,12 +76,12 @@ class Rig:
         *,
         fast: bool = False,
         live: bool = False,
-        crew: ProcessGroup | None = None,
+        group: ProcessGroup | None = None,
     ) -> None:
         self._profile = profile
         self._fast = fast
         self._live = live
-        self._crew = crew
+        self._group = group
         self._told: Connected | None = None
         self._view: LiveView | None = None
         self._zero_set = False
@@ -133,22 +133,22 @@ class Rig:
             self.disconnect()
         try:
             # Nobody knows yet what sessions the processes that it starts itself will run.
-            any_session = self._crew is None
-            crew = self._crew = self._crew or ProcessGroup(live=self._live)
-            granted = self._take_precedence(crew)
+            any_session = self._group is None
+            group = self._group = self._group or ProcessGroup(live=self._live)
+            granted = self._take_precedence(group)
             if reset_fault:
                 self._reset_fault(moving)
-            _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
-            job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
-            crew.fresh(CONTROL).start(job)
+            _lay_out(group, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
+            job = ControlJob(self._profile, moving, group.channels.specs, self._fast)
+            group.fresh(CONTROL).start(job)
             told = self._ask(_CONNECT_PATIENCE_S)
             assert isinstance(told, Connected)
             self._told = replace(told, realtime={**told.realtime, **granted})
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if LIVE in crew:
-            self._view = LiveView(crew, self._profile.name, fast=self._fast)
+        if LIVE in group:
+            self._view = LiveView(group, self._profile.name, fast=self._fast)
         self.connected = True
         self.zero_lost |= self._zero_set
         self._zero_set = False
@@ -178,7 +178,7 @@ class Rig:
         SessionFailedError
             If the file cannot be written, or the recorder died.
         """
-        crew = self._require()
+        group = self._require()
         assert self._told is not None
         if self.zero_lost:
             raise RigError(
@@ -187,9 +187,9 @@ class Rig:
             )
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(crew.channels.board)
-        crew.channels.clear()
-        session = Session(order, crew, self._told, self._view, watcher, listens)
+        _wipe(group.channels.board)
+        group.channels.clear()
+        session = Session(order, group, self._told, self._view, watcher, listens)
         outcome = reason = ""
         try:
             result = replace(session.run(stop), hardware=not self.simulated)
@@ -221,10 +221,10 @@ class Rig:
         str
             Its address, or why there is none, for the operator.
         """
-        crew = self._require()
+        group = self._require()
         if self._view is None:
             return "No live view was requested."
-        _wipe(crew.channels.board)
+        _wipe(group.channels.board)
         return self._view.show(order, stop)
 
     def tare(self) -> dict[str, Any]:
@@ -267,19 +267,19 @@ class Rig:
         RigError
             If it reported a fault, died or hangs; everything is closed then.
         """
-        crew = self._require()
+        group = self._require()
         if self._view is not None:
             self._view.look()
         try:
-            message = crew.control.poll(0.0)
+            message = group.control.poll(0.0)
         except ChildError as error:
             message = Ended(str(error))
-        board = crew.channels.board
+        board = group.channels.board
         board.beat(Word.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
         still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
-            crew.control.kill()
+            group.control.kill()
             message = Ended(
                 f"The control process has not responded for {still_s:.1f} s. Check CPU load."
             )
@@ -291,11 +291,11 @@ class Rig:
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
         with self._looking:
-            crew, view = self._crew, self._view
-            if crew is None or not crew.laid_out:
+            group, view = self._group, self._view
+            if group is None or not group.laid_out:
                 return None
             address = None if view is None else view.address
-            return replace(self._statuses.look(crew), live_view=address)
+            return replace(self._statuses.look(group), live_view=address)
 
     def signals(self) -> list[SignalBlock]:
         """Return what has come of the record since the last call, from any thread.
@@ -303,30 +303,30 @@ class Rig:
         It begins with the first call, and again if the last one is more than 1 s ago.
         """
         with self._looking:
-            crew = self._crew
-            if crew is None or not crew.laid_out:
+            group = self._group
+            if group is None or not group.laid_out:
                 return []
-            return self._signals.take(crew.channels)
+            return self._signals.take(group.channels)
 
     def disconnect(self) -> None:
         """Disable the drive, close the devices, end the processes; harmless when repeated."""
         with self._looking:
-            crew, self._crew = self._crew, None
+            group, self._group = self._group, None
             self._view = None
             self.connected = False
-        if crew is not None:
-            crew.end()
+        if group is not None:
+            group.end()
         if self._precedence is not None:
             self._precedence.release()
             self._precedence = None
 
-    def _take_precedence(self, crew: ProcessGroup) -> dict[str, str]:
+    def _take_precedence(self, group: ProcessGroup) -> dict[str, str]:
         """Put this process before the ordinary ones; say what was granted."""
         if self._fast:
             return {}
         realtime = self._profile.realtime
         self._precedence = Precedence(realtime.supervision_priority, realtime.cpu)
-        crew.cores = self._precedence.cores_before
+        group.cores = self._precedence.cores_before
         return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
     def _reset_fault(self, moving: WhatMoves | None) -> None:
@@ -338,15 +338,15 @@ class Rig:
             raise RigError(str(error)) from None
 
     def _require(self) -> ProcessGroup:
-        if self._crew is None or not self.connected:
+        if self._group is None or not self.connected:
             raise RigError("The rig is not connected.")
-        return self._crew
+        return self._group
 
     def _order(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
         """Have the control process measure something between sessions."""
-        crew = self._require()
+        group = self._require()
         try:
-            crew.control.send(order)
+            group.control.send(order)
             answer = self._ask(_ANSWER_PATIENCE_S + duration_s)
         except (ChildError, RigError) as error:
             self.disconnect()
@@ -366,8 +366,8 @@ class Rig:
         ChildError
             If it died.
         """
-        assert self._crew is not None
-        answer = self._crew.control.poll(patience_s)
+        assert self._group is not None
+        answer = self._group.control.poll(patience_s)
         if answer is None:
             raise RigError(
                 f"The control process does not answer within {patience_s:g} s; check that the "
@@ -379,9 +379,9 @@ class Rig:
 
     def _await_end(self) -> None:
         """Let a control process whose device failed close what can be closed."""
-        assert self._crew is not None
+        assert self._group is not None
         with contextlib.suppress(ChildError):
-            self._crew.control.poll(_ANSWER_PATIENCE_S)
+            self._group.control.poll(_ANSWER_PATIENCE_S)
         self.disconnect()
 
 
@@ -394,9 +394,9 @@ def _wipe(board: SharedState) -> None:
     board[Word.LAST_PIECE] = 0
 
 
-def _lay_out(crew: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:
+def _lay_out(group: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:
     try:
-        crew.lay_out(rate_hz, fast=fast, watched=watched)
+        group.lay_out(rate_hz, fast=fast, watched=watched)
     except OSError as error:
         raise RigError(
             f"No shared memory for the session processes ({error.strerror}); check the "

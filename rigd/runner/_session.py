@@ -210,7 +210,7 @@ class Session:
     ----------
     order
         Session to run.
-    crew
+    group
         Processes of the rig; its control process is connected and idle.
     connected
         Message of that process when it had connected.
@@ -231,18 +231,18 @@ class Session:
     def __init__(
         self,
         order: Order,
-        crew: ProcessGroup,
+        group: ProcessGroup,
         connected: Connected,
         live: LiveView | None,
         watcher: Watcher,
         listens: Callable[[], bool],
     ) -> None:
         self._order = order
-        self._crew = crew
+        self._group = group
         self._connected = connected
         self._live = live
-        self._board = crew.channels.board
-        self._events = Observer(crew.channels.events)
+        self._board = group.channels.board
+        self._events = Observer(group.channels.events)
         self._watcher = watcher
         self._listens = listens
         self._virtual = connected.realtime["clock"] == "virtual"
@@ -286,10 +286,10 @@ class Session:
         self._board[Word.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
-        crew, search = self._crew, self._order.excitation.search
+        group, search = self._group, self._order.excitation.search
         try:
             reference = put_reference(
-                crew.channels.reference_fd,
+                group.channels.reference_fd,
                 self._order.excitation.reference_rad,
                 None if search is None else search.planned_ticks,
             )
@@ -302,9 +302,9 @@ class Session:
         profile = order.profile
         realtime = None if self._virtual else profile.realtime
         if order.touch is not None:
-            self._touches = TouchEstimates(crew, order.touch, profile.rig.rate_hz, realtime)
+            self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
         if search is not None or order.watch_fit:
-            self._fit = OnlineFit(crew, profile, reference, search, realtime)
+            self._fit = OnlineFit(group, profile, reference, search, realtime)
             lost = self._fit.await_ready(self._reports)
             if lost and search is not None:
                 raise SessionFailedError(lost)
@@ -315,11 +315,11 @@ class Session:
         job = SessionJob(
             order.profile, reference, self._refused_to_supervision(), order.ending, touch
         )
-        crew.control.send(job)
+        group.control.send(job)
         answer = self._listen_to_control()
         if isinstance(answer, Ready):
             header = file_header(order, self._connected, answer.tare)
-            crew.recorder.send(header)
+            group.recorder.send(header)
             if self._fit is not None:
                 self._fit.begin(header)
             self._ask_recorder(Armed)
@@ -337,11 +337,11 @@ class Session:
 
     def _open_file(self) -> None:
         """Have the file made, under another name if somebody else has just taken the one chosen."""
-        crew = self._crew
+        group = self._group
         realtime = None if self._virtual else self._order.profile.realtime
         for _ in range(_MOST_NAMES):
-            job = RecorderJob(self._order.path, crew.channels.specs, realtime)
-            crew.fresh(RECORDER).start(job)
+            job = RecorderJob(self._order.path, group.channels.specs, realtime)
+            group.fresh(RECORDER).start(job)
             try:
                 opened = self._ask_recorder(Opened, _START_PATIENCE_S)
             except _NameTakenError as error:
@@ -368,7 +368,7 @@ class Session:
         deadline, phase = 0.0, -1
         while True:
             try:
-                answer = self._crew.control.poll(_POLL_S)
+                answer = self._group.control.poll(_POLL_S)
             except ChildError as error:
                 return self._control_died(str(error))
             self._report()
@@ -415,7 +415,7 @@ class Session:
 
     def _kill_control(self, why: str) -> Finished:
         """End a control process that hangs: the drive's own watch is what switches off then."""
-        self._crew.control.kill()
+        self._group.control.kill()
         return self._control_died(
             f"The control process {why} and was killed: without its heartbeat the drive switches "
             "itself off. Check that it is off."
@@ -445,7 +445,7 @@ class Session:
 
     def _recorder_trouble(self) -> str | None:
         try:
-            message = self._crew.recorder.poll(0.0)
+            message = self._group.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
         if isinstance(message, Failed):
@@ -458,7 +458,7 @@ class Session:
         deadline = time.monotonic() + patience_s
         message = None
         while message is None and time.monotonic() < deadline:
-            message = self._crew.recorder.poll(_POLL_S)
+            message = self._group.recorder.poll(_POLL_S)
             self._report()
         if message is None:
             raise SessionFailedError(
@@ -522,9 +522,9 @@ class Session:
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
                 outcome["reason"] = self._fit.shortcoming
-        self._crew.recorder.wake()
+        self._group.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
-        self._crew.recorder.send(Close(outcome, packed, segments))
+        self._group.recorder.send(Close(outcome, packed, segments))
         closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}

@@ -196,9 +196,9 @@ class StatusWatch:
         self._written: tuple[float, tuple[int, ...]] | None = None
         self._signals = SignalWatch(rate_hz)
 
-    def look(self, crew: ProcessGroup) -> RigStatus:
+    def look(self, group: ProcessGroup) -> RigStatus:
         """Return the status now."""
-        board = crew.channels.board
+        board = group.channels.board
         load_ppm = board.known(Word.BUS_LOAD_PPM)
         return RigStatus(
             phase=Phase(board[Word.PHASE]),
@@ -214,13 +214,13 @@ class StatusWatch:
             sensor_status=board.known(Word.SENSOR_STATUS),
             disk_free_mb=board[Word.DISK_FREE_MB] or None,
             view_dropped=board[Word.LIVE_DROPPED],
-            signals=self._signals.look(crew.channels.samples),
-            processes=tuple(self._processes(crew)),
-            topics=tuple(self._topics(crew)),
+            signals=self._signals.look(group.channels.samples),
+            processes=tuple(self._processes(group)),
+            topics=tuple(self._topics(group)),
         )
 
-    def _topics(self, crew: ProcessGroup) -> Iterator[TopicStatus]:
-        rings, now_s = crew.channels.rings, time.monotonic()
+    def _topics(self, group: ProcessGroup) -> Iterator[TopicStatus]:
+        rings, now_s = group.channels.rings, time.monotonic()
         written = tuple(ring.written for ring in rings)
         before_s, before = self._written or (now_s, written)
         self._written = now_s, written
@@ -231,19 +231,19 @@ class StatusWatch:
             expected_hz = topic.expected_hz(self._rate_hz)
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
-    def _processes(self, crew: ProcessGroup) -> Iterator[ProcessStatus]:
-        board, now_s = crew.channels.board, time.monotonic()
+    def _processes(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
+        board, now_s = group.channels.board, time.monotonic()
         for process in PROCESSES:
             still_s = self._pulses[process].look(board[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue
-            if process not in crew:
+            if process not in group:
                 continue
-            child = crew[process]
+            child = group[process]
             if not child.running:
                 state = "ended"
-            elif not crew.has_job(process):
+            elif not group.has_job(process):
                 state = "waiting"
             elif process.hung_after_s is not None and still_s > process.hung_after_s:
                 state = "hung"

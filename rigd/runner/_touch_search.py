@@ -119,7 +119,7 @@ class TouchEstimates:
 
     Parameters
     ----------
-    crew
+    group
         Processes of the rig, their memory laid out.
     search
         The obstacle that is looked for.
@@ -131,28 +131,28 @@ class TouchEstimates:
 
     def __init__(
         self,
-        crew: "ProcessGroup",
+        group: "ProcessGroup",
         search: TouchSearch,
         rate_hz: float,
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
-        self._crew = crew
+        self._group = group
         self._rate_hz = rate_hz
         self._events: list[Event] = []
         self._news: list[dict[str, Any]] = []
         self._lost = ""
         self._told: dict[int, TouchTold] = {}
         job = TouchJob(
-            crew.channels.specs,
-            crew.channels.samples.written,
+            group.channels.specs,
+            group.channels.samples.written,
             rate_hz,
             search.model,
             search.order.shear_projection,
             realtime,
         )
         try:
-            crew.fresh(TOUCH).start(job)
-            if not isinstance(crew[TOUCH].poll(_READY_PATIENCE_S), TouchReady):
+            group.fresh(TOUCH).start(job)
+            if not isinstance(group[TOUCH].poll(_READY_PATIENCE_S), TouchReady):
                 self._lose(f"The touch process was not ready within {_READY_PATIENCE_S:g} s.")
         except ChildError as error:
             self._lose(str(error))
@@ -204,7 +204,7 @@ class TouchEstimates:
         if self._lost:
             return
         try:
-            for message in self._crew[TOUCH].messages(patience_s):
+            for message in self._group[TOUCH].messages(patience_s):
                 if isinstance(message, TouchTold):
                     self._told[message.number] = message
                     self._note(message)

@@ -16,9 +16,9 @@ from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
 from ._plain_files import open_plain_file as open_plain_file
-from ._signals import StopRequest as StopRequest
-from ._signals import held_back as held_back
-from ._signals import ignore as ignore
-from ._signals import let_pass as let_pass
-from ._signals import raise_on as raise_on
-from ._signals import signal_when_orphaned as signal_when_orphaned
+from ._stop_signals import StopRequest as StopRequest
+from ._stop_signals import held_back as held_back
+from ._stop_signals import ignore as ignore
+from ._stop_signals import let_pass as let_pass
+from ._stop_signals import raise_on as raise_on
+from ._stop_signals import signal_when_orphaned as signal_when_orphaned

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rigd.runtime._signals import signal_when_orphaned
+from rigd.runtime._stop_signals import signal_when_orphaned
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -15,7 +15,7 @@ from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.session import SessionWriter, read_session
 from rigd.session._format import pack_sample_into
 

@@ -92,7 +92,7 @@ def test_under_a_profile_its_values_are_compared(rigd, profile_with):
 
 
 def test_the_eds_of_a_profile_comes_first(rigd, profile_with, monkeypatch):
-    monkeypatch.setattr("rigd.checks._rig.inspect_devices", lambda _: [])
+    monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
     path = profile_with(f"eds = '{eds_path('elmo_gold')}'")
     rows = rows_of(rigd("check", "--profile", path, "--json"))
     groups = list(dict.fromkeys(row["group"] for row in rows))
@@ -102,7 +102,7 @@ def test_the_eds_of_a_profile_comes_first(rigd, profile_with, monkeypatch):
 
 
 def test_a_profile_whose_eds_is_none_fails(rigd, profile_with, tmp_path, monkeypatch):
-    monkeypatch.setattr("rigd.checks._rig.inspect_devices", lambda _: [])
+    monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
     (tmp_path / "x.eds").write_bytes(b"\0" * 1000)
     done = rigd("check", "--profile", profile_with('eds = "x.eds"'), "--json")
     assert done.returncode == 1

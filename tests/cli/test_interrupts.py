@@ -10,7 +10,7 @@ import pytest
 
 from rigd.runner._foreground import _tell_stop
 from rigd.runner._session import SessionResult
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 
 DURING = {
     # What defines a dataclass or a named tuple is an `exec` of text.
@@ -35,7 +35,7 @@ DURING = {
     "the clean-up after its end": (
         "import os, signal, sys\n"
         "import rigd.cli.live\n"
-        "from rigd.runtime._signals import interrupt\n"
+        "from rigd.runtime._stop_signals import interrupt\n"
         "class Late:\n"
         "    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.SIGINT):\n"
         "        kill(pid, number)\n"

@@ -54,7 +54,7 @@ def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
 @pytest.mark.parametrize("name", [WITH_TORQUE[0], *map(further, WITH_TORQUE[1:])])
 def test_it_gets_past_loading_in_a_check(new, rigd_here, monkeypatch, name):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)
-    monkeypatch.setattr("rigd.checks._rig.inspect_devices", lambda _: [])
+    monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
     new(eds_path(name))
     done = rigd_here("check", "--profile", "my_rig.toml", "--json")
     # What a drive lacks is not accepted by itself.

@@ -21,7 +21,7 @@ from rigd.profile import load_profile
 from rigd.runner import _rig as rig_module
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.session import SessionError, SessionWriter
 
 _ENDED = object()
@@ -238,10 +238,10 @@ def open_writer(path):
 
 
 def open_watched(rig, moving):
-    return ThreadCrew.world.open_devices(rig)
+    return ThreadGroup.world.open_devices(rig)
 
 
-class ThreadCrew(ProcessGroup):
+class ThreadGroup(ProcessGroup):
     """Control and recorder as threads of this process."""
 
     world = None
@@ -262,7 +262,7 @@ class Operated:
 
     def __init__(self, profile, folder, *, live=False):
         self.world = World()
-        ThreadCrew.world = self.world
+        ThreadGroup.world = self.world
         self.loop = asyncio.new_event_loop()
         self.worker = ThreadPoolExecutor(1)
         self.events = []
@@ -340,7 +340,7 @@ def operate(profile, tmp_path, monkeypatch):
     monkeypatch.setattr(control, "StopRequest", QuietStop)
     monkeypatch.setattr(control, "collect_no_garbage", lambda: "off")
     monkeypatch.setattr(control, "open_devices", open_watched)
-    monkeypatch.setattr(rig_module, "ProcessGroup", ThreadCrew)
+    monkeypatch.setattr(rig_module, "ProcessGroup", ThreadGroup)
     made = []
 
     def make():
@@ -352,7 +352,7 @@ def operate(profile, tmp_path, monkeypatch):
         if operated.loop.is_closed():
             continue
         if operated.state in (State.RUNNING, State.STOPPING):
-            operated.rig._crew.control.kill()  # of a test that has failed: nobody waits for it
+            operated.rig._group.control.kill()  # of a test that has failed: nobody waits for it
         operated.close()
 
 

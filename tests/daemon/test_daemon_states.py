@@ -30,11 +30,11 @@ def limit_is_violated(operated, drive):
 
 
 def control_dies(operated, drive):
-    operated.rig._crew.control.kill()
+    operated.rig._group.control.kill()
 
 
 def recorder_dies(operated, drive):
-    operated.rig._crew.recorder.kill()
+    operated.rig._group.recorder.kill()
 
 
 def stop_is_asked_for(operated, drive):
@@ -151,7 +151,7 @@ def make_machine(operate):
         @rule()
         def control_dies_between_sessions(self):
             if self.operated.rig.connected:
-                self.operated.rig._crew.control.kill()
+                self.operated.rig._group.control.kill()
             self.operated.watch()
             assert self.operated.state is State.FAULT
 

@@ -280,7 +280,7 @@ def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
 
 
 def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
-    operated.rig._crew.control.kill()
+    operated.rig._group.control.kill()
     for _ in range(100):
         operated.watch()
         if operated.state is State.FAULT:
@@ -304,7 +304,7 @@ def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
 
 def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
     operated.world.countdown = 3000
-    operated.world.then = lambda _: operated.rig._crew.recorder.kill()
+    operated.world.then = lambda _: operated.rig._group.recorder.kill()
     operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
     assert operated.state is State.FAULT
     for words in ("killed by signal 9", "drive is disabled", "rigd recover"):
@@ -322,7 +322,7 @@ def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(
 
     def fail_both(drive):
         drive.off_doubt = doubt
-        operated.rig._crew.recorder.kill()
+        operated.rig._group.recorder.kill()
 
     operated.world.countdown, operated.world.then = 3000, fail_both
     operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
@@ -441,9 +441,9 @@ def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
 
 def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
     assert operated.ask("start", **SHORT)["series"] == 1
-    crew = operated.rig._crew
+    group = operated.rig._group
     with monkeypatch.context() as broken:
-        broken.setattr(type(crew), "_start", refuse_to_start)
+        broken.setattr(type(group), "_start", refuse_to_start)
         operated.ask("start", **SHORT)
     assert operated.state is State.FAULT
     assert "cannot be started" in operated.last["reason"]
@@ -485,7 +485,7 @@ def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, 
 
 
 def board(operated):
-    return operated.rig._crew.channels.board
+    return operated.rig._group.channels.board
 
 
 def test_the_end_of_the_daemon_stops_a_session_safely(operated):

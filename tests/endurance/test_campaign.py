@@ -15,7 +15,7 @@ from rigd.profile import load_profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 
 COARSE_KB = 4096
 
@@ -35,9 +35,9 @@ def campaign():
 def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     profile = load_profile("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    crew = ProcessGroup(live=False)
-    control = crew[CONTROL].pid
-    rig = Rig(profile, fast=True, crew=crew)
+    group = ProcessGroup(live=False)
+    control = group[CONTROL].pid
+    rig = Rig(profile, fast=True, group=group)
     looks = []
     gc.collect()  # of other tests in this process: it would free what counts here
     try:

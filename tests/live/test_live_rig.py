@@ -19,7 +19,7 @@ from rigd.runner import _live_view as live_view
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
 from rigd.runner._session import SessionFailedError
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.session import read_session
 
 
@@ -105,7 +105,7 @@ def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
 @pytest.mark.further  # as test_live_backlog.py
 def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
-    board = rig._crew.channels.board
+    board = rig._group.channels.board
     assert board[Word.GO]
     rig.show(order("second"), StopRequest())
     assert board[Word.GO] == 0
@@ -198,8 +198,8 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
     assert told[0].startswith("Live view: "), "a new session is a new chance"
 
 
-class StillCrew:
-    """A crew whose publisher is there and says and does nothing."""
+class StillGroup:
+    """A group whose publisher is there and says and does nothing."""
 
     def __init__(self):
         board = {Word.LIVE_BEAT: 0}
@@ -219,10 +219,10 @@ class StillCrew:
 def test_one_that_is_only_starting_has_time_on_a_busy_computer(monkeypatch, heard, patience_s):
     now_s = [0.0]
     monkeypatch.setattr(live_view.time, "monotonic", lambda: now_s[0])
-    crew = StillCrew()
-    view = live_view.LiveView(crew, "rig")
+    group = StillGroup()
+    view = live_view.LiveView(group, "rig")
     view._heard = heard
-    while crew.started == 1:
+    while group.started == 1:
         now_s[0] += 0.1
         view.look()
     assert now_s[0] == pytest.approx(patience_s, abs=0.5)

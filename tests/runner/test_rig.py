@@ -14,7 +14,7 @@ from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig, RigError
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.session import read_session
 
 

@@ -10,7 +10,7 @@ from rigd.engine import Phase, Word, shared_memory_fd
 from rigd.engine._ring import Ring
 from rigd.profile import load_profile
 from rigd.runner import _signals
-from rigd.runner._signals import SignalReader
+from rigd.runner._signal_blocks import SignalReader
 from rigd.session._format import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 1000.0

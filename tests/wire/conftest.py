@@ -1,4 +1,4 @@
-"""Sessions on the simulated rig's wires, in this process's own crew."""
+"""Sessions on the simulated rig's wires, in a process group of this process's own."""
 
 import json
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rigd.profile import load_profile
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
 from rigd.runner._session import SessionProgress, SessionResult
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.sim.wire._simulator import inject
 
 

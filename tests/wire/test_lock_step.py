@@ -10,7 +10,7 @@ from rigd.devices.parameters import Selection
 from rigd.excitation import hold
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
-from rigd.runtime._signals import StopRequest
+from rigd.runtime._stop_signals import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire._simulator import inject
 
