@@ -1,25 +1,13 @@
 """The real-time realisation against Eq. 25, and what it refuses."""
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
 from cases import further
+from paper_table import table_3
 
 from rigd.beam import Beam, Damping, RealisationError, couple, modes, realise, transfer
 
 PAPER_BEAM = Beam(0.98, 4.7e-3, 0.090275)
-
-
-def table_3():
-    """Mean parameters of the twelve models of the paper's Table 3."""
-    sets = {}
-    with (Path(__file__).parent.parent / "data" / "paper_table3.csv").open(newline="") as file:
-        for row in csv.DictReader(file):
-            name = "lambda_" if row["parameter"] == "lambda" else row["parameter"]
-            sets.setdefault(f"{row['type']}-{row['weighting']}", {})[name] = float(row["mean"])
-    return {name: Damping(**values) for name, values in sets.items()}
 
 
 SETS = table_3() | {"undamped": Damping()}

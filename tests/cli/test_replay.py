@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from graphics import NO_GRAPHICS, viewer_ended
 from processes import children, eventually, has_ended, listeners
+from rerun_files import batches
 
 from analysis.models import WelchSettings
 from analysis.paper._estimate import estimate
@@ -53,16 +54,6 @@ def refused(done, code, *words):
     assert line.startswith("Error: ")
     for word in words:
         assert word in line, line
-
-
-def chunks(path: Path) -> dict[str, list]:
-    """Read a recording with Rerun's own reader: record batches by entity, in order of time."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, list] = {}
-    for chunk in RrdReader(path).stream():
-        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-    return found
 
 
 def columns(batches: list, *names: str) -> dict[str, np.ndarray]:
@@ -102,7 +93,7 @@ def paper(made_once):
 
     folder = made_once("replayed", make)
     (path,) = folder.glob("out/*.mcap")
-    return read_session(path), chunks(folder / "paper.rrd"), folder / "paper.rrd"
+    return read_session(path), batches(folder / "paper.rrd"), folder / "paper.rrd"
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +269,7 @@ def saved(rigd_here):
         out = path.with_suffix(".rrd")
         done = rigd_here("replay", path, "--save", out)
         assert done.returncode == 0, done.stderr
-        return chunks(out)
+        return batches(out)
 
     return save
 
@@ -412,7 +403,7 @@ def test_what_is_set_for_programs_of_ones_own_is_no_matter(rigd_here, short, tmp
     out = tmp_path / f"{'x' * 250}.rrd"  # as long as a name can be
     done = rigd_here("replay", short, "--save", out)
     assert done.returncode == 0, done.stderr
-    assert chunks(out)["/signals"]
+    assert batches(out)["/signals"]
     assert not (tmp_path / "elsewhere.rrd").exists()
 
 

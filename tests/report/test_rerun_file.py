@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cases import further
+from rerun_files import batches
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
@@ -25,16 +26,6 @@ from rigd.view._rrd_file import new_rrd_file
 BAND = (0.5875, 50.0)
 
 
-def read(path: Path) -> dict[str, list]:
-    """Read a recording with Rerun's own reader: record batches by entity."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, list] = {}
-    for chunk in RrdReader(path).stream():
-        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-    return found
-
-
 def value(batches: list, name: str):
     """Return the one value of a component that stays as it is."""
     (found,) = [b.column(name).to_pylist()[0] for b in batches if name in b.schema.names]
@@ -45,7 +36,7 @@ def value(batches: list, name: str):
 def written(paper_analysis, tmp_path_factory):
     path = tmp_path_factory.mktemp("rerun") / "paper.rrd"
     write_rerun_file(RecordResult(paper_analysis.record, welch=paper_analysis), path)
-    return read(path), path
+    return batches(path), path
 
 
 class Canvas:
@@ -180,7 +171,7 @@ def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper
 def of_record(record_result, tmp_path_factory):
     path = tmp_path_factory.mktemp("rerun") / "record.rrd"
     write_rerun_file(replace(record_result, welch=None), path)
-    return read(path), path
+    return batches(path), path
 
 
 def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
@@ -256,7 +247,7 @@ def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tm
     path = tmp_path / "own.rrd"
     with new_rrd_file(path) as stream:
         fit_charts.draw(analysis, "numbers", stream)
-    chunks = read(path)
+    chunks = batches(path)
     names = {
         entity.rpartition("/")[2] for entity in chunks if "/type_III/magnitude/model" in entity
     }
@@ -290,7 +281,7 @@ def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeyp
     assert done.exit_code == 0, done.output
     said = " ".join(done.stdout.split())
     assert f"Session and fits for Rerun: {out} (rigd replay {out})" in said
-    assert "/fits/type_I/magnitude/model_const" in read(out)
+    assert "/fits/type_I/magnitude/model_const" in batches(out)
     before = out.read_bytes()
     for options, words in (
         (("--rerun", out), "nothing is overwritten"),

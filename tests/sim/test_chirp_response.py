@@ -15,13 +15,12 @@ fifty random beams, whose damping may grow much faster with frequency, the same 
 held for 1 ms) is looked at six times a tick.
 """
 
-import csv
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cases import further
+from paper_table import table_3
 
 from rigd.beam import Beam, Damping, TransferGrid, couple, modes, propagator, realise
 from rigd.devices.parameters import (
@@ -46,15 +45,6 @@ MOTOR = Motor(
 POLE_RAD_S = 80.0
 WINDOW_PER_S = 0.1
 LIMIT = 5e-4
-
-
-def table_3():
-    sets = {}
-    with (Path(__file__).parent.parent / "data" / "paper_table3.csv").open(newline="") as file:
-        for row in csv.DictReader(file):
-            name = "lambda_" if row["parameter"] == "lambda" else row["parameter"]
-            sets.setdefault(f"{row['type']}-{row['weighting']}", {})[name] = float(row["mean"])
-    return {name: Damping(**values) for name, values in sets.items()}
 
 
 def random_damping(seed):
