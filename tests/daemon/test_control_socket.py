@@ -19,7 +19,7 @@ from rigd.daemon import _server as server
 from rigd.daemon._address import AddressError, UnknownGroupError, bind, find, running, socket_path
 from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.daemon._states import Peer, State
-from rigd.runner import _signals
+from rigd.runner import _signal_blocks
 from rigd.runtime import answers
 
 LONG = {
@@ -376,7 +376,7 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
 
 
 def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
-    monkeypatch.setattr(_signals, "_ABANDONED_S", 1e9)  # however slow the computer is
+    monkeypatch.setattr(_signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.tell_signals())

@@ -9,7 +9,7 @@ import pytest
 from rigd.engine import Phase, Word, shared_memory_fd
 from rigd.engine._ring import Ring
 from rigd.profile import load_profile
-from rigd.runner import _signals
+from rigd.runner import _signal_blocks
 from rigd.runner._signal_blocks import SignalReader
 from rigd.session._format import SAMPLE_SIZE, pack_sample_into
 
@@ -26,7 +26,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    monkeypatch.setattr(_signals, "time", clock := Clock())
+    monkeypatch.setattr(_signal_blocks, "time", clock := Clock())
     return clock
 
 
