@@ -1,4 +1,4 @@
-"""A campaign told: as text, as one page, and as a folder with figures, tables, text and JSON."""
+"""Report of a campaign: text, one page, and a folder with figures, tables and JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A record told: as one page, and as a folder with figures, tables, text and JSON."""
+"""Report of a record: one page, and a folder with figures, tables, text and JSON."""
 
 from __future__ import annotations
 

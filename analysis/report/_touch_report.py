@@ -1,4 +1,4 @@
-"""Touches told: as a table, a document and lines, and as a folder with page and figures."""
+"""Report of touches: table, document and lines, and a folder with page and figures."""
 
 from __future__ import annotations
 
