@@ -1,4 +1,5 @@
 from ._candidate import Candidate as Candidate
+from ._comparison import Comparison as Comparison
 from ._data import Decimation as Decimation
 from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError
@@ -31,7 +32,6 @@ from ._plant import Plant as Plant
 from ._plant import Setting as Setting
 from ._predictor import Prediction as Prediction
 from ._predictor import ResponseGrid as ResponseGrid
-from ._problem import Comparison as Comparison
 from ._problem import Objective as Objective
 from ._profile_likelihood import WIDEST_SHARE as WIDEST_SHARE
 from ._profile_likelihood import Order as Order

@@ -10,12 +10,12 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
+from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record
 from analysis.identify._knock import knock_in, with_knock
 from analysis.identify._leakage import without_leakage
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
-from analysis.identify._problem import Comparison
 from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._rivals import with_extras

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
-    from analysis.identify._problem import Comparison
 
 
 # Clipping and stops

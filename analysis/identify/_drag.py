@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Noise
     from analysis.identify._plant import Plant
-    from analysis.identify._problem import Comparison
     from analysis.models import Structure
 
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._comparison import Comparison
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
-from analysis.identify._problem import Comparison, Objective
+from analysis.identify._problem import Objective
 from analysis.identify._result import RecordAnalysis, RecordFit
 from analysis.identify._search import CoarseResponse, Descent, Search
 from analysis.identify._uncertainty import (
@@ -58,7 +59,7 @@ def fit_record(
     the damping and over density over stiffness, stiffness, delay and tool inertia. For noise in
     the torque alone that is the maximum-likelihood estimate, whatever the excitation. Where a
     controller held the motor to a reference, the part coherent with that is used as input
-    (`analysis.identify._problem`): the noise then moves the motor as well.
+    (`analysis.identify._instrument`): the noise then moves the motor as well.
 
     Parameters
     ----------

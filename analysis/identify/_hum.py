@@ -20,10 +20,10 @@ from analysis.identify._noise import Line
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.identify._comparison import Comparison
     from analysis.identify._free_decay import Pole
     from analysis.identify._noise import Noise
     from analysis.identify._plant import Plant
-    from analysis.identify._problem import Comparison
 
 _RESONANCE: Final = 3.0
 """Half-widths of a resonance (damping ratio times frequency) that count as the resonance."""

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
-    from analysis.identify._problem import Comparison
 
 _FREEST: Final = STRUCTURES["VI"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from analysis.identify._noise import Noise, noise_of, smooth_power
 
 if TYPE_CHECKING:
-    from analysis.identify._problem import Comparison
+    from analysis.identify._comparison import Comparison
     from analysis.identify._result import RecordFit
 
 _NEAR_HZ: Final = 5.0

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Line
     from analysis.identify._plant import Plant
-    from analysis.identify._problem import Comparison
     from analysis.models import Structure
 
 _RARE: Final = 1e-4

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.identify._comparison import Comparison
     from analysis.identify._hum import Hum
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
-    from analysis.identify._problem import Comparison
     from analysis.optimizer import Minimum
 
 

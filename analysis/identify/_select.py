@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import wrong_scale
+from analysis.identify._comparison import Comparison
 from analysis.identify._diagnostics import findings, unexplained
 from analysis.identify._drag import damping_with_amplitude, with_air_drag
 from analysis.identify._finding import doubted
@@ -20,7 +21,6 @@ from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
 from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._nonlinear import nonlinear_forces
-from analysis.identify._problem import Comparison
 from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
 from analysis.identify._residual_tests import (
     InputRelation,

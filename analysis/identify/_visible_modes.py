@@ -10,8 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Noise
-    from analysis.identify._problem import Comparison
     from analysis.identify._result import RecordFit
 
 _EVIDENCE: Final = 400.0

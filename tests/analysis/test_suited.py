@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement
-from analysis.identify._problem import Comparison
+from analysis.identify._comparison import Comparison
 from analysis.models import WelchSettings
 from analysis.paper._estimate import EstimateError, SettingsError
 from analysis.record import load_record

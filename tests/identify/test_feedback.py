@@ -8,8 +8,8 @@ import pytest
 from cases import further
 
 from analysis.identify import Measurement, Plant, fit_record, select
+from analysis.identify._comparison import Comparison
 from analysis.identify._instrument import following
-from analysis.identify._problem import Comparison
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, transfer
 

@@ -5,8 +5,9 @@ import pytest
 from cases import further
 
 from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
+from analysis.identify._comparison import Comparison
 from analysis.identify._parametrization import Steps, Unknowns
-from analysis.identify._problem import Comparison, Objective
+from analysis.identify._problem import Objective
 from analysis.identify._residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend

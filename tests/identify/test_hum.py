@@ -10,10 +10,10 @@ import pytest
 from cases import further
 
 from analysis.identify import Plant, fit_record
+from analysis.identify._comparison import Comparison
 from analysis.identify._free_decay import Pole
 from analysis.identify._hum import hum_beside_modes
 from analysis.identify._noise import noise_of
-from analysis.identify._problem import Comparison
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
 

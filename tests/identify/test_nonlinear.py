@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, Plant
+from analysis.identify._comparison import Comparison
 from analysis.identify._nonlinear import ModalForces, Term
-from analysis.identify._problem import Comparison
 
 MODE_1 = Term("cubic stiffness", 1)
 

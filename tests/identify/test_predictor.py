@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from analysis.identify import Plant
+from analysis.identify._comparison import Comparison
 from analysis.identify._data import Decimation
 from analysis.identify._predictor import Prediction
-from analysis.identify._problem import Comparison
 from rigd.beam import PARAMETERS, Beam, Damping
 
 OFFSETS = ("stiffness_offset_2", "stiffness_offset_3")

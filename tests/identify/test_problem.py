@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, Plant
+from analysis.identify._comparison import Comparison
 from analysis.identify._noise import Noise
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._problem import Comparison, Objective
+from analysis.identify._problem import Objective
 from analysis.identify._refit import Refit
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping

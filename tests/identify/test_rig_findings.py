@@ -10,9 +10,9 @@ from cases import further
 from analysis.identify import Measurement, select
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import clipping, stops, wrong_scale
+from analysis.identify._comparison import Comparison
 from analysis.identify._headline import MISREAD
 from analysis.identify._leakage import repeats_after_s
-from analysis.identify._problem import Comparison
 from analysis.report._text import damping_sentences
 from rigd.beam import Beam
 

@@ -7,8 +7,8 @@ import pytest
 
 from analysis.identify import SETTINGS, headline_json, select
 from analysis.identify._candidates import CandidateSet
+from analysis.identify._comparison import Comparison
 from analysis.identify._free_decay import mode_poles
-from analysis.identify._problem import Comparison
 from analysis.identify._profile_likelihood import CHI_SQUARE_95
 from analysis.identify._refit import resonances_kept
 from analysis.identify._verdict import ANOTHER_DAMPING, EVEN

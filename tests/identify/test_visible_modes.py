@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import fit_record
+from analysis.identify._comparison import Comparison
 from analysis.identify._noise import Noise
-from analysis.identify._problem import Comparison
 from analysis.identify._sentences import experiments
 from analysis.identify._visible_modes import driven, visible_modes
 from analysis.models import STRUCTURES

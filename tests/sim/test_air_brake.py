@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, Plant
+from analysis.identify._comparison import Comparison
 from analysis.identify._drag_torque import DragLaw, DragResponse
-from analysis.identify._problem import Comparison
 from rigd.beam import Damping, PointForceGrid
 from rigd.profile import load_profile
 from rigd.sim._plant import SimulatedPlant

@@ -1,0 +1,515 @@
+"""Comparison of one record in one band with any plant: what of it counts, and what is taken out.
+
+What of the motor's angle counts as input is told by `analysis.identify._instrument`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._data import Decimation, MeasurementError, fast_length_below
+from analysis.identify._drag_torque import DragExpansion, DragResponse
+from analysis.identify._free_decay import (
+    DecaySpectra,
+    LaterDecaySpectra,
+    decay_columns,
+    mode_poles,
+)
+from analysis.identify._instrument import following
+from analysis.identify._predictor import Prediction
+from analysis.models import LARGEST_SHARE_OF_RATE
+from rigd.beam import undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._data import Measurement
+    from analysis.identify._drag_torque import DragLaw
+    from analysis.identify._free_decay import Pole
+    from analysis.identify._hum import Hum
+    from analysis.identify._noise import Noise
+    from analysis.identify._plant import Plant
+
+_FEWEST_BINS: Final = 50
+_LARGEST_CHANGE: Final = 0.1
+"""Whitened squares that another plant's share of the rest may add before it is taken out anew."""
+
+_FEEDBACKS: Final = 3
+"""Times that what rings is predicted from the angle that follows, and the other way round."""
+
+_LARGEST_REST: Final = 0.3
+"""Share of the angle's power that may be apart from the reference. With more it was not this
+reference that the motor followed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One record in one band, ready to be compared with any plant.
+
+    Attributes
+    ----------
+    measurement : Measurement
+        Record at its full rate.
+    angle_rad, torque_nm : ndarray, shape (m,)
+        Both channels in the band at the decimated rate; unknown torque filled by what is expected.
+    decimation : Decimation
+    kept : slice
+        Samples that are compared.
+    prediction : Prediction
+    bins : slice
+        Bins of the residual's transform that lie in the band.
+    frequency_hz : ndarray, shape (K,)
+    visible_modes : int
+        Modes of the nominal beam within the band, whose free decay is projected out.
+    decays : DecaySpectra
+        Spectra of what rings at the beginning.
+    later_decays : tuple of LaterDecaySpectra
+        Spectra of what rings after each gap of the angle that is too long to be interpolated.
+    apart_nm : ndarray, shape (samples,)
+        Torque that was taken out because it followed no reference, at the samples kept.
+    apart_at_unknown_nm : ndarray, shape (u,)
+        The same at the ticks whose torque is unknown.
+    hum : tuple of Hum
+        What was taken out besides, as well as it was known; the rest of it is projected out.
+    rest_rad : ndarray, shape (m,), or float
+        Angle that followed no reference, 0 where all of it counts.
+    rest_nm, rest_at_unknown_nm : ndarray or float
+        Torque that was taken out for it, at the samples kept and at the ticks without torque.
+    drag : DragExpansion, optional
+        The torque by drag that was taken out, and what it changes by with the beam.
+    struck : ndarray of complex, shape (k, K), or None
+        Spectra of the torque by knocks, of unknown sizes: beside what was taken out.
+    last_poles_rad_s : list of complex
+        Where the last plant had its poles: all that explain a record have them close by.
+    """
+
+    measurement: Measurement
+    angle_rad: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+    decimation: Decimation
+    kept: slice
+    prediction: Prediction
+    bins: slice
+    frequency_hz: NDArray[np.float64]
+    visible_modes: int
+    decays: DecaySpectra
+    later_decays: tuple[LaterDecaySpectra, ...] = ()
+    apart_nm: NDArray[np.float64] | float = 0.0
+    apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    hum: tuple[Hum, ...] = ()
+    rest_rad: NDArray[np.float64] | float = 0.0
+    rest_nm: NDArray[np.float64] | float = 0.0
+    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    drag: DragExpansion | None = None
+    struck: NDArray[np.complex128] | None = None
+    last_poles_rad_s: list[complex] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
+        """Bring a measurement into the band.
+
+        The mean of the residual is never compared: it is the torque sensor's zero.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Record at its full rate.
+        band_hz : tuple of float
+            First and last frequency.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used, or is too short for the band.
+        """
+        lowest_hz, highest_hz = band_hz
+        limit_hz = LARGEST_SHARE_OF_RATE * measurement.rate_hz
+        if not 0 <= lowest_hz < highest_hz <= limit_hz:
+            raise MeasurementError(
+                f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
+                f"or beyond {LARGEST_SHARE_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                "choose another --band."
+            )
+        measurement.check(highest_hz)
+        decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
+        angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
+        inside = decimation.inside(measurement.angle_rad.size)
+        samples = inside.stop - inside.start
+        if samples > 0:
+            samples = fast_length_below(samples)
+        all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
+        first = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
+        bins = slice(first, int(np.searchsorted(all_hz, highest_hz, side="right")))
+        if bins.stop - bins.start < _FEWEST_BINS:
+            raise MeasurementError(
+                f"{measurement.name}: {measurement.angle_rad.size / measurement.rate_hz:.3g} s of "
+                f"record are too short for the band {lowest_hz:g}-{highest_hz:g} Hz: "
+                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_FEWEST_BINS} are "
+                "needed; record longer or widen the band."
+            )
+        kept = slice(inside.start, inside.start + samples)
+        frequency_hz = all_hz[bins]
+        beam = measurement.beam
+        gaps = measurement.long_gaps(highest_hz)
+        if gaps:
+            measurement = measurement.without_torque_in(gaps)
+        known, torque = measurement.torque_known, measurement.torque_nm
+        ticks = np.arange(torque.size)
+        interpolated = torque if known.all() else np.interp(ticks, ticks[known], torque[known])
+        omega_rad_s = 2 * np.pi * frequency_hz
+        comparison = cls(
+            measurement=measurement,
+            angle_rad=angle_rad,
+            torque_nm=decimation.apply(interpolated),
+            decimation=decimation,
+            kept=kept,
+            prediction=Prediction(angle_rad, decimation.rate_hz, kept),
+            bins=bins,
+            frequency_hz=frequency_hz,
+            visible_modes=int(
+                np.sum(undamped_frequencies_rad_s(beam, 50) < 2 * np.pi * highest_hz)
+            ),
+            decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
+        )
+        begin_s = [end / measurement.rate_hz - comparison.first_s for _, end in gaps]
+        later = tuple(
+            LaterDecaySpectra(
+                samples, decimation.rate_hz, omega_rad_s, first_s, 1 / measurement.rate_hz
+            )
+            for first_s in begin_s
+            if 0 < first_s < (samples - 1) / decimation.rate_hz
+        )
+        comparison = replace(comparison, later_decays=later)
+        return comparison._struck() if measurement.knocks else comparison
+
+    def _struck(self) -> Comparison:
+        """Take out the knocks as well as they are known; the rest of them is projected out."""
+        rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
+        grid_s = self.times_s()
+        ticks = self._places(~self.measurement.torque_known)
+        reach_s = self.decimation.reach / rate_hz
+        unknown_s = ticks / self.measurement.rate_hz - reach_s
+        taken_nm, at_unknown_nm = (
+            np.sum([each.torque(time_s, grid_s, rate_hz) for each in knocks], axis=0)
+            for time_s in (grid_s, unknown_s)
+        )
+        columns = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
+        return replace(self, struck=self.spectrum(columns))._without(taken_nm, at_unknown_nm)
+
+    def _without(
+        self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
+    ) -> Comparison:
+        """Take out torque: at the samples kept, and at the ticks whose torque is unknown."""
+        left_nm = self.torque_nm.copy()
+        left_nm[self.kept] -= torque_nm
+        return replace(
+            self,
+            torque_nm=left_nm,
+            apart_nm=self.apart_nm + torque_nm,
+            apart_at_unknown_nm=self.apart_at_unknown_nm + at_unknown_nm,
+        )
+
+    def times_s(self) -> NDArray[np.float64]:
+        """Instants of the samples compared since the record's first tick, shape (samples,)."""
+        return self.first_s + np.arange(self.samples) / self.decimation.rate_hz
+
+    @property
+    def first_s(self) -> float:
+        """Instant of the first of them."""
+        return float(self.kept.start - self.decimation.reach) / self.decimation.rate_hz
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return int(self.kept.stop - self.kept.start)
+
+    def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
+        """Poles of a plant whose free decay is projected out, as `mode_poles` gives them.
+
+        Parameters
+        ----------
+        plant : Plant
+        wrt : sequence of str
+            Parameters to differentiate by.
+        """
+        found = mode_poles(plant, self.visible_modes, wrt, self.last_poles_rad_s)
+        self.last_poles_rad_s[:] = [pole.at_rad_s for pole in found]
+        return found
+
+    def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
+        return np.fft.rfft(values)[..., self.bins]
+
+    def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Turn a spectrum in the band, shape (K,), into the samples kept, shape (samples,)."""
+        every = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
+        every[self.bins] = spectrum
+        return np.fft.irfft(every, self.samples)
+
+    def followed_rad(self) -> NDArray[np.float64]:
+        """Part of the angle that is coherent with the reference, shape (m,).
+
+        All of it without a reference, or with one that does not explain it.
+        """
+        if self.measurement.reference_rad is None:
+            return self.angle_rad
+        followed = self._followed(self.angle_rad)
+        # By its speed: an angle that drifts follows no reference, and disturbs nothing.
+        own, apart = (
+            np.sum(np.diff(angle_rad[self.kept]) ** 2)
+            for angle_rad in (self.angle_rad, self.angle_rad - followed)
+        )
+        return followed if apart < _LARGEST_REST * own else self.angle_rad
+
+    def _followed(
+        self, moved_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Part of an angle that follows the reference, and a torque if one is given, shape (m,)."""
+        reference_rad = self.measurement.reference_rad
+        assert reference_rad is not None
+        # Later samples fall to 0 with the filter's end, behind everything that is compared.
+        end = self._recorded
+        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
+        followed = moved_rad.copy()
+        followed[:end] = following(
+            moved_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
+        )
+        return followed
+
+    @property
+    def _recorded(self) -> int:
+        """Decimated samples up to the record's end."""
+        return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
+
+    def following_reference(self, plant: Plant) -> Comparison:
+        """Use the part of the angle coherent with the reference as input, and take out the rest.
+
+        Parameters
+        ----------
+        plant : Plant
+            As found so far. Its error adds to the noise and makes no bias.
+
+        Returns
+        -------
+        Comparison
+            `self` if all of the angle counts as such: see `followed_rad`.
+        """
+        followed = self.followed_rad()
+        if followed is self.angle_rad:
+            return self
+        return self._split(self.angle_rad, followed, plant)
+
+    def _split(
+        self, moved_rad: NDArray[np.float64], followed: NDArray[np.float64], plant: Plant
+    ) -> Comparison:
+        """Use a part of the angle as input, and take out what a plant makes of the rest."""
+        return replace(
+            self,
+            angle_rad=followed,
+            prediction=self.prediction.of_other(followed),
+            rest_rad=moved_rad - followed,
+        ).with_rest_of(plant)
+
+    def with_rest_of(self, plant: Plant) -> Comparison:
+        """Take out what a plant makes of the angle that followed no reference, in place of before.
+
+        Parameters
+        ----------
+        plant : Plant
+        """
+        if not isinstance(self.rest_rad, np.ndarray):
+            return self
+        rest = self.prediction.of_other(self.rest_rad)
+        rest_nm = rest.torque(plant)[0]
+        at_unknown_nm = rest.torque_between(
+            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+        )[0]
+        told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
+        return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
+
+    def renewed(self, plant: Plant, noise: Noise) -> Comparison:
+        """Tell anew what followed the reference, with a plant better than the one before.
+
+        Parameters
+        ----------
+        plant : Plant
+            As fitted to this comparison.
+        noise : Noise
+
+        Returns
+        -------
+        Comparison
+            `self` if the torque of what followed no reference is the same with either plant, but
+            for what moves a parameter by a third of its standard deviation at most.
+        """
+        other = self.with_rest_of(plant)
+        if other is self:
+            return self
+        change = self.spectrum(other.rest_nm - np.asarray(self.rest_nm)) * noise.weight
+        if np.vdot(change, change).real <= _LARGEST_CHANGE:
+            return self
+        moved_rad, followed = self.angle_rad + self.rest_rad, self.angle_rad
+        felt = Prediction(followed, self.decimation.rate_hz, slice(0, self._recorded))
+        # What rings moves the motor, which makes it ring otherwise.
+        for _ in range(_FEEDBACKS):
+            followed = self._followed(moved_rad, felt.of_other(followed).torque(plant)[0])
+        return self._split(moved_rad, followed, plant)
+
+    @property
+    def hum_nm(self) -> NDArray[np.float64] | float:
+        """Hum that was taken out, at the samples kept."""
+        return self._hum_at(np.arange(self.samples) / self.decimation.rate_hz)
+
+    def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
+        """Take out hum, in place of what was taken out before."""
+        other = replace(self, hum=hum)
+        ticks = self._places(~self.measurement.torque_known)
+        first_s = self.kept.start / self.decimation.rate_hz
+        time_s = ticks / self.measurement.rate_hz - first_s
+        return other._without(
+            other.hum_nm - self.hum_nm, other._hum_at(time_s) - self._hum_at(time_s)
+        )
+
+    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
+        """Take the torque by drag out, and tell what it changes by.
+
+        Parameters
+        ----------
+        plant : Plant
+            The beam whose drag it is.
+        law : DragLaw
+
+        Raises
+        ------
+        DragError
+            The drag is too large to be followed.
+        """
+        # All that moves is braked, whether or not it followed a reference.
+        moved_rad = self.angle_rad + self.rest_rad
+        response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
+        found = response.torque(law, range(1, self.visible_modes + 1))
+
+        def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(values[..., self.kept])
+
+        unknown = self._places(~self.measurement.torque_known)
+        between = np.fft.irfft(
+            self.decimation.factor * np.fft.rfft(found.torque_nm),
+            self.decimation.factor * found.torque_nm.size,
+        )
+        return replace(
+            self,
+            torque_nm=self.torque_nm - found.torque_nm,
+            apart_nm=self.apart_nm + found.torque_nm[self.kept],
+            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            drag=DragExpansion(
+                plant=plant,
+                law=law,
+                response=response,
+                band=band,
+                by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
+                by_external=band(found.by_external),
+                by_ln_density=band(found.by_ln_density),
+                by_delay=band(found.by_delay),
+                by_law=band(found.by_law),
+                speed_m_s=found.speed_m_s,
+                top_speed_m_s=found.top_speed_m_s,
+            ),
+        )
+
+    def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
+
+    def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of terms of unknown amplitude, shape (m, K).
+
+        Free decays, from the beginning on and from each long gap on, hum, knocks, and last a zero
+        of the torque sensor that drifts in proportion to time: the jump from the record's end to
+        its beginning would leak into all bins.
+        """
+        hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
+        drift = _drift(self.samples)[None, self.bins]
+        struck = drift[:0] if self.struck is None else self.struck
+        decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
+        return np.concatenate([*decays, hum, struck, drift])
+
+    def decay_gradient(
+        self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Differentiate the free decays among ``amplitudes @ nuisance(poles)`` through the poles.
+
+        Parameters
+        ----------
+        poles : sequence of Pole
+        amplitudes : ndarray, shape (m,)
+
+        Returns
+        -------
+        ndarray of complex, shape (k, K)
+        """
+        total = self.decays.gradient(poles, amplitudes)
+        each = decay_columns(poles)
+        for number, later in enumerate(self.later_decays, start=1):
+            total += later.gradient(poles, amplitudes[number * each :])
+        return total
+
+    def filled(self, plant: Plant) -> Comparison:
+        """Put what `plant` predicts where the torque is unknown, so that it does not count there.
+
+        The squares that remain have their minimum where that of the known samples is, once the
+        fit has settled.
+        """
+        known = self.measurement.torque_known
+        if known.all():
+            return self
+        torque = self.measurement.torque_nm.copy()
+        torque[~known] = (
+            self.apart_at_unknown_nm
+            + self.prediction.torque_between(plant, self.decimation.factor, self._places(~known))[0]
+        )
+        torque_nm = self.decimation.apply(torque)
+        torque_nm[self.kept] -= self.apart_nm
+        return replace(self, torque_nm=torque_nm)
+
+    def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
+        """Compute what unknown torques would have given to the gradient's spectra, (k, K).
+
+        Parameters
+        ----------
+        plant : Plant
+            Beam and rig.
+        wrt : tuple of str
+            Names of the derivatives, k of them.
+        """
+        unknown = ~self.measurement.torque_known
+        lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
+        if unknown.any():
+            _, gradient = self.prediction.torque_between(
+                plant, self.decimation.factor, self._places(unknown), wrt
+            )
+            for row, values in zip(lost, gradient, strict=True):
+                only = np.zeros(unknown.size)
+                only[unknown] = values
+                row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
+        return lost
+
+    def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Ticks counted from the first decimated sample on."""
+        return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
+
+
+@lru_cache(maxsize=2)
+def _drift(samples: int) -> NDArray[np.complex128]:
+    """Transform of a drift of 1 over all samples, kept: every evaluation needs it.
+
+    Not to be written to.
+    """
+    drift: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
+    drift.flags.writeable = False
+    return drift
