@@ -25,6 +25,8 @@ SHEAR_NOISE_N = 2.0e-2
 ENCODER_STEP_RAD = 7.0e-5
 RATE_HZ = 1000.0
 POLE_RAD_S = 80.0
+_CONVERGED_N = 1e-10
+"""Forces of several obstacles are found together once none changes by more."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Struck:
     peak_n: float
     force_n: Real
     """At the ticks, as the obstacle pushes: negative."""
+    met_s: tuple[float, ...]
+    """When each of the obstacles was first met; infinite for one that was not."""
 
 
 def simulate(
@@ -151,6 +155,7 @@ def simulate(
             begun = np.minimum(begun, np.where(gap > 0, now, np.inf))
             force = np.zeros((m, most))
             for _ in range(1 if most == 1 else 30):
+                last = force
                 others = (
                     np.einsum("op,...->...", np.ones((1, 1)), gap)
                     if most == 1
@@ -159,6 +164,8 @@ def simulate(
                 giving = own + mobility * dt
                 pressed = (law * others - c / dt * np.maximum(before, 0)) / (1 + law * giving)
                 force = -np.where(others > 0, np.maximum(pressed, 0.0), 0.0)
+                if np.abs(force - last).max() < _CONVERGED_N:
+                    break
             pulse = knock * np.sin(np.pi * np.clip((now - begun) / knock_s, 0, 1))
             force = np.where(knock != 0, -np.where(np.isfinite(begun), pulse, 0.0), force)
             place = place - mobility * dt * force * (knock == 0)
@@ -171,7 +178,13 @@ def simulate(
     out[0] = ENCODER_STEP_RAD * np.round(out[0] / ENCODER_STEP_RAD)
     return [
         Struck(
-            out[0, :, i], out[1, :, i], out[2, :, i], float(touch[i]), float(peak[i]), out[3, :, i]
+            out[0, :, i],
+            out[1, :, i],
+            out[2, :, i],
+            float(touch[i]),
+            float(peak[i]),
+            out[3, :, i],
+            tuple(begun[i, : len(cases[i])].tolist()),
         )
         for i in range(m)
     ]

@@ -63,15 +63,23 @@ _LEAST_SCALE = 1.2
 _LEAST_STD_M = (3e-4, 5e-4)
 """What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
 tip: in 130 simulated touches the errors agree with the intervals if this is added."""
-_EARLY_S = 0.015
+_EARLY_S = (0.01, 0.022)
+"""After the detection: what a touch that nothing explains is compared with as well. Later a second
+point may be touched."""
 _WIDE = 8.0
 """Fall of the log-likelihood at the ends of an interval for a touch that nothing explains."""
 _LEAST_QUIET = 100
 """Samples before a touch without which nothing can be told."""
 _CLEAR = 16.0
 """Difference in the sum of squared residuals that decides between two kinds."""
+_DOUBTFUL = 9.0
+"""By so much less, that of an obstacle that moves or gives way leaves open whether it is at rest:
+one that is at rest gains that much by chance in one of a hundred touches."""
 _WORSE = 3.5
 """By so many standard deviations may the sum of squared residuals exceed its expectation."""
+_POOR = 2.0
+"""Beyond so many the explanation may be the wrong one: other kinds are tried, and the point gets
+the interval that any force leaves it."""
 _WORSE_LATER = 2.5
 """The same for what a longer record adds. Bounces make much of small errors of the model: where the
 later ones are explained less well, what the first told is nearer to the truth."""
@@ -234,6 +242,8 @@ class _Estimation:
         self.available = self.record.angle_rad.size - self.detected
         self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
+        self.later_doubtful = False
+        """Whether later samples, which are left out, speak against an obstacle at rest."""
         self.starts = self._first_starts()
 
     @property
@@ -264,6 +274,7 @@ class _Estimation:
             window = self.window(seconds)
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
             if before is not None and self._later_is_worse(rest, window, *before):
+                self.later_doubtful = self._changes(rest, window)
                 rest, window = before
                 break
             before = rest, window
@@ -273,7 +284,7 @@ class _Estimation:
                 break
             starts = np.vstack([rest.parameters, self._cloud(rest.posterior)])
         explanations = [rest]
-        if not self._fits(rest, window) or self._changes(rest, window):
+        if not self._fits(rest, window, _POOR) or self._changes(rest, window):
             explanations += self._others(window)
         return self._answer(explanations, window, scan=scan)
 
@@ -449,9 +460,9 @@ class _Estimation:
 
     # Other kinds
 
-    def _fits(self, explanation: _Explanation, window: Window) -> bool:
+    def _fits(self, explanation: _Explanation, window: Window, worse: float = _WORSE) -> bool:
         """Whether no more is left than noise leaves, which is itself known from few samples."""
-        return bool(explanation.chi2 < self._most(window.data.size))
+        return bool(explanation.chi2 < self._most(window.data.size, worse))
 
     def _most(self, degrees: int, worse: float = _WORSE) -> float:
         """Greatest sum of squared residuals that noise explains."""
@@ -467,7 +478,7 @@ class _Estimation:
         return self._fits(shorter, until) and more > self._most(added, _WORSE_LATER)
 
     def _changes(self, rest: _Explanation, window: Window) -> bool:
-        """Whether the obstacle at rest becomes much likelier if it may move or give way."""
+        """Whether the obstacle at rest becomes likelier if it may move or give way."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
         free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
@@ -481,7 +492,7 @@ class _Estimation:
             rounds=5,
             free=free,
         )
-        return bool(found.chi2.min() < rest.chi2 - _CLEAR)
+        return bool(found.chi2.min() < rest.chi2 - _DOUBTFUL)
 
     def _others(self, window: Window) -> list[_Explanation]:
         """Obstacles that move or give way, and a knock."""
@@ -540,14 +551,19 @@ class _Estimation:
         best = min(explanations, key=lambda each: each.chi2)
         if rest.chi2 < best.chi2 + _CLEAR:
             best = rest
-        rivals = [each for each in explanations if each.chi2 < best.chi2 + _CLEAR]
+        rivals = [best, *(each for each in explanations if _rivals(best, each))]
         offset = self.begin / self.rate
         x_m = time_s = force_n = stiffness = None
         history, instants = np.zeros(0), np.zeros(0)
         kind = "unknown"
         if self._fits(best, window):
-            kind = best.kind if len(rivals) == 1 else "unknown"
+            poor = not self._fits(best, window, _POOR)
+            doubtful = self.later_doubtful if best is rest else poor
+            if len(rivals) == 1 and not doubtful:
+                kind = best.kind
             x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
+            if poor:
+                x_m = self._widened(x_m)
             history, instants, force_n = self._forces(best, window)
             if kind == "rigid":
                 stiffness = _stiffness(rest.posterior)
@@ -575,13 +591,18 @@ class _Estimation:
         """Point of a touch that nothing explains: where any force could do it, early and later.
 
         More than one point may be touched by then, so what the first samples tell alone counts
-        too, and both with wide intervals.
+        too, and all with wide intervals.
         """
-        early = self.tables.blind.scan(self.window(_EARLY_S))
-        at, _, low, high = self.blind.interval(_WIDE)
-        _, _, first_low, first_high = early.interval(_WIDE)
-        low, high = min(low, first_low), max(high, first_high)
-        return Estimated(at, (high - low) / 4, (low, high))
+        early = [self.tables.blind.scan(self.window(seconds)) for seconds in _EARLY_S]
+        ends = np.array([scan.interval(_WIDE)[2:] for scan in (self.blind, *early)])
+        low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
+        return Estimated(self.blind.interval(_WIDE)[0], (high - low) / 4, (low, high))
+
+    def _widened(self, told: Estimated) -> Estimated:
+        """Widen the interval of a point to all where any force could be."""
+        *_, low, high = self.blind.interval()
+        low, high = min(low, told.interval_95[0]), max(high, told.interval_95[1])
+        return Estimated(told.value, max(told.std, (high - low) / 4), (low, high))
 
     def _place(self, rivals: list[_Explanation]) -> Estimated:
         """Point of touch, with what bounces leave unknown of it."""
@@ -630,6 +651,13 @@ def _distinct(found: Descended) -> Real:
         if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
             kept.append(row)
     return np.array(kept)
+
+
+def _rivals(best: _Explanation, other: _Explanation) -> bool:
+    """Whether another explanation is about as likely: a parameter more must be worth its while."""
+    if best.kind == "rigid" and other.kind in ("moving", "yielding"):
+        return other.chi2 < best.chi2 - _DOUBTFUL
+    return other is not best and other.chi2 < best.chi2 + _CLEAR
 
 
 def _known(rivals: list[_Explanation], column: int, shift: float = 0.0) -> Estimated:

@@ -1,6 +1,6 @@
 """Obstacles that tests of `rigd.touch` let the antenna strike, and how their records are cut."""
 
-from touch_records import Obstacle
+from touch_records import Obstacle, Slew
 
 from rigd.touch import TouchRecord
 
@@ -15,6 +15,19 @@ OBSTACLES = {
     "fleeing": Obstacle(x_m=0.6, angle_rad=0.25, rate_rad_s=0.5),
     "knock": Obstacle(x_m=0.5, knock_n=2.0, knock_s=0.008),
 }
+
+MISTAKEN = {
+    "gives way": (Obstacle(0.863, 0.3956, 1280.0, mobility_m_per_n_s=0.27), Slew(0.79, 30.0)),
+    "gives way slowly": (Obstacle(0.697, 0.354, 7500.0, mobility_m_per_n_s=0.12), Slew(0.71, 30.0)),
+    "flees": (Obstacle(0.278, 0.178, 5000.0, rate_rad_s=0.356), Slew(0.71, 30.0)),
+    "two": ((Obstacle(0.492, 0.296, 1870.0), Obstacle(0.207, 0.324, 1880.0)), Slew(0.65, 30.0)),
+    "two at once": (
+        (Obstacle(0.208, 0.33, 350.0), Obstacle(0.577, 0.33, 1500.0)),
+        Slew(0.7, 30.0),
+    ),
+}
+"""Obstacles that could be taken for one at rest, or elsewhere, and how the antenna comes to them;
+of two, the first is met first."""
 
 
 def cut(struck, after, *, shear=True, noticed=NOTICED):

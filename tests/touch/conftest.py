@@ -1,7 +1,7 @@
 """Records of touches, simulated once."""
 
 import pytest
-from struck_beam import OBSTACLES
+from struck_beam import MISTAKEN, OBSTACLES
 from touch_records import DAMPED, LINK, Slew, simulate
 
 from rigd.touch import TouchEstimator, TouchModel
@@ -19,6 +19,14 @@ def struck():
         seed=4,
     )
     return dict(zip(OBSTACLES, records, strict=True))
+
+
+@pytest.fixture(scope="session")
+def mistaken():
+    """Name → record of what could be taken for an obstacle at rest."""
+    obstacles, slews = zip(*MISTAKEN.values(), strict=True)
+    records = simulate(obstacles, slews, duration_s=0.85, steps=40, modes=20, seed=4)
+    return dict(zip(MISTAKEN, records, strict=True))
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from struck_beam import OBSTACLES, begin_s, cut
+from struck_beam import MISTAKEN, OBSTACLES, begin_s, cut
 
 from rigd.touch import TouchRecord, estimate_touch
 
@@ -66,6 +66,27 @@ def test_what_is_no_obstacle_at_rest_is_not_called_one(told, name):
     if estimate.x_m is not None:
         low, high = estimate.x_m.interval_95
         assert low - 2e-3 < OBSTACLES[name].x_m < high + 2e-3
+
+
+@pytest.mark.parametrize("noticed", [4, 6])
+@pytest.mark.parametrize("name", MISTAKEN)
+def test_never_sure_of_a_wrong_point_or_kind(estimator, mistaken, name, noticed):
+    """Bounces of what gives way, moves or comes in pairs fit an obstacle at rest elsewhere, too."""
+    estimate = estimator.estimate(cut(mistaken[name], 190, noticed=noticed), scan=False)
+    kind = {"gives": "yielding", "flees": "moving", "two": "unknown"}[name.split()[0]]
+    assert estimate.kind in (kind, "unknown")
+    obstacles, _ = MISTAKEN[name]
+    met = obstacles if isinstance(obstacles, tuple) else (obstacles,)
+    x = estimate.x_m
+    assert x is None or min(abs(x.value - each.x_m) for each in met) < 4 * x.std
+
+
+def test_of_two_obstacles_the_first_is_told_from_what_precedes_the_second(estimator, mistaken):
+    """The second is met 65 ms after the first, 285 mm from it."""
+    estimate = estimator.estimate(cut(mistaken["two"], 190), scan=False)
+    assert estimate.samples == 50
+    assert estimate.x_m.value == pytest.approx(MISTAKEN["two"][0][0].x_m, abs=0.01)
+    assert estimate.x_m.std < 5e-3
 
 
 def test_the_same_record_gives_the_same_answer(estimator, told, struck):
