@@ -274,7 +274,8 @@ class _Estimation:
             window = self.window(seconds)
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
             if before is not None and self._later_is_worse(rest, window, *before):
-                self.later_doubtful = self._changes(rest, window)
+                # Of still later bounces the search may miss the minimum: they speak of no kind.
+                self.later_doubtful = seconds <= _COVERED_S and self._changes(rest, window)
                 rest, window = before
                 break
             before = rest, window
