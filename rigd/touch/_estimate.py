@@ -63,7 +63,7 @@ _LEAST_SCALE = 1.2
 _LEAST_STD_M = (3e-4, 5e-4)
 """What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
 tip: in 130 simulated touches the errors agree with the intervals if this is added."""
-_EARLY_S = (0.01, 0.022)
+_EARLY_S = (0.006, 0.01, 0.022)
 """After the detection: what a touch that nothing explains is compared with as well. Later a second
 point may be touched."""
 _WIDE = 8.0
