@@ -45,6 +45,13 @@ class Line:
         value, std, speed = self.drag
         return (value - self.wire.true_m(speed)) / std
 
+    @property
+    def known_to(self) -> float:
+        """Standard deviation of C_D d over the truth."""
+        assert self.drag is not None and self.wire is not None
+        _, std, speed = self.drag
+        return std / self.wire.true_m(speed)
+
     def text(self) -> str:
         """Give a row of the table."""
         where = "none" if self.wire is None else (
@@ -108,6 +115,14 @@ def main() -> None:
     held = [abs(line.error) < 1.959964 for line in named]
     free = [line for line in lines if line.wire is None]
     print(f"named {len(named)} of {len(there)}; C_D d within its interval {sum(held)}")
+    for amplitude_rad in AMPLITUDES_RAD:
+        known_to = [
+            line.known_to
+            for line in named
+            if line.wire is not None and line.wire.amplitude_rad == amplitude_rad
+        ]
+        least, most = min(known_to, default=0.0), max(known_to, default=0.0)
+        print(f"standard deviation at {amplitude_rad:g} rad: {least:.2%} to {most:.2%}")
     print(f"false delay, density, stiffness, modes: {sum(_false(line) for line in there)}")
     print(f"without air named {sum(line.drag is not None for line in free)} of {len(free)}")
     print(f"worst without a flag: {max(line.worst for line in there)}")

@@ -23,7 +23,7 @@ at one beam and drag and taken out of the measured torque; what it changes by wh
 change is linear (`DragExpansion`) in
 
 * the poles of the modes, on which the motion near a resonance depends,
-* the external damping, which also drives the modes,
+* the external damping ``gamma s^lambda`` at these poles, since it also drives the modes,
 * the logarithm of the mass per length, which the force has to move,
 * the delay between the channels,
 * the drag itself.
@@ -127,8 +127,9 @@ class DragTorque:
     torque_nm : ndarray, shape (m,)
     by_pole : dict of int to ndarray, shape (2, m)
         For each mode: derivatives by the real and the imaginary part of its upper pole.
-    by_external : ndarray, shape (2, m)
-        By gamma and by lambda, the poles held: external damping also drives the modes.
+    by_external : ndarray, shape (2, 2, m)
+        For each of the two lowest modes, whose poles are held: by c_0 and c_1 of an external
+        damping ``c_0 + c_1 s`` that drives it.
     by_law : ndarray, shape (2, m)
         By the two numbers of the law.
     by_delay : ndarray, shape (m,)
@@ -236,30 +237,31 @@ class DragResponse:
             for change in (share + mirror, 1j * (share - mirror)):
                 sources.append(([mode - 1], self._fine(moved[mode - 1 : mode] * change)))
                 direct.append(self.in_time(carried[mode - 1] * change))
-        for change in self._external():
-            sources.append((_LOWEST, self._fine(self._driven[_LOWEST] * change)))
-            direct.append(self.in_time(carried[_LOWEST].sum(axis=0) * change))
+        for mode in _LOWEST:
+            for change in (1 / self._inertial, self.s / self._inertial):
+                sources.append(([mode], self._fine(self._driven[mode : mode + 1] * change)))
+                direct.append(self.in_time(carried[mode] * change))
         changed = self._perturbed(speed, law, sources)
         by = [self._torque(change) for change in changed]
         by[: len(direct)] = [row + more for row, more in zip(by, direct, strict=False)]
+        of_external, of_law = by[2 * len(modes) : len(direct)], by[len(direct) :]
         torque = self._response(spectra)
         return DragTorque(
             law=law,
             torque_nm=self.in_time(torque),
             by_pole={mode: np.array(by[2 * i : 2 * i + 2]) for i, mode in enumerate(modes)},
-            by_external=np.array(by[-4:-2]),
-            by_law=np.array(by[-2:]),
+            by_external=np.reshape(of_external, (len(_LOWEST), 2, self._samples)),
+            by_law=np.array(of_law),
             by_delay=self.in_time(-self.s * torque),
             speed_m_s=self._mean_speed(speed),
             top_speed_m_s=top,
         )
 
-    def _external(self) -> tuple[Complex, Complex]:
-        """Differentiate ``ln p`` by gamma and by lambda, shape (bins,) each."""
-        damping = self.plant.damping
-        log_s = np.log(self.s)
-        by_gamma = np.exp(damping.lambda_ * log_s) / self._inertial
-        return by_gamma, damping.gamma * log_s * by_gamma
+    @property
+    def poles(self) -> Complex:
+        """Upper pole of each mode, shape (MODES,)."""
+        upper: Complex = self._pairs[:, 0]
+        return upper
 
     @property
     def _leverage(self) -> Real:
@@ -487,8 +489,10 @@ def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
 
 # Change with beam and drag
 
-_OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
+_OF_DENSITY: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 """Parameters whose logarithms add up to that of the mass per length."""
+
+_OF_EXTERNAL: Final = ("gamma", "lambda")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -506,8 +510,8 @@ class DragExpansion:
         Spectrum in the band of samples of the angle's times.
     by_pole : dict of int to ndarray of complex, shape (2, K)
         For each mode: by the real and the imaginary part of its upper pole.
-    by_external : ndarray of complex, shape (2, K)
-        By gamma and lambda, the poles held.
+    by_external : ndarray of complex, shape (2, 2, K)
+        By the external damping of each of the two lowest modes, as `DragTorque` has it.
     by_ln_density, by_delay : ndarray of complex, shape (K,)
     by_law : ndarray of complex, shape (2, K)
         By the two numbers of the law.
@@ -556,35 +560,47 @@ class DragExpansion:
                 moved += [apart.real, apart.imag, 0.0, 0.0, -1.0]
                 turn = [pole.derivative.real, pole.derivative.imag]
                 slopes += [*turn, *(-part for part in turn), np.zeros(chain.shape[1])]
-        of_density = sum(
-            (chain[names.index(name)] for name in _OF_DENSITY if name in names),
-            start=np.zeros(chain.shape[1]),
-        )
         rows.append(self.by_ln_density)
         here, there = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         moved.append(np.log(there / here))
-        slopes.append(of_density)
-        before, after = self.plant.damping, plant.damping
-        if after.gamma > 0:
-            rows += list(self.by_external)
-            moved += [after.gamma - before.gamma, after.lambda_ - before.lambda_]
-            slopes += [
-                chain[names.index(name)] if name in names else np.zeros(chain.shape[1])
-                for name in ("gamma", "lambda")
-            ]
-        else:
-            rows.append(self.by_external[0])
-            moved.append(-before.gamma)
-            slopes.append(np.zeros(chain.shape[1]))
+        slopes.append(_part(chain, names, _OF_DENSITY).sum(axis=0))
+        for by_external, values in zip(self.by_external, self._external(plant), strict=True):
+            rows += list(by_external)
+            moved += values[:, 0].tolist()
+            slopes += list(values[:, 1:] @ _part(chain, names, _OF_EXTERNAL))
         rows.append(self.by_delay)
         moved.append(plant.delay_s - self.plant.delay_s)
-        free = "delay_s" in names
-        slopes.append(chain[names.index("delay_s")] if free else np.zeros(chain.shape[1]))
+        slopes += list(_part(chain, names, ("delay_s",)))
         # As real numbers: they are multiplied by real ones only.
         every = np.array(rows).view(np.float64)
         change: Complex = (np.array(moved) @ every).view(np.complex128)
         jacobian: Complex = (np.array(slopes).T @ every).view(np.complex128)
         return change, jacobian
+
+    def _external(self, plant: Plant) -> list[Real]:
+        """External damping of another beam less that of this one, as it drives the lowest modes.
+
+        At the pole of each, where it counts: with another order ``gamma s^lambda`` is not linear in
+        gamma and lambda, and where little external damping shows a fit may come by any order.
+
+        Returns
+        -------
+        list of ndarray, shape (2, 3)
+            For each mode c_0 and c_1 of ``c_0 + c_1 s``, with their derivatives by gamma and
+            lambda.
+        """
+        before, after = self.plant.damping, plant.damping
+        found = []
+        for s in self.response.poles[_LOWEST].tolist():
+            if not s.imag > 0:  # no such oscillation
+                found.append(np.zeros((2, 3)))
+                continue
+            log_s, per_gamma = np.log(s), s**after.lambda_
+            change = after.gamma * per_gamma - before.gamma * s**before.lambda_
+            values = np.array([change, per_gamma, after.gamma * log_s * per_gamma])
+            of_s = values.imag / s.imag
+            found.append(np.array([values.real - of_s * s.real, of_s]))
+        return found
 
     def _remainder(self, mode: int, here: complex, there: complex) -> tuple[Complex, Complex]:
         """Linear torque of a mode beyond the first order in its pole, (K,), and its slopes, (2, K).
@@ -602,3 +618,9 @@ class DragExpansion:
         spectra = torque * np.array([grown - 1 - first, real, imaginary])
         curved, *steeper = self.band(self.response.in_time(spectra))
         return curved, np.array(steeper)
+
+
+def _part(chain: Real, names: Sequence[str], wanted: Sequence[str]) -> Real:
+    """Rows of some parameters, shape (len(wanted), k); nought of one that is not there."""
+    none = np.zeros(chain.shape[1])
+    return np.array([chain[names.index(name)] if name in names else none for name in wanted])
