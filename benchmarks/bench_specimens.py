@@ -1,0 +1,128 @@
+"""Whether campaigns of one beam are taken for one specimen, and those of two beams for two.
+
+``bench_specimens.py [--times N] [--records N] [--noise-nm NM] [--apart SHARE] [--first SEED]``
+writes session files of exact records (`independent_records.py`, alpha 0.996), each with a noise of
+its own: N campaigns of one beam, then one whose second half is of a beam with frequencies higher by
+a share. Each goes through `campaign`, as by `analyze FILES`. A line for each: what its sessions
+select by themselves, whether they are called a mixture, by what and in which groups, the least
+p-value, and the worst error of the pooled numbers in their own standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from independent_records import (
+    AMPLITUDE_RAD,
+    FIRST_HZ,
+    LAST_HZ,
+    RATE_HZ,
+    REST_S,
+    SWEEP_S,
+    Exact,
+    Truth,
+    exact,
+)
+
+from analysis.campaigns import CampaignResult, campaign
+from rigd.runtime import use_one_thread
+from rigd.testing import Signals, write_session
+
+BEAM = Truth(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A campaign: exact records, session by session."""
+
+    name: str
+    records: tuple[Exact, ...]
+
+
+def written(case: Case, noise_nm: float, first_seed: int, folder: Path) -> list[Path]:
+    """Write the sessions of a campaign, each with its own noise."""
+    rest, sweep = round(REST_S * RATE_HZ), round(SWEEP_S * RATE_HZ)
+    paths = []
+    for number, record in enumerate(case.records):
+        angle_rad, torque_nm = record.noisy(noise_nm, first_seed + number)
+        segments = {
+            "rest": (0, rest),
+            "sweep": (rest, rest + sweep),
+            "ring_down": (rest + sweep, angle_rad.size),
+        }
+        stated = {
+            "excitation": "chirp",
+            "amplitude_rad": repr(AMPLITUDE_RAD),
+            "start_hz": repr(FIRST_HZ),
+            "stop_hz": repr(LAST_HZ),
+            "duration_s": repr(SWEEP_S),
+        }
+        signals = Signals(record.reference_rad, angle_rad, torque_nm, segments, RATE_HZ, stated)
+        paths.append(write_session(folder / f"{number:03}.mcap", signals))
+    return paths
+
+
+def line(case: Case, found: CampaignResult) -> str:
+    """Say in a row what was made of a campaign."""
+    verdict, alike = found.verdict, found.homogeneity
+    if verdict is None:
+        return f"| {case.name} | no verdict |"
+    alone = ", ".join(f"{name} {count}" for name, count in verdict.alone.items())
+    least = min(each.chance for each in alike.quantities)
+    mixed = "no"
+    if (leading := alike.leading) is not None:
+        sizes = " and ".join(str(len(group)) for group in leading.groups)
+        mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({leading.own_stds:.0f} std)"
+    worst = "" if alike.mixed else f"{worst_error(case, found):.1f}"
+    lost = len(found.failures) + len(found.lost_trials)
+    return (
+        f"| {case.name} | {alone} | {mixed} | {least:.2g} of {len(alike.quantities)} "
+        f"| {worst} | {lost} |"
+    )
+
+
+def worst_error(case: Case, found: CampaignResult) -> float:
+    """Largest error of the pooled parameters, in their standard deviations."""
+    headline, truth = found.headline, case.records[0].truth.parameters
+    assert headline is not None
+    return max(
+        abs(each.value - truth[each.name]) / each.std
+        for each in headline.parameters
+        if each.name in truth and each.std
+    )
+
+
+def main() -> None:
+    """Judge the campaigns asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--times", type=int, default=5, help="campaigns of one beam")
+    parser.add_argument("--records", type=int, default=40, help="of each campaign")
+    parser.add_argument("--noise-nm", type=float, default=5e-3, help="of the torque")
+    parser.add_argument("--apart", type=float, default=5e-4, help="share between two beams")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--jobs", type=int, default=1)
+    given = parser.parse_args()
+    use_one_thread()
+    one = exact(BEAM)
+    faster = BEAM.density_over_stiffness / (1 + given.apart) ** 2
+    other = exact(replace(BEAM, density_over_stiffness=faster))
+    half = given.records // 2
+    cases = [Case("one beam", (one,) * given.records) for _ in range(given.times)]
+    two = (one,) * half + (other,) * (given.records - half)
+    cases.append(Case(f"two beams, {given.apart:.2%} apart", two))
+    print("| campaign | alone | called mixed | least p | worst error pooled | left out |")
+    print("|---|---|---|---|---|---|")
+    for number, case in enumerate(cases):
+        with tempfile.TemporaryDirectory() as name:
+            paths = written(case, given.noise_nm, given.first + number * given.records, Path(name))
+            begun = time.perf_counter()
+            found = campaign(paths, jobs=given.jobs)
+        print(line(case, found), f"{time.perf_counter() - begun:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
