@@ -172,6 +172,7 @@ def descend(
     relative_tolerance: float,
     max_evaluations: int = 200,
     second_part: NDArray[np.float64] | None = None,
+    hopeless: tuple[int, float] | None = None,
 ) -> Minimum:
     """Descend to a local minimum.
 
@@ -191,6 +192,9 @@ def descend(
     second_part : ndarray, shape (k, k), optional
         As a descent on nearly the same problem has learned it; used from the first step on. With
         that of few points of a frequency response, fits to all take 39 evaluations in place of 57.
+    hopeless : tuple of int and float, optional
+        Number of evaluations after which a descent ends whose cost is still above a value, and that
+        value: there are better explanations of the data, and nobody asks for this minimum.
     """
     x = np.clip(start, region.lower, region.upper)
     here = problem(x)
@@ -202,6 +206,8 @@ def descend(
         held = here.held(x, region.lower, region.upper)
         free = ~held & (here.hessian.diagonal() > 0)
         if not free.any():
+            break
+        if hopeless is not None and evaluations >= hopeless[0] and here.cost > hopeless[1]:
             break
         limits = region.limits(x)
         model = here.hessian + second if uses_second else here.hessian

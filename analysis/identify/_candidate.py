@@ -33,6 +33,10 @@ EXTRA_WORDS: Final[Mapping[str, str]] = MappingProxyType(
 """What tables call the extras of a candidate."""
 
 
+FAR_BEHIND: Final = 1000.0
+"""Difference of BIC from which a candidate stays behind wherever exactly its minimum is."""
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """One structure on one kind of beam, fitted.

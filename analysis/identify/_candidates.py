@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import Candidate, Kind
+from analysis.identify._candidate import FAR_BEHIND, Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record
@@ -60,9 +60,6 @@ _PLAIN: Final[Kind] = (True, ())
 _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 _INTEGER: Final = STRUCTURES["VII"]
-
-_FAR_BEHIND: Final = 1000.0
-"""Difference of BIC from which a candidate stays behind wherever exactly its minimum is."""
 
 _A_STEP: Final = 3
 """Evaluations that bring such a candidate next to it."""
@@ -312,7 +309,7 @@ class CandidateSet:
     def _brought_to(self, other: CandidateSet, c: Candidate, max_evaluations: int) -> Candidate:
         """Fit a candidate in a set that differs a little; roughly where it is far behind."""
         behind = c.bic - min(each.bic for each in self.candidates)
-        return other.refit(c, max_evaluations if behind < _FAR_BEHIND else _A_STEP).candidate()
+        return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
 
     def _with_modes_free(self, uniform: RecordFit) -> CandidateSet:
         """Free the modes' stiffness from where a uniform beam explains the record."""

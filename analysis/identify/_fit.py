@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._candidate import FAR_BEHIND
 from analysis.identify._comparison import Comparison
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
@@ -39,6 +41,13 @@ _TOLERANCE: Final = 1e-9
 
 _BEFORE_LINES: Final = 1e-4
 """The same while noise and lines are still to be found: a standard deviation."""
+
+_PATIENCE: Final = 20
+"""Evaluations after which a structure far behind the closest one is left where it is: it creeps
+along a valley that damping of the wrong kind makes."""
+
+_A_LOOK: Final = 4
+"""The same for one that was far behind before."""
 
 _REPEATS: Final = 3
 """Each leaves a fifth of the bias that a narrow-band disturbance caused."""
@@ -115,12 +124,13 @@ def fit_record(
     # What was apart from the reference may hide the beam, or stand for noise. The closest structure
     # shows that before all others are fitted, and the closest of all once they are.
     renewed = reference.renewed(reference.noise(), _BEFORE_LINES)
+    descents: list[Descent] = []
     for _ in range(_REPEATS):
         if renewed is not reference:
             reference = renewed
             comparison = reference.objective.comparison
             searches = [search.on(comparison) for search in searches]
-        noise, descents = _under_its_noise(searches, closest, reference)
+        noise, descents = _under_its_noise(searches, closest, reference, descents)
         closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference = descents[closest]
         renewed = reference.renewed(noise, _BEFORE_LINES)
@@ -131,17 +141,46 @@ def fit_record(
 
 
 def _under_its_noise(
-    searches: list[Search], closest: int, reference: Descent
+    searches: list[Search], closest: int, reference: Descent, before: list[Descent]
 ) -> tuple[Noise, list[Descent]]:
-    """Descend with all structures under the noise that the closest one leaves."""
+    """Descend with all structures under the noise that the closest one leaves.
+
+    Parameters
+    ----------
+    searches : list of Search
+        One for each structure.
+    closest : int
+        Place of the closest structure.
+    reference : Descent
+        Where that is.
+    before : list of Descent
+        Where all were before it was told anew what follows the reference; empty the first time.
+        One that stays far behind from there is not searched for again.
+    """
     # Lines are looked for once, in what a fit to every bin leaves.
     noise = reference.noise(with_lines=True)
     hum = reference.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
-    return noise, [
-        search.under(noise, reference if i == closest else None).to_minimum(noise, _TOLERANCE)
-        for i, search in enumerate(searches)
-    ]
+    first = searches[closest].under(noise, reference).to_minimum(noise, _TOLERANCE)
+    behind = math.exp(FAR_BEHIND / (2 * np.count_nonzero(noise.counts)))
+    most = behind * first.cost(noise)
+    descents = []
+    for i, search in enumerate(searches):
+        found = first if i == closest else None
+        if found is None and before:
+            found = _still_behind(Descent(search.objective, before[i].x), noise, most)
+        if found is None:
+            found = search.under(noise).to_minimum(noise, _TOLERANCE, (_PATIENCE, most))
+        descents.append(found)
+    return noise, descents
+
+
+def _still_behind(before: Descent, noise: Noise, most: float) -> Descent | None:
+    """Look whether a structure stays above a cost from where it was; None if it does not."""
+    if before.cost(noise) <= most:
+        return None
+    found = before.to_minimum(noise, _TOLERANCE, (_A_LOOK, most))
+    return found if found.cost(noise) > most else None
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:

@@ -429,7 +429,7 @@ def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
 _SHARE: Final = 0.5
 """Longest step of an order, as a share of the way to 0 or 2."""
 
-_NEXT_TO_NOTHING: Final = 1e-4
+NEXT_TO_NOTHING: Final = 1e-4
 """Loss that may vanish in one step."""
 
 _LARGEST_GROWTH: Final = 50.0
@@ -446,14 +446,22 @@ class Steps:
     dampings : tuple of (int, int, bool)
         Places of the loss and of the order of each damping whose order is free, and whether it adds
         to the stiffness; otherwise it takes from the inertia.
+    losses : tuple of int
+        Places of the losses of dampings whose order is fixed.
+    linear_below : float
+        Loss below which a step that raises a loss is one of the loss itself, to which all that it
+        does is proportional. Its logarithm would leap from next to nothing to the upper bound, and
+        most of a descent would be spent on taking that back.
     """
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     dampings: tuple[tuple[int, int, bool], ...]
+    losses: tuple[int, ...] = ()
+    linear_below: float = 0.0
 
     @classmethod
-    def of(cls, unknowns: Unknowns) -> Steps:
+    def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
         """Find bounds and dampings of a vector of unknowns."""
         names = unknowns.names
         dampings = tuple(
@@ -461,7 +469,12 @@ class Steps:
             for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
             if order in names
         )
-        return cls(*unknowns.bounds, dampings)
+        losses = tuple(
+            names.index(coefficient)
+            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
+            if coefficient in names and order not in names
+        )
+        return cls(*unknowns.bounds, dampings, losses, linear_below)
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Least and largest step in each unknown, shape (k,).
@@ -486,11 +499,16 @@ class Steps:
             Within the `limits`; tangent to the way at `x`.
         """
         end = np.clip(x + step, self.lower, self.upper)
+        for i in self.losses:
+            if step[i] > 0 and math.exp(x[i]) < self.linear_below:
+                end[i] = min(x[i] + math.log1p(step[i]), self.upper[i])
         for i, j, elastic in self.dampings:
             if step[i] != 0:
                 before, after = _turn(x[j], elastic), _turn(end[j], elastic)
                 most = math.exp(self.upper[i])
-                loss, turn = _along(math.exp(x[i]), float(step[i]), before, after, most)
+                loss = math.exp(x[i])
+                linear = loss < self.linear_below
+                loss, turn = _along(loss, float(step[i]), before, after, most, linear=linear)
                 end[i] = math.log(loss) if loss > 0 else self.lower[i]
                 if turn != after:
                     end[j] = _order(turn, elastic)
@@ -499,7 +517,7 @@ class Steps:
 
 
 def _along(
-    loss: float, step: float, before: float, after: float, most: float
+    loss: float, step: float, before: float, after: float, most: float, *, linear: bool
 ) -> tuple[float, float]:
     """Loss and turn to which a step of ``ln loss`` leads while the turn goes from before to after.
 
@@ -510,10 +528,11 @@ def _along(
     real = 1 + size * math.cos(before)
     # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
     along = (step + size / math.sin(before) * (after - before)) / math.hypot(real, loss)
-    if along <= -1 and loss < _NEXT_TO_NOTHING:
+    if along <= -1 and loss < NEXT_TO_NOTHING:
         return 0.0, after  # in proportion to its effect it would change sign
     theta = math.atan2(loss, real)
-    theta = 2 * math.atan(math.tan(theta / 2) * math.exp(min(along, _LARGEST_GROWTH)))
+    growth = 1 + along if linear and along > 0 else math.exp(min(along, _LARGEST_GROWTH))
+    theta = 2 * math.atan(math.tan(theta / 2) * growth)
     if theta < after:
         loss = math.sin(theta) / math.sin(after - theta) * math.sin(after)
         if loss <= most:

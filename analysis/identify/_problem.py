@@ -187,6 +187,7 @@ class Objective:
         *,
         relative_tolerance: float,
         max_evaluations: int = 200,
+        hopeless: tuple[int, float] | None = None,
     ) -> tuple[Objective, Minimum]:
         """Descend; again, while what is put for unknown torques moves the minimum.
 
@@ -195,7 +196,7 @@ class Objective:
         start : ndarray, shape (k,)
         weight : ndarray, shape (K,)
             That of `Noise`.
-        region, relative_tolerance, max_evaluations
+        region, relative_tolerance, max_evaluations, hopeless
             As `descend` takes them.
 
         Returns
@@ -214,6 +215,7 @@ class Objective:
                 region,
                 relative_tolerance=relative_tolerance,
                 max_evaluations=max_evaluations,
+                hopeless=hopeless,
             )
             converged = np.abs(found.x - x).max() < _CONVERGED
             x = found.x

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from analysis.identify._candidate import FAR_BEHIND
 from analysis.identify._refit import MISSED, Refit
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 
@@ -317,9 +319,9 @@ class Walk:
         for value in places:
             start = self._first.x.copy()
             start[self._place] = value
-            looks[value] = self._descend(start, _LOOKS, hold=True)
+            looks[value] = self._descend(start, _LOOKS, hold=(self.order,))
         for value in dips({value: look.cost for value, look in looks.items()}):
-            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS, hold=False)
+            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS)
             values, deviance = self.curve()
             at = float(bottom.x[self._place])
             here = self._values * math.log(bottom.cost / min(self.costs.values()))
@@ -376,11 +378,37 @@ class Walk:
 
     def _hold(self, value: float, near: Refit) -> float:
         """Fit all else with the order at `value`; give the root of the deviance."""
-        self._keep(value, self._descend(self._tangent(value, near), _MAX_EVALUATIONS, hold=True))
+        hold, most = (self.order,), self.costs[self._centre] * math.exp(FAR_BEHIND / self._values)
+        found = self._descend(
+            self._tangent(value, near), _MAX_EVALUATIONS, hold=hold, hopeless=(_LOOKS, most)
+        )
+        if found.cost > most and self._without_damping.cost < found.cost:
+            # Near its ends an order turns a loss into inertia or stiffness: the tangent may lead
+            # far astray, where no descent ends. Without the damping its order says nothing.
+            start = self._without_damping.x.copy()
+            start[self._place] = value
+            found = self._descend(start, _MAX_EVALUATIONS, hold=hold)
+        self._keep(value, found)
         return self._root(value)
 
-    def _descend(self, start: NDArray[np.float64], max_evaluations: int, *, hold: bool) -> Refit:
-        """Fit from a vector of unknowns, the order held where it starts or free."""
+    @cached_property
+    def _without_damping(self) -> Refit:
+        """Fit without the damping whose order is walked along: what it costs at any order."""
+        coefficient = COEFFICIENT_OF[self.order]
+        start = self._first.x.copy()
+        place = self._unknowns.names.index(coefficient)
+        start[place] = self._unknowns.bounds[0][place]
+        return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
+
+    def _descend(
+        self,
+        start: NDArray[np.float64],
+        max_evaluations: int,
+        *,
+        hold: tuple[str, ...] = (),
+        hopeless: tuple[int, float] | None = None,
+    ) -> Refit:
+        """Fit from a vector of unknowns, some of them held where they start."""
         field = self._field
         return Refit.descend(
             field.comparison,
@@ -390,7 +418,8 @@ class Walk:
             field.columns,
             max_evaluations=max_evaluations,
             relative_tolerance=_TOLERANCE,
-            hold=self.order if hold else None,
+            hold=hold,
+            hopeless=hopeless,
         )
 
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ import numpy as np
 from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
 from analysis.identify._noise import Noise, smooth_power
-from analysis.identify._parametrization import Steps
+from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps
 from analysis.identify._problem import Objective
 from rigd.beam import clamped_free_eigenvalues
 
@@ -119,7 +119,8 @@ class Refit:
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _TOLERANCE,
-        hold: str | None = None,
+        hold: Sequence[str] = (),
+        hopeless: tuple[int, float] | None = None,
     ) -> Refit:
         """Descend from `start`, unknown torques being put as they are predicted there.
 
@@ -135,13 +136,15 @@ class Refit:
             Most evaluations of the sum of squares; with 1 nothing moves.
         relative_tolerance : float
             As `descend` takes it.
-        hold : str, optional
-            An unknown that stays where it starts.
+        hold : sequence of str
+            Unknowns that stay where they start.
+        hopeless : tuple of int and float, optional
+            As `analysis.optimizer.descend` takes it.
         """
-        region = Steps.of(unknowns)
+        region = Steps.of(unknowns, NEXT_TO_NOTHING)
         x = np.clip(start, region.lower, region.upper)
-        if hold is not None:
-            place = unknowns.names.index(hold)
+        for name in hold:
+            place = unknowns.names.index(name)
             region.lower[place] = region.upper[place] = x[place]
         objective, found = Objective(comparison, unknowns, columns).minimum(
             x,
@@ -149,6 +152,7 @@ class Refit:
             region,
             relative_tolerance=relative_tolerance,
             max_evaluations=max_evaluations,
+            hopeless=hopeless,
         )
         return cls(objective, found.x, found.equations, noise)
 
@@ -165,7 +169,7 @@ class Refit:
         objective, found = self.objective.minimum(
             self.x,
             self.noise.weight,
-            Steps.of(self.objective.unknowns),
+            Steps.of(self.objective.unknowns, NEXT_TO_NOTHING),
             relative_tolerance=_TOLERANCE,
             max_evaluations=max_evaluations,
         )

@@ -229,11 +229,22 @@ class Descent:
         """The plant there."""
         return self.objective.unknowns.plant(self.x)
 
-    def to_minimum(self, noise: Noise, tolerance: float) -> Descent:
-        """Descend to the minimum under a noise spectrum."""
+    def to_minimum(
+        self, noise: Noise, tolerance: float, hopeless: tuple[int, float] | None = None
+    ) -> Descent:
+        """Descend to the minimum under a noise spectrum.
+
+        Parameters
+        ----------
+        noise : Noise
+        tolerance : float
+            Relative, of the sum of squares.
+        hopeless : tuple of int and float, optional
+            As `descend` takes it.
+        """
         region = Steps.of(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
-            self.x, noise.weight, region, relative_tolerance=tolerance
+            self.x, noise.weight, region, relative_tolerance=tolerance, hopeless=hopeless
         )
         return Descent(objective, minimum.x)
 

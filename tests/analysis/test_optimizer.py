@@ -226,6 +226,23 @@ def test_on_a_bound_the_others_make_the_best_of_it():
     assert problem.asked < 12
 
 
+def test_a_hopeless_descent_is_given_up_and_no_other():
+    start, tight = np.array([1.0, 1.5, 0.5]), 1e-12
+    whole = descend(Counted(decays, slopes), start, free(3), relative_tolerance=tight)
+    assert whole.evaluations > 4
+    above, below = whole.cost * 0.99, whole.cost * 1.01
+    given_up = descend(
+        Counted(decays, slopes), start, free(3), relative_tolerance=tight, hopeless=(4, above)
+    )
+    assert given_up.evaluations == 4
+    assert given_up.cost > whole.cost
+    followed = descend(
+        Counted(decays, slopes), start, free(3), relative_tolerance=tight, hopeless=(40, below)
+    )
+    assert followed.evaluations == whole.evaluations
+    assert followed.x == pytest.approx(whole.x, abs=1e-12)
+
+
 def test_it_ends_where_it_is_told_to():
     problem = Counted(decays, slopes)
     start = np.array([1.0, 1.5, 0.5])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify._parametrization import Steps, Unknowns
+from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
@@ -105,4 +105,19 @@ def test_without_a_free_order_steps_are_straight():
     steps = Steps.of(Unknowns.of(STRUCTURES["III"], NOMINAL, SETTINGS))
     x, step = np.array([1.0, 1.0, *REST]), np.array([2.0, -3.0, 0.1, 0.1, 0.1, 0.1])
     assert steps.dampings == ()
+    assert steps.losses == (0, 1)
     assert steps.end(x, step) == pytest.approx(x + step)
+
+
+@pytest.mark.parametrize("structure", ["VI", "III"])
+def test_from_next_to_nothing_a_loss_grows_by_what_is_asked_of_it(structure):
+    unknowns = Unknowns.of(STRUCTURES[structure], NOMINAL, SETTINGS)
+    steps = Steps.of(unknowns, NEXT_TO_NOTHING)
+    place = unknowns.names.index("zeta")
+    x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
+    # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.
+    x[place], step[place] = math.log(1e-8), 999.0
+    assert math.exp(steps.end(x, step)[place]) == pytest.approx(1e-5, rel=1e-3)
+    assert Steps.of(unknowns).end(x, step)[place] == steps.upper[place]
+    x[place], step[place] = math.log(1e-2), 0.5
+    assert steps.end(x, step) == pytest.approx(Steps.of(unknowns).end(x, step), abs=1e-12)
