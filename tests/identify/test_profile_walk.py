@@ -29,9 +29,9 @@ class DoubleWell(Walk):
         self.order, self.structure = "lambda", None
         self._values, self._place = COUNT, 0
         self.costs, self._at = {}, {}
-        self._stand_at(self._descend(np.array([start]), 1, hold=False))
+        self._stand_at(self._descend(np.array([start]), 1))
 
-    def _descend(self, start, max_evaluations, *, hold):
+    def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
         order = float(start[0])
         if not hold:
             order = min(BOTTOMS, key=lambda at: ((order - at) / WIDTH) ** 2 + BOTTOMS[at])
@@ -55,3 +55,26 @@ def test_both_valleys_are_found_from_either(start):
     assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
     assert high == pytest.approx(1.4 + WIDTH * (limit - 1) ** 0.5, abs=3e-3)
     assert is_open == [False, False]
+
+
+class Astray(DoubleWell):
+    """The same, where descents from the tangent end nowhere beyond an order of 1.9."""
+
+    BEYOND = 1.9
+
+    def _descend(self, start, max_evaluations, *, hold=(), hopeless=None):
+        found = super()._descend(start, max_evaluations, hold=hold)
+        if hopeless is not None and found.x[0] > self.BEYOND:
+            found.cost = 1e3 * COUNT
+            assert found.cost > hopeless[1]
+        return found
+
+    @property
+    def _without_damping(self):
+        return SimpleNamespace(x=np.array([1.4]), cost=cost(1.5))
+
+
+def test_an_order_is_not_excluded_because_a_descent_went_astray():
+    walk = Astray(1.4)
+    near = walk._at[1.4]
+    assert walk._hold(1.95, near) == pytest.approx((deviance(1.95) - deviance(1.4)) ** 0.5)
