@@ -382,14 +382,24 @@ class Walk:
         found = self._descend(
             self._tangent(value, near), _MAX_EVALUATIONS, hold=hold, hopeless=(_LOOKS, most)
         )
-        if found.cost > most and self._without_damping.cost < found.cost:
+        if found.cost > most:
             # Near its ends an order turns a loss into inertia or stiffness: the tangent may lead
-            # far astray, where no descent ends. Without the damping its order says nothing.
-            start = self._without_damping.x.copy()
-            start[self._place] = value
-            found = self._descend(start, _MAX_EVALUATIONS, hold=hold)
+            # far astray, where no descent ends. All else stays, the loss at a mode too.
+            found = self._lower(found, near, value, (_LOOKS, most))
+        if found.cost > most:
+            # Without the damping its order says nothing.
+            found = self._lower(found, self._without_damping, value)
         self._keep(value, found)
         return self._root(value)
+
+    def _lower(
+        self, found: Refit, other: Refit, value: float, hopeless: tuple[int, float] | None = None
+    ) -> Refit:
+        """Descend from another refit with only the order moved; give the lower of the two."""
+        start = other.x.copy()
+        start[self._place] = value
+        again = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
+        return min(found, again, key=lambda refit: refit.cost)
 
     @cached_property
     def _without_damping(self) -> Refit:

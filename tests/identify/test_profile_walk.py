@@ -78,3 +78,20 @@ def test_an_order_is_not_excluded_because_a_descent_went_astray():
     walk = Astray(1.4)
     near = walk._at[1.4]
     assert walk._hold(1.95, near) == pytest.approx((deviance(1.95) - deviance(1.4)) ** 0.5)
+
+
+class TangentAstray(DoubleWell):
+    """The same, where only the tangent leads astray."""
+
+    def _tangent(self, value, near):
+        return np.array([value + 8.0])
+
+    @property
+    def _without_damping(self):
+        raise AssertionError("there is a lower minimum with the damping")
+
+
+def test_the_damping_stays_where_only_the_tangent_went_astray():
+    walk = TangentAstray(1.4)
+    near = walk._at[1.4]
+    assert walk._hold(1.45, near) == pytest.approx((deviance(1.45) - deviance(1.4)) ** 0.5)
