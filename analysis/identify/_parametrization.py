@@ -462,7 +462,14 @@ class Steps:
 
     @classmethod
     def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
-        """Find bounds and dampings of a vector of unknowns."""
+        """Find bounds and dampings of a vector of unknowns.
+
+        Parameters
+        ----------
+        unknowns : Unknowns
+        linear_below : float
+            As the field of that name.
+        """
         names = unknowns.names
         dampings = tuple(
             (names.index(coefficient), names.index(order), coefficient == "zeta")
