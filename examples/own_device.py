@@ -41,7 +41,7 @@ class RigidHub:
 
     def command(self, torque_nm: float) -> float:
         self.torque_nm = torque_nm if self.enabled else 0.0
-        return torque_nm
+        return self.torque_nm
 
     def disable(self) -> None:
         self.torque_nm, self.enabled = 0.0, False

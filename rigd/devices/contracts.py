@@ -114,7 +114,8 @@ class Drive(Protocol):
         Returns
         -------
         float
-            The torque as it was sent: what the drive's steps and limits make of it.
+            The torque as it was sent: what the drive's steps and limits make of it; 0 while it is
+            not enabled.
         """
 
     def health(self) -> LineHealth:

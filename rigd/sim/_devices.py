@@ -212,9 +212,8 @@ class SimulatedDrive:
         self._due_ns = self.angle_time_ns = due_ns
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque in N·m; a drive that is not enabled exerts none."""
-        self._plant.command(torque_nm)
-        return torque_nm
+        """Set the torque in N·m, and return what is exerted: none while it is not enabled."""
+        return self._plant.command(torque_nm)
 
     def health(self) -> LineHealth:
         """Report that there is no line."""

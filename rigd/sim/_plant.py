@@ -270,18 +270,22 @@ class SimulatedPlant:
         if self._contact is not None:
             self._contact.end(obstacle, self.elapsed_s)
 
-    def command(self, torque_nm: float) -> None:
-        """Torque to exert from this tick on, after the actuation delay; limited to the peak.
+    def command(self, torque_nm: float) -> float:
+        """Set the torque to exert from this tick on, after the actuation delay.
 
-        Without effect while the drive is off.
+        Returns
+        -------
+        float
+            That torque: limited to the peak, 0 while the drive is off.
         """
         if not self.enabled:
-            return
+            return 0.0
         if torque_nm > self._peak_nm:
             torque_nm = self._peak_nm
         elif torque_nm < -self._peak_nm:
             torque_nm = -self._peak_nm
         self._torque_nm = torque_nm
+        return torque_nm
 
     def advance(self, n_periods: int = 1) -> None:
         """Go to the tick `n_periods` from here, with the last command repeated at those between."""

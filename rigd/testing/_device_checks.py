@@ -7,6 +7,9 @@ from math import isfinite
 from rigd.devices import Devices, Wrench
 
 _PERIOD_NS = 1_000_000
+_TORQUE_NM = 0.3
+_ROUNDED = 0.1
+"""Share of a torque by which a drive may round it."""
 
 
 def _must(condition: bool, message: str) -> None:
@@ -15,9 +18,14 @@ def _must(condition: bool, message: str) -> None:
 
 
 def _run(
-    devices: Devices, first: int, ticks: int, torque_nm: float | None = None
+    devices: Devices,
+    first: int,
+    ticks: int,
+    torque_nm: float | None = None,
+    *,
+    enabled: bool = False,
 ) -> tuple[list[float], list[Wrench]]:
-    """Let some ticks pass; return angles and wrenches."""
+    """Let some ticks pass; return angles and wrenches, and check what torque was sent."""
     angles, wrenches = [], []
     for tick in range(first, first + ticks):
         devices.drive.latch(tick * _PERIOD_NS)
@@ -25,7 +33,12 @@ def _run(
         angles.append(devices.drive.read_angle())
         wrenches.append(devices.sensor.read_wrench())
         if torque_nm is not None:
-            devices.drive.command(torque_nm)
+            sent_nm = devices.drive.command(torque_nm)
+            expected_nm = torque_nm if enabled else 0.0
+            _must(
+                abs(sent_nm - expected_nm) <= _ROUNDED * abs(expected_nm),
+                f"the torque sent is said to be {sent_nm:g} N·m, not {expected_nm:g} N·m",
+            )
     return angles, wrenches
 
 
@@ -37,7 +50,7 @@ def _connect(devices: Devices) -> None:
 def _until_it_is_enabled_the_rig_is_read_and_nothing_moves(devices: Devices) -> None:
     _connect(devices)
     _must(bool(json.loads(json.dumps(devices.sensor.calibration()))), "there is no calibration")
-    angles, wrenches = _run(devices, 0, 300, torque_nm=0.3)
+    angles, wrenches = _run(devices, 0, 300, _TORQUE_NM)
     _must(all(map(isfinite, angles)), "an angle is not finite")
     _must(all(len(wrench) == 6 for wrench in wrenches), "a wrench has not six axes")
     _must(all(isfinite(value) for wrench in wrenches for value in wrench), "nor is a wrench finite")
@@ -52,14 +65,14 @@ def _torque_is_what_was_commanded_from_enabling_to_disabling(devices: Devices) -
     devices.drive.enable()
     angles, _ = _run(devices, 0, 300)
     _must(max(angles) - min(angles) < 1e-3, "it moves without a command")
-    angles, _ = _run(devices, 300, 60, torque_nm=0.3)
+    angles, _ = _run(devices, 300, 60, _TORQUE_NM, enabled=True)
     _must(angles[-1] > angles[0] + 1e-3, "a positive torque does not turn it towards positive")
     devices.drive.disable()
     devices.drive.disable()
     speeds = []
-    last = _run(devices, 360, 1, torque_nm=0.3)[0][0]
+    last = _run(devices, 360, 1, _TORQUE_NM)[0][0]
     for block in range(20):
-        angles, _ = _run(devices, 361 + 100 * block, 100, torque_nm=0.3)
+        angles, _ = _run(devices, 361 + 100 * block, 100, _TORQUE_NM)
         speeds.append(abs(angles[-1] - last))
         last = angles[-1]
     _must(speeds[-1] < 0.2 * max(speeds), "it does not coast to a stop once it is disabled")
@@ -99,4 +112,5 @@ DEVICE_CHECKS: tuple[Callable[[Devices], None], ...] = (
     _the_lines_tell_how_they_are,
 )
 """What the loop relies on: each takes devices that are opened but not connected, and raises
-AssertionError with what is wrong. The second lets the motor turn."""
+AssertionError with what is wrong. The second lets the motor turn. None of them knows the inertia:
+that the torque has the right scale, ``rigd identify motor`` shows."""
