@@ -49,6 +49,7 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._free_decay import mode_poles
+from analysis.identify._plant import OF_BEAM
 from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, torque_channel
 from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
@@ -489,9 +490,6 @@ def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
 
 # Change with beam and drag
 
-_OF_DENSITY: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-"""Parameters whose logarithms add up to that of the mass per length."""
-
 _OF_EXTERNAL: Final = ("gamma", "lambda")
 
 
@@ -563,7 +561,8 @@ class DragExpansion:
         rows.append(self.by_ln_density)
         here, there = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         moved.append(np.log(there / here))
-        slopes.append(_part(chain, names, _OF_DENSITY).sum(axis=0))
+        # The logarithms of the two add up to that of the mass per length.
+        slopes.append(_part(chain, names, OF_BEAM).sum(axis=0))
         for by_external, values in zip(self.by_external, self._external(plant), strict=True):
             rows += list(by_external)
             moved += values[:, 0].tolist()

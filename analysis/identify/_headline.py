@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
+from analysis.identify._plant import OF_BEAM
 from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
@@ -33,7 +34,6 @@ _NOT_DETERMINED: Final = "not identifiable from this record"
 _AT_EDGE: Final = "at the edge of the range searched"
 
 _MODES_TO_TELL_DAMPINGS: Final = 2
-_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _NOT_APART: Final = "not separable from a damping of unknown order"
 """Damping of a low order is a stiffness, of an order near 2 an inertia."""
 
@@ -341,7 +341,7 @@ def of_fit(
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
     if few or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        flags |= dict.fromkeys(_BEAM, _NOT_APART)
+        flags |= dict.fromkeys(OF_BEAM, _NOT_APART)
     return Headline(
         name=name,
         fit=fit,

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import EXTRAS, SETTINGS, Plant
+from analysis.identify._plant import EXTRAS, OF_BEAM, SETTINGS, Plant
 from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
 from analysis.models import ORDER_RANGE, SIZE_RANGE
 from rigd.beam import Beam, undamped_frequencies_rad_s
@@ -69,7 +69,6 @@ _EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
     }
 )
 _TIP: Final = "tip_mass_kg"
-_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
     {"filter_time_constant_s": 1.0, "second_order_filter_time_constant_s": 2**0.5}
 )
@@ -321,7 +320,7 @@ class Unknowns:
             inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
             if "lambda" in place:
                 derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
-        for name, (moved, slope) in zip(_BEAM, _bare_beam(given.get(_TIP, 0.0)), strict=True):
+        for name, (moved, slope) in zip(OF_BEAM, _bare_beam(given.get(_TIP, 0.0)), strict=True):
             if name in place and _TIP in place:
                 values[name] *= math.exp(moved)
                 derivative[place[name], place[_TIP]] = slope

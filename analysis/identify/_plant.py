@@ -37,9 +37,10 @@ EXTRAS: Final[tuple[Extra, ...]] = (
 """What a rig may have beside a rigid clamp, a bare beam and ideal channels. Neutral at 0, and free
 only in candidates that carry them."""
 
-LOGARITHMIC: Final = frozenset(
-    {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
-)
+OF_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+"""Parameters of the beam without its damping."""
+
+LOGARITHMIC: Final = frozenset({"zeta", "gamma", *OF_BEAM})
 """Parameters that are positive and uncertain by a factor: their logarithm is what is estimated."""
 
 

@@ -242,8 +242,6 @@ class _Estimation:
         self.available = self.record.angle_rad.size - self.detected
         self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
-        self.later_doubtful = False
-        """Whether later samples, which are left out, speak against an obstacle at rest."""
         self.starts = self._first_starts()
 
     @property
@@ -261,6 +259,7 @@ class _Estimation:
         """Return what the touch was."""
         starts, covered_s = self.starts, 0.0
         before: tuple[_Explanation, Window] | None = None
+        later_doubtful = False
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         for seconds in (*stages, available_s):
@@ -275,7 +274,7 @@ class _Estimation:
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
             if before is not None and self._later_is_worse(rest, window, *before):
                 # Of still later bounces the search may miss the minimum: they speak of no kind.
-                self.later_doubtful = seconds <= _COVERED_S and self._changes(rest, window)
+                later_doubtful = seconds <= _COVERED_S and self._changes(rest, window)
                 rest, window = before
                 break
             before = rest, window
@@ -287,7 +286,7 @@ class _Estimation:
         explanations = [rest]
         if not self._fits(rest, window, _POOR) or self._changes(rest, window):
             explanations += self._others(window)
-        return self._answer(explanations, window, scan=scan)
+        return self._answer(explanations, window, scan=scan, later_doubtful=later_doubtful)
 
     @cached_property
     def blind(self) -> BlindScan:
@@ -546,8 +545,17 @@ class _Estimation:
     # The answer
 
     def _answer(
-        self, explanations: list[_Explanation], window: Window, *, scan: bool
+        self,
+        explanations: list[_Explanation],
+        window: Window,
+        *,
+        scan: bool,
+        later_doubtful: bool,
     ) -> TouchEstimate:
+        """Say what the likeliest explanation tells, and of what kind the touch is.
+
+        `later_doubtful`: later samples, which are left out, speak against an obstacle at rest.
+        """
         rest = explanations[0]
         best = min(explanations, key=lambda each: each.chi2)
         if rest.chi2 < best.chi2 + _CLEAR:
@@ -559,7 +567,7 @@ class _Estimation:
         kind = "unknown"
         if self._fits(best, window):
             poor = not self._fits(best, window, _POOR)
-            doubtful = self.later_doubtful if best is rest else poor
+            doubtful = later_doubtful if best is rest else poor
             if len(rivals) == 1 and not doubtful:
                 kind = best.kind
             x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
