@@ -14,7 +14,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
+from analysis.identify._verdict import (
+    ANOTHER_DAMPING,
+    BESIDE_DRAG,
+    EXCLUDED,
+    ORDER_ONE_ELSEWHERE,
+    OTHER_ORDER_ELSEWHERE,
+    STRONG,
+)
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -38,6 +45,8 @@ _NOT_APART: Final = "not separable from a damping of unknown order"
 """Damping of a low order is a stiffness, of an order near 2 an inertia."""
 
 ONE_MODE: Final = "one mode alone does not separate internal from external damping"
+
+_BY_RIVALS: Final = (ORDER_ONE_ELSEWHERE, OTHER_ORDER_ELSEWHERE)
 
 _LAW_ASSUMED: Final = (
     "the stiffness depends on the deflection, and only its lowest power was fitted"
@@ -69,12 +78,16 @@ class Quantity:
         None as above.
     flag : str or None
         Why it is not a property of the antenna or the rig; None if it is.
+    std_any_rig : float or None
+        Standard deviation whichever kind of rig is the true one, where another kind explains the
+        record about as well and nothing else makes the value doubtful; else None.
     """
 
     value: float
     std: float | None
     interval_95: tuple[float, float] | None
     flag: str | None = None
+    std_any_rig: float | None = None
 
     def flagged(self, flag: str | None) -> Quantity:
         """Give it a flag, unless it has one.
@@ -83,12 +96,43 @@ class Quantity:
         ----------
         flag : str or None
         """
-        return replace(self, flag=self.flag or flag)
+        if flag is None:
+            return self
+        # With another reason for doubt, no deviation covers it.
+        return replace(self, flag=self.flag or flag, std_any_rig=None)
+
+    def with_rival(self, value: float, std: float | None, flag: str | None) -> Quantity:
+        """Count in what another kind of rig, which explains the record as well, would have.
+
+        Parameters
+        ----------
+        value : float
+            The same quantity there.
+        std : float or None
+            Its standard deviation; None if the data do not tell.
+        flag : str or None
+            The reason for doubt, if that value lies outside the interval here.
+        """
+        low, high = self.interval_95 or (-math.inf, math.inf)
+        told = self if low <= value <= high else self.flagged(flag)
+        so_far = self.std_any_rig
+        if so_far is None:
+            if self.std is None or self.flag not in (None, *_BY_RIVALS):
+                return told
+            so_far = self.std
+        away = math.inf if std is None else math.hypot(std, value - self.value)
+        return replace(told, std_any_rig=max(so_far, away))
 
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it."""
         ends = None if self.interval_95 is None else list(self.interval_95)
-        return {"value": self.value, "std": self.std, "interval_95": ends, "flag": self.flag}
+        return {
+            "value": self.value,
+            "std": self.std,
+            "interval_95": ends,
+            "flag": self.flag,
+            "std_any_rig": self.std_any_rig,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,8 +345,9 @@ def headline(
             drag_speed_m_s=drag.speed_m_s,
         )
     simpler = _simpler(field, fractional) if unexplained is None else None
-    for other in field.other_kinds(STRONG):
-        told = _doubted_by(told, other)
+    best = field.other_kinds(STRONG)
+    for other in field.of_other_kinds(STRONG):
+        told = _doubted_by(told, other, flagging=any(other is each for each in best))
     return replace(told, structures=structures(field, fractional), simpler=simpler)
 
 
@@ -464,38 +509,37 @@ def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
 
 
-def _doubted_by(told: Headline, other: Candidate) -> Headline:
-    """Flag what another kind of rig, which explains the record as well, would have elsewhere."""
-    flag = f"type {other.name} fits the record equally well with another value"
-    values = other.fit.parameters
+def _doubted_by(told: Headline, other: Candidate, *, flagging: bool) -> Headline:
+    """Count in another kind of rig that explains the record as well; flag what it has elsewhere."""
+    reason = f"type {other.name} fits the record equally well with another value"
+    flag = reason if flagging else None
+    values, std = other.fit.parameters, other.fit.std
 
-    def elsewhere(quantity: Quantity, value: float) -> bool:
-        low, high = quantity.interval_95 or (-math.inf, math.inf)
+    def elsewhere(size: Quantity, value: float) -> bool:
+        low, high = size.interval_95 or (-math.inf, math.inf)
         return not low <= value <= high
 
-    def moved(mine: Quantity, value: float) -> Quantity:
-        return mine.flagged(flag) if elsewhere(mine, value) else mine
-
     parameters = {
-        name: moved(each, values[name]) if name in values else each
+        name: each.with_rival(values[name], std[name], flag) if name in values else each
         for name, each in told.parameters.items()
     }
     sizes = tuple(
-        each.flagged(flag) if elsewhere(each.size, _loss(values, each)) else each
+        each.flagged(flag) if flag and elsewhere(each.size, _loss(values, each)) else each
         for each in told.sizes
     )
     theirs = {mode.number: mode for mode in other.fit.modes}
 
-    modes = tuple(
-        replace(
-            mode,
-            frequency_hz=moved(mode.frequency_hz, theirs[mode.number].frequency_hz),
-            damping_ratio=moved(mode.damping_ratio, theirs[mode.number].damping_ratio),
+    def moved(mine: Mode) -> Mode:
+        its = theirs[mine.number]
+        return replace(
+            mine,
+            frequency_hz=mine.frequency_hz.with_rival(its.frequency_hz, its.frequency_std_hz, flag),
+            damping_ratio=mine.damping_ratio.with_rival(
+                its.damping_ratio, its.damping_ratio_std, flag
+            ),
         )
-        if mode.number in theirs
-        else mode
-        for mode in told.modes
-    )
+
+    modes = tuple(moved(mode) if mode.number in theirs else mode for mode in told.modes)
     return replace(told, parameters=parameters, sizes=sizes, modes=modes)
 
 

@@ -46,6 +46,11 @@ _MODES_FOR_ONE_DAMPING: Final = 3
 """Modes from which on it shows that there is no second damping: two loss factors are explained by
 coefficient and order of one damping as well as by two dampings."""
 
+ORDER_ONE_ELSEWHERE: Final = "order 1 on another kind of rig explains the record about as well"
+OTHER_ORDER_ELSEWHERE: Final = (
+    "another order on another kind of rig explains the record about as well"
+)
+
 ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
 
 
@@ -169,9 +174,9 @@ def _judged(
         return "open", BESIDE_DRAG
     for rival in field.of_other_kinds(STRONG):
         if _integer(rival, order):
-            return "open", "order 1 on another kind of rig explains the record about as well"
+            return "open", ORDER_ONE_ELSEWHERE
         if _elsewhere(rival, profile):
-            return "open", "another order on another kind of rig explains the record about as well"
+            return "open", OTHER_ORDER_ELSEWHERE
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None

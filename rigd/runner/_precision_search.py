@@ -139,6 +139,10 @@ def _read(target: Target, found: Mapping[str, Any] | None) -> Stated:
         return Stated(*of, None, inf, target.std, "it is not part of what was found")
     value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
     asked_std = target.std * (abs(value) if target.relative else 1.0)
+    any_rig = found["std_any_rig"]
+    if doubt and any_rig is not None and any_rig <= asked_std:
+        # Other kinds of rig explain the record as well, and do not differ by what is asked.
+        return Stated(*of, value, float(any_rig), asked_std)
     return Stated(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
 
 

@@ -107,7 +107,7 @@ def test_the_headline_is_json(nearly_one):
     assert {"zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "delay_s",
             "bending_stiffness_n_m2", "tool_inertia_kg_m2"} == set(back["parameters"])  # fmt: skip
     for each in back["parameters"].values():
-        assert set(each) == {"value", "std", "interval_95", "flag"}
+        assert set(each) == {"value", "std", "interval_95", "flag", "std_any_rig"}
     assert back["orders"]["lambda"]["status"] == "fractional"
     assert {"type": "VI", "status": "selected"} in back["structures"]
     assert [mode["mode"] for mode in back["modes"]] == [1, 2, 3]

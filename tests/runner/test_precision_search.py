@@ -38,7 +38,8 @@ def answer(profile, tick, share, flag=None, kind="VI"):
     def quantity(value):
         std = share * value
         ends = [value - 2 * std, value + 2 * std]
-        return {"value": value, "std": std, "interval_95": ends, "flag": flag}
+        told = {"value": value, "std": std, "interval_95": ends, "flag": flag}
+        return {**told, "std_any_rig": None}
 
     found = [mode for mode in modes(beam, damping, 3) if mode.frequency_hz < 50]
     return {
@@ -285,6 +286,20 @@ def test_rivals_that_are_left_after_a_pause_are_told_apart_by_scans(profile, qui
         assert not any(isinstance(m, SearchEnded) for m in told)
         names += [m.name for m in told if isinstance(m, PieceTold)]
     assert names.count("a scan between the modes as well") == 3
+
+
+def test_rivals_that_differ_by_less_than_is_asked_do_not_count(profile):
+    """What is told then is the deviation whichever of them is the true one."""
+    document = answer(profile, 1, CERTAIN)
+    second = document["modes"][1]["damping_ratio"]
+    second["flag"] = "another beam fits as well"
+    for share, reached in ((0.009, True), (0.011, False)):
+        second["std_any_rig"] = share * second["value"]
+        (found,) = stated(document, [parse_target("damping", "2:1%")])
+        assert (found.ratio <= 1.0) is reached
+        assert bool(found.doubt) is not reached
+        if reached:
+            assert found.ratio == pytest.approx(0.9)
 
 
 def test_modes_above_the_band_are_not_asked_for(profile):
