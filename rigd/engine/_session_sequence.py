@@ -21,7 +21,13 @@ from rigd.engine._publish import Display, SampleLog
 from rigd.engine._realtime import page_faults
 from rigd.engine._reference import PieceReader
 from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
-from rigd.engine._timing import SUSPENDED_S, Clock, SuspendWatch, TickScheduler
+from rigd.engine._timing import (
+    SIGN_OF_LIFE_S,
+    SUSPENDED_S,
+    Clock,
+    SuspendWatch,
+    TickScheduler,
+)
 from rigd.engine._topics import Channels
 from rigd.excitation import quintic, still_path
 from rigd.profile import Profile
@@ -341,8 +347,15 @@ class SessionSequence:
             raise end
 
     def _await_piece(self, pieces: PieceReader, tick: int) -> None:
-        """Let virtual time stand still until a tick has its reference."""
+        """Let virtual time stand still until a tick has its reference.
+
+        Where there are lines it does not for long: a tick now and then holds the last angle.
+        """
+        on_lines = self._cycle.devices.drive.health().bits is not None
+        begun_s = time.monotonic()
         while pieces.waits(tick) and self._stop_reason() is None:
+            if on_lines and time.monotonic() - begun_s > SIGN_OF_LIFE_S:
+                return
             self._display.show(self._cycle, self._metronome.due_ns)
             time.sleep(_GO_POLL_S)
 

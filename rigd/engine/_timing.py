@@ -12,6 +12,9 @@ from typing import Protocol
 
 SUSPENDED_S = 0.01
 """More than this of :meth:`SuspendWatch.suspended_s` is a suspend; no suspend is so short."""
+SIGN_OF_LIFE_S = 1.0
+"""Time for which virtual time may stand still where there are lines: at their other end a host that
+is silent for long is assumed to be dead."""
 
 
 class Clock(Protocol):

@@ -39,7 +39,13 @@ from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine._reference import PieceReader, map_reference
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine._shared_state import Event, Phase, Word, write_event
-from rigd.engine._timing import Clock, RealClock, TickScheduler, VirtualClock
+from rigd.engine._timing import (
+    SIGN_OF_LIFE_S,
+    Clock,
+    RealClock,
+    TickScheduler,
+    VirtualClock,
+)
 from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -50,7 +56,6 @@ _SILENCE_S = 1.0
 """Time for which a device may be silent between sessions."""
 _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
-_SIGN_OF_LIFE_S = 1.0
 _TAKE_UP_TICKS = 2
 """Ticks after which the motor's angle is known, and that it is at rest."""
 
@@ -202,8 +207,7 @@ class _ControlServer:
     def _await_order(self) -> object | None:
         """Observe with the torque off until there is something to do; None: nothing any more.
 
-        Virtual time stands still meanwhile, but for a tick now and then where there are lines: at
-        their other end a host that is silent for long is assumed to be dead.
+        Virtual time stands still meanwhile, but for a tick now and then where there are lines.
         """
         seen_s = time.monotonic()
         while not self._stop.requested:
@@ -216,7 +220,7 @@ class _ControlServer:
                 return message
             if not self._clock.virtual:
                 self._observe()
-            elif self._on_lines and time.monotonic() - seen_s > _SIGN_OF_LIFE_S:
+            elif self._on_lines and time.monotonic() - seen_s > SIGN_OF_LIFE_S:
                 seen_s = time.monotonic()
                 self._metronome.wait()
                 self._read_at_rest()

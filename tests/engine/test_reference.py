@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rigd.devices.contracts import LineHealth
 from rigd.engine._messages import SessionJob
 from rigd.engine._reference import (
     PieceReader,
@@ -156,6 +157,33 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     reference_rad = samples["angle_reference_rad"]
     assert reference_rad - reference_rad[0] == pytest.approx(expected, abs=1e-12)
     assert session.board[Word.HELD] == 0
+    session.assert_safe()
+
+
+@pytest.mark.parametrize(("bits", "held"), [(None, False), (0, True)])
+def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_signs_of_life(
+    make_session, monkeypatch, bits, held
+):
+    """A drive on a line takes a host that is silent for 5 s for dead, the torque being on."""
+    monkeypatch.setattr("rigd.engine._session_sequence.SIGN_OF_LIFE_S", 0.1)
+    session = make_session()
+    session.drive.health = lambda: LineHealth(bits)
+    spec = put_reference(shared_memory_fd(), np.zeros(2000), 300)
+    writer = PieceWriter(spec, session.board)
+
+    def plan():
+        writer.append(np.zeros(100))
+        session.board[Word.LAST_PIECE] = 1
+
+    planner = threading.Timer(1.0, plan)
+    planner.start()
+    session.obey(SessionJob(session.profile, spec))
+    planner.join()
+    ticks_held = session.board[Word.HELD]
+    assert (ticks_held > 0) == held
+    assert ticks_held < 12
+    assert session.finished.outcome == "complete"
+    assert session.finished.counts["scheduled"] == len(session.samples) == 400 + ticks_held
     session.assert_safe()
 
 
