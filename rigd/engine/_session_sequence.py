@@ -149,6 +149,9 @@ class SessionSequence:
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
         self._relative_reference = reference_rad
+        # Of one that grows, each piece is planned with the start angle.
+        planned_rad = np.asarray(reference_rad)
+        self._farthest_rad = float(planned_rad.min()), float(planned_rad.max())
         self._ending = ending
         self._return_path = _return_path(profile, ending)
         self._end_angle_rad = 0.0
@@ -170,7 +173,8 @@ class SessionSequence:
         Raises
         ------
         SessionEnd
-            If the rig does not come to rest in time, or stands outside the limits.
+            If the rig does not come to rest in time, or stands where the record would leave the
+            limits.
         """
         self._cycle.watch.reset(0.0)  # what the last session left counts no more
         rest = self._wait_for_rest()
@@ -181,6 +185,15 @@ class SessionSequence:
                 "fault",
                 f"The motor is at {self._start_angle_rad:.4g} rad, outside "
                 f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
+            )
+        goal_rad = max((self._start_angle_rad + part for part in self._farthest_rad), key=abs)
+        if abs(goal_rad) > limit_rad:
+            raise SessionEnd(
+                "fault",
+                f"The motor is at {self._start_angle_rad:.4g} rad, from where the reference goes "
+                f"to {goal_rad:.4g} rad, outside limits.angle_rad = {limit_rad:g} rad. Move it "
+                "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
+                "amplitude.",
             )
         self._rest_spread_nm = rest.torque_spread_nm
         self._compare_with_tare_before(float(rest.torques_nm.mean()))

@@ -134,7 +134,9 @@ class Case:
 
 CASES = {
     "angle": Case(
-        lambda s: limit(s, angle_rad=0.01), r"Angle -?0\.01\d* rad exceeds limit 0\.01 rad"
+        # Beyond what the reference asks for, at which the session would not begin.
+        lambda s: (limit(s, angle_rad=0.03), sensor(s, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.5])),
+        r"Angle -?0\.03\d* rad exceeds limit 0\.03 rad",
     ),
     "velocity": Case(
         lambda s: limit(s, velocity_rad_s=0.3),

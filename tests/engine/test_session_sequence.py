@@ -294,6 +294,23 @@ def test_it_refuses_to_start_while_the_motor_moves(make_session):
     assert "not at rest" in session.finished.reason
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_it_refuses_to_start_where_the_reference_would_leave_the_limit(make_session, sign):
+    """As after a move: it was planned from the rig's zero, and nothing moves before it is known."""
+    session = make_session()
+    session.drive.fault_at = 1
+    session.drive.fault = lambda angle: angle + sign * 1.56
+    session.run()
+    session.assert_safe()
+    assert session.drive.torques == []
+    assert session.finished.outcome == "fault"
+    assert session.finished.counts == books()
+    goal = f"{sign * 1.585:g} rad, outside limits.angle_rad = 1.57 rad"
+    assert f"The motor is at {sign * 1.56:g} rad" in session.finished.reason
+    assert goal in session.finished.reason
+    assert "rigd run move 0" in session.finished.reason
+
+
 class LateAt(VirtualClock):
     """A clock that wakes late at some of its deadlines."""
 
