@@ -56,6 +56,8 @@ _UNSURE = 0.01
 _FILTERS = 1.2
 """Acceleration of a move's reference over what the peak torque does to the motor alone: some more,
 for the loop follows it through its filters."""
+_GOING = ("move", "touch")
+"""Excitations that go to an angle: they know where they start, and have no amplitude."""
 _SETTLED = 5.0
 """Time constants of the loop in which it follows up a reference."""
 
@@ -314,18 +316,25 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
     )
     refusals: list[str] = []
     if firm or (forcible and not force):
-        largest_rad = largest_amplitude(profile, excitation, force=force)
-        lower = "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
+        lower = _remedy(profile, excitation, force=force)
         refusals = [f"{finding}; {lower}." for finding in firm]
         refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
     clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
     return Plan(
         prediction,
         warnings=tuple(([unstable] if unstable else []) + ([] if refusals else clipped)),
-        tip_in_words=_tip_in_words(prediction, profile.rig.beam),
+        tip_in_words=_tip_in_words(prediction, profile.rig.beam, excitation.kind),
         refused="\n".join(refusals),
         ending=_ending(loop, stays=excitation.stays),
     )
+
+
+def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
+    """Say what of an excitation is to be changed where it would leave the limits."""
+    if excitation.kind in _GOING:
+        return "go less far or slower"
+    largest_rad = largest_amplitude(profile, excitation, force=force)
+    return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
 def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
@@ -498,9 +507,8 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     if model.beam is not None:
         tip = tip_motion(model.beam, model.damping, response.angle_rad, model.rate_hz)
     peaks = _peaks(excitation.reference_rad, response, tip)
-    if excitation.kind not in ("move", "touch"):
+    if excitation.kind not in _GOING:
         return peaks
-    # These know where they start.
     start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
     return replace(peaks, peak_angle_rad=_peak(start_rad + response.angle_rad))
 
@@ -539,7 +547,7 @@ def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str
     return metadata
 
 
-def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
+def _tip_in_words(predicted: Prediction, beam: Beam, kind: str) -> str:
     tip = predicted.tip
     if tip is None:
         return ""
@@ -551,7 +559,8 @@ def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
     if not tip.slope_rad > SMALL_SLOPE_RAD:
         return motion
     lower = math.floor(100 * SMALL_SLOPE_RAD / tip.slope_rad) / 100
-    within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
+    scales = lower > 0 and kind not in _GOING
+    within = f"; {lower:g} times the amplitude stays within" if scales else ""
     return (
         f"{motion} At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error "
         f"up to {100 * tip.slope_rad**2 / 3:.2g} %), and air drag may limit the motion{within}."

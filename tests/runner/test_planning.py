@@ -11,6 +11,7 @@ from rigd.excitation import chirp, from_csv, hold, multisine, step
 from rigd.runner._console import plan_lines
 from rigd.runner._planning import (
     RefusedError,
+    excitation_for,
     largest_amplitude,
     plan_document,
     plan_session,
@@ -102,6 +103,16 @@ def test_what_has_no_amplitude_has_no_largest(profile, tmp_path):
     assert "lower the amplitude.\n" in predict_session(profile, far).refused
     for excitation in (far, hold(rate_hz=1000.0, duration_s=1.0)):
         assert largest_amplitude(profile, excitation) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [("touch", {"angle_rad": 0.6, "speed_rad_s": 30.0}), ("move", {"angle_rad": 1.5})],
+)
+def test_what_goes_to_an_angle_is_told_of_no_amplitude(profile, kind, parameters):
+    plan = predict_session(profile, excitation_for(profile, kind, parameters))
+    assert "At slopes above" in plan.tip_in_words
+    assert "amplitude" not in plan.tip_in_words
 
 
 @pytest.mark.parametrize(
