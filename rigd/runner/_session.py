@@ -303,6 +303,7 @@ class Session:
         realtime = None if self._virtual else profile.realtime
         if order.touch is not None:
             self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
+            self._touches.await_ready(self._reports)
         if search is not None or order.watch_fit:
             self._fit = OnlineFit(group, profile, reference, search, realtime)
             lost = self._fit.await_ready(self._reports)

@@ -141,6 +141,7 @@ class TouchEstimates:
         self._events: list[Event] = []
         self._news: list[dict[str, Any]] = []
         self._lost = ""
+        self._ready = False
         self._told: dict[int, TouchTold] = {}
         job = TouchJob(
             group.channels.specs,
@@ -152,10 +153,22 @@ class TouchEstimates:
         )
         try:
             group.fresh(TOUCH).start(job)
-            if not isinstance(group[TOUCH].poll(_READY_PATIENCE_S), TouchReady):
-                self._lose(f"The touch process was not ready within {_READY_PATIENCE_S:g} s.")
         except ChildError as error:
             self._lose(str(error))
+
+    def await_ready(self, meanwhile: Callable[[], bool]) -> None:
+        """Wait until the process can estimate, or is lost.
+
+        Parameters
+        ----------
+        meanwhile
+            Called some times a second; says whether to go on waiting.
+        """
+        deadline_s = time.monotonic() + _READY_PATIENCE_S
+        while not (self._ready or self._lost) and meanwhile():
+            self._listen(_POLL_S)
+            if not self._ready and time.monotonic() > deadline_s:
+                self._lose(f"The touch process was not ready within {_READY_PATIENCE_S:g} s.")
 
     def attend(self) -> list[Event]:
         """Take what has come, and return what the operator is to be told."""
@@ -205,7 +218,9 @@ class TouchEstimates:
             return
         try:
             for message in self._group[TOUCH].messages(patience_s):
-                if isinstance(message, TouchTold):
+                if isinstance(message, TouchReady):
+                    self._ready = True
+                elif isinstance(message, TouchTold):
                     self._told[message.number] = message
                     self._note(message)
         except ChildError as error:

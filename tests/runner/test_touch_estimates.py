@@ -1,0 +1,49 @@
+"""Estimates of touches: what a session does while the touch process prepares."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from rigd.engine import TouchReady
+from rigd.runner._touch_search import TouchEstimates
+
+
+class Group(dict):
+    """Processes, of which any is the same one."""
+
+    def __init__(self, messages):
+        self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written=0))
+        self.child = SimpleNamespace(start=lambda _: None, messages=messages)
+
+    def fresh(self, _):
+        return self.child
+
+    def __getitem__(self, _):
+        return self.child
+
+
+def estimates(messages):
+    order = SimpleNamespace(shear_projection=None)
+    return TouchEstimates(Group(messages), SimpleNamespace(order=order, model=None), 1000.0)
+
+
+def test_a_stop_does_not_wait_for_a_process_that_prepares():
+    begun_s = time.monotonic()
+    waits = iter([True, False])
+    touches = estimates(lambda _: [])
+    touches.await_ready(lambda: next(waits))
+    assert time.monotonic() - begun_s < 2.0
+    assert touches.attend() == []
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
+)
+def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
+    monkeypatch.setattr("rigd.runner._touch_search._READY_PATIENCE_S", 0.0)
+    touches = estimates(lambda _: messages)
+    touches.await_ready(lambda: True)
+    told = [event.message for event in touches.attend()]
+    assert len(told) == len(words)
+    assert all(each in text for each, text in zip(words, told, strict=True))
