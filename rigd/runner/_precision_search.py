@@ -305,9 +305,11 @@ class Search:
     ) -> Iterator[object]:
         """Append a piece, or a pause where what is planned is expected to suffice."""
         reference_rad = self._reference_rad(held)
-        left_s = (self._most_ticks - reference_rad.size) / self._rate_hz
+        # Less than nothing where the angle was held for long before the last piece.
+        left_ticks = self._most_ticks - reference_rad.size
+        left_s = left_ticks / self._rate_hz
         if left_s < SHORTEST_S + PAUSE_S:
-            if self.may_be_last:
+            if self.may_be_last or left_ticks <= 0:
                 yield self._end(self._too_long, reached=False)
             else:
                 self._pause(min(PAUSE_S, left_s))

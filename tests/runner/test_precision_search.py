@@ -223,6 +223,21 @@ def test_the_time_that_is_allowed_is_kept(profile, quick_pieces):
     assert "--at-most" in ends[0].reason
 
 
+@pytest.mark.parametrize("over_ticks", [-1, 0, 700])
+def test_a_decision_that_took_long_may_leave_no_time(profile, quick_pieces, over_ticks):
+    """The angle was held before the last piece, so that it ends with the record, or after it."""
+    bench = Bench(profile, "damping 0.01%", at_most_s=12.0)
+    bench.told(ON_THE_WAY)
+    held = 12 * RATE_HZ - bench.writer.ticks + over_ticks
+    told = bench.told(ON_THE_WAY, held=held)
+    if over_ticks < 0:
+        assert bench.search.may_be_last
+        assert bench.writer.ticks + held == 12 * RATE_HZ
+    else:
+        assert isinstance(told[-1], SearchEnded)
+        assert told[-1].reason == "Not reached within 12 s (--at-most)."
+
+
 def test_what_goes_too_slowly_is_out_of_reach(profile, quick_pieces):
     """The information grows by so little that an hour would not do: it is said, with a remedy."""
     bench = Bench(profile, "damping 0.1%", at_most_s=60.0)
