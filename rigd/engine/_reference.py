@@ -123,6 +123,9 @@ class PieceWriter:
 class PieceReader:
     """Follows a reference that grows, tick by tick; holds the last angle while there is no more.
 
+    A piece that would not end with the record or before is not begun: the motor would have to stop
+    at full swing.
+
     Parameters
     ----------
     reference_rad
@@ -131,7 +134,8 @@ class PieceReader:
         Ticks that are there from the start.
     board
         `Word.PLANNED` announces what is there, `Word.LAST_PIECE` that nothing more comes; the ticks
-        in which the angle was held go into `Word.HELD`.
+        in which the angle was held go into `Word.HELD`, those before the piece that was begun last
+        into `Word.HELD_BEFORE`, and where that ends into `Word.BEGUN`.
 
     """
 
@@ -143,13 +147,19 @@ class PieceReader:
         self._announced = board.word(Word.PLANNED)
         self._last_piece = board.word(Word.LAST_PIECE)
         self._held_word = board.word(Word.HELD)
+        self._before_word = board.word(Word.HELD_BEFORE)
+        self._begun_word = board.word(Word.BEGUN)
         self._held = 0
 
     def at(self, tick: int) -> float:
         """Return the reference of a tick, later than that of the last call."""
         place = tick - self._held
         if place >= self._planned:
-            self._planned = max(self._planned, self._announced[0])
+            announced = self._announced[0]
+            if self._planned < announced <= len(self._reference_rad) - self._held:
+                self._planned = announced
+                self._before_word[0] = self._held
+                self._begun_word[0] = announced
             if place >= self._planned:
                 # From the next tick on it follows what is appended by then, from its beginning.
                 self._held += place + 1 - self._planned

@@ -107,6 +107,10 @@ class Word(IntEnum):
     """Touches detected in the record."""
     HELD = 25
     """Ticks of the record in which the angle was held because there was no next piece."""
+    HELD_BEFORE = 29
+    """Those of them before the piece that was begun last."""
+    BEGUN = 30
+    """Ticks of the reference up to the end of that piece; 0: none was begun."""
     # Written by the touch process
     TOUCH_BEAT = 24
     # Written by the fit process

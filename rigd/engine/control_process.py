@@ -263,6 +263,8 @@ class _ControlServer:
             Word.STALE_WRENCHES,
             Word.TOUCHES,
             Word.HELD,
+            Word.HELD_BEFORE,
+            Word.BEGUN,
         ):
             board[word] = 0
         self._warn_of_refusals(job)

@@ -239,7 +239,9 @@ class Search:
         self.due: int | None = first + scan_rad.size
         self.may_be_last = False
 
-    def answered(self, document: Mapping[str, Any], held: int) -> Iterator[object]:
+    def answered(
+        self, document: Mapping[str, Any], held: int, held_before: int
+    ) -> Iterator[object]:
         """Decide by an estimate; yields what the supervisor is to be told.
 
         Parameters
@@ -248,9 +250,11 @@ class Search:
             Answer of the fit program to the samples before `due`.
         held
             Ticks of the record in which the angle was held because there was no piece.
+        held_before
+            Those of them before the piece that was begun last.
         """
         last = self._stretches[-1]
-        last.begins = last.place + held
+        last.begins = last.place + held_before
         if document["problem"] or "plant" not in document:
             problem = document["problem"] or "Nothing could be fitted."
             if self._columns:
@@ -292,8 +296,33 @@ class Search:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
 
-    def ended(self, ticks: int) -> SearchEnded:
-        """Return what there is of a search whose record has ended after so many ticks."""
+    def is_begun(self, begun: int) -> bool:
+        """Whether what was planned last is being played: only then is it known from which tick on.
+
+        Parameters
+        ----------
+        begun
+            Ticks of the reference up to the end of the piece that was begun last.
+        """
+        return len(self._stretches) == 1 or begun > self._stretches[-1].place
+
+    def ended(self, ticks: int, held_before: int, begun: int) -> SearchEnded:
+        """Return what there is of a search whose record has ended after so many ticks.
+
+        Parameters
+        ----------
+        ticks
+            Ticks of the record.
+        held_before
+            As for `answered`.
+        begun
+            As for `is_begun`.
+        """
+        if self.is_begun(begun):
+            last = self._stretches[-1]
+            last.begins = last.place + held_before
+        else:
+            self._stretches.pop()
         return self._end(self._too_long if ticks >= self._most_ticks else "", reached=False)
 
     @property

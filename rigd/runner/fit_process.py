@@ -13,6 +13,7 @@ import queue
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from typing import Any, BinaryIO, Final, Self, cast
 
 from rigd.engine import (
@@ -26,6 +27,7 @@ from rigd.engine import (
     Parent,
     PieceWriter,
     RecordEnded,
+    SearchEnded,
     Word,
     attach_channels,
     keep_off_loop,
@@ -176,7 +178,7 @@ class _Follower:
                 case RecordEnded(ticks):
                     self._ended_after = ticks
                     if self._search is not None and self._search.due is not None:
-                        self._parent.send(self._search.ended(ticks))
+                        self._parent.send(self._ended(ticks, self._search))
 
     def _begin(self, header: FileHeader) -> None:
         """Begin with what the file says of the session."""
@@ -206,11 +208,21 @@ class _Follower:
         if self._ended_after is not None:
             if drained:
                 self._request(self._ended_after, whole=True)
-        elif search is not None and search.due is not None:
+        elif (
+            search is not None
+            and search.due is not None
+            and search.is_begun(self._board[Word.BEGUN])
+        ):
             # Read after the samples: the loop counts what it holds before it gives the sample.
             tick = search.due + self._board[Word.HELD]
             if self._ticks >= tick:
                 self._request(tick, whole=search.may_be_last)
+
+    def _decided(self, answer: dict[str, Any], search: Search) -> Iterator[object]:
+        return search.answered(answer, self._board[Word.HELD], self._board[Word.HELD_BEFORE])
+
+    def _ended(self, ticks: int, search: Search) -> SearchEnded:
+        return search.ended(ticks, self._board[Word.HELD_BEFORE], self._board[Word.BEGUN])
 
     def _request(self, tick: int, *, whole: bool) -> None:
         self._number += 1
@@ -226,7 +238,7 @@ class _Follower:
             self._asked = None
         if search is not None and not final:
             if self._ended_after is None:
-                for message in search.answered(answer, self._board[Word.HELD]):
+                for message in self._decided(answer, search):
                     self._parent.send(message)
             return False
         answer["text"] = estimate_lines(answer, self._before)

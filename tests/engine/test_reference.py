@@ -61,6 +61,30 @@ def test_the_last_angle_is_held_until_the_next_piece():
     assert board[Word.HELD] == 4
 
 
+def test_it_is_told_before_which_piece_the_angle_was_held():
+    writer, reader, board = growing()
+    before = []
+    for tick in range(12):
+        if tick in (2, 6):
+            writer.append(np.array([10.0, 11.0]))
+        reader.at(tick)
+        before.append(board[Word.HELD_BEFORE])
+    assert before == [0] * 6 + [1] * 6  # the first piece at tick 3, the second at tick 6
+    assert board[Word.BEGUN] == 7
+    assert board[Word.HELD] == 5
+
+
+@pytest.mark.parametrize(("room", "played"), [(4, [10, 11]), (3, [3])])
+def test_a_piece_that_would_not_end_with_the_record_is_not_begun(room, played):
+    """The motor would have to stop at full swing."""
+    writer, reader, board = growing(room=room)
+    assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
+    writer.append(np.array([10.0, 11.0]))
+    assert not reader.waits(5)
+    assert [reader.at(tick) for tick in range(5, 3 + room)] == played
+    assert board[Word.BEGUN] == (5 if len(played) > 1 else 0)
+
+
 def test_missed_ticks_are_played_by_as_in_a_given_reference():
     writer, reader, board = growing()
     writer.append(np.array([10.0, 11.0, 12.0]))

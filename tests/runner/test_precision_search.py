@@ -93,12 +93,12 @@ class Bench:
         self.writer = PieceWriter(spec, self.board)
         self.search = Search(excitation.search, profile, self.writer)
 
-    def told(self, share, held=0, **more):
+    def told(self, share, held=0, before=None, **more):
         document = answer(self.profile, self.search.due + held, share, **more)
-        return list(self.search.answered(document, held))
+        return list(self.search.answered(document, held, held if before is None else before))
 
     def problem(self, text="Nothing is excited yet."):
-        return list(self.search.answered({"tick": self.search.due, "problem": text}, 0))
+        return list(self.search.answered({"tick": self.search.due, "problem": text}, 0, 0))
 
 
 def designed_at_once(monkeypatch, std):
@@ -190,11 +190,33 @@ def test_a_record_that_stays_doubtful_is_given_up_with_its_findings(bench):
 def test_ticks_that_were_held_shift_what_follows(bench):
     bench.told(ON_THE_WAY)
     bench.told(ON_THE_WAY, held=300)
-    end = bench.search.ended(9000)
+    end = bench.search.ended(9000, 300, bench.writer.ticks)
     first, last = end.segments["piece_1"]
     assert first == 6800
     assert last > first
     assert not end.reached
+
+
+def test_ticks_that_were_held_after_a_piece_do_not_shift_it(bench):
+    """As where a decision takes longer than what is planned: the scan was played at once."""
+    bench.told(ON_THE_WAY, held=1200, before=0)
+    bench.told(ON_THE_WAY, held=2000, before=1700)
+    segments = bench.search.ended(14000, 2050, bench.writer.ticks).segments
+    assert segments["scan"] == (1000, 6000)
+    assert segments["sweep"][0] == 1000
+    first, end = segments["piece_1"]
+    assert first == 6500 + 1700
+    assert segments["piece_2"][0] == end - 1700 + 2050
+
+
+def test_a_piece_that_was_not_begun_is_no_segment(bench):
+    assert bench.search.is_begun(0)
+    bench.told(ON_THE_WAY)
+    place = bench.search.due
+    assert bench.search.is_begun(bench.writer.ticks)
+    assert not bench.search.is_begun(0)
+    segments = bench.search.ended(place + 400, 0, 0).segments
+    assert segments.keys() == {"scan", "sweep"}
 
 
 def test_a_scan_that_told_nothing_is_repeated_and_then_given_up(bench):
@@ -257,7 +279,7 @@ def test_damping_that_is_absent_cannot_be_told(profile):
         document["plant"]["damping"] |= {"zeta": 0.0}
         document["covariance"]["names"].remove("zeta")
         document["parameters"] = {}
-        found = bench.search.answered(document, 0)
+        found = bench.search.answered(document, 0, 0)
         ends = [m for m in found if isinstance(m, SearchEnded)]
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
@@ -297,7 +319,7 @@ def test_rivals_that_are_left_after_a_pause_are_told_apart_by_scans(profile, qui
             bench.told(CERTAIN)
         document = answer(profile, bench.search.due, CERTAIN)
         document["modes"][1]["damping_ratio"]["flag"] = "another beam fits as well"
-        told = list(bench.search.answered(document, 0))
+        told = list(bench.search.answered(document, 0, 0))
         assert not any(isinstance(m, SearchEnded) for m in told)
         names += [m.name for m in told if isinstance(m, PieceTold)]
     assert names.count("a scan between the modes as well") == 3
