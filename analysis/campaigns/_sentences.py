@@ -8,7 +8,7 @@ import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
 from analysis.models import QUANTITIES, STRUCTURES
-from analysis.statistics import NORMAL_95
+from analysis.statistics import student_t_quantile
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -308,7 +308,8 @@ def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
     """Say how the modes are damped; of a mixture, that it is one."""
     if not best.modes:
         return []
-    said = "; ".join(map(_mode, best.modes))
+    t = student_t_quantile(0.95, best.sessions - 1)
+    said = "; ".join(_mode(each, t) for each in best.modes)
     of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {said} (± 95 % of the mean over {of})."]
 
@@ -433,8 +434,8 @@ def _damping(structure: str) -> str:
     return " and ".join(kinds)
 
 
-def _mode(mode: PooledMode) -> str:
-    half = NORMAL_95 * 100 * mode.damping_ratio_std
+def _mode(mode: PooledMode, t: float) -> str:
+    half = t * 100 * mode.damping_ratio_std
     digits = decimals(max(half, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "

@@ -12,6 +12,7 @@ from analysis.campaigns._orders import freest_estimate, pooled_order
 from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict, common_findings
 from analysis.identify import Finding
+from analysis.statistics import student_t_quantile
 
 ALIKE = Homogeneity((), ())
 
@@ -46,6 +47,15 @@ def estimates_of(make_estimate):
 
 def ranked(*groups):
     return sorted(map(pooled, groups), key=lambda each: each.bic)
+
+
+def test_the_modes_have_student_s_interval_as_the_figure_of_them(estimates_of):
+    """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
+    found = pooled(estimates_of("VI", 100.0))
+    std = found.modes[0].damping_ratio_std
+    (said_of,) = sentences.modes(found, mixed=False)
+    half = float(said_of.split("± ")[1].split(" %")[0]) / 100
+    assert half == pytest.approx(student_t_quantile(0.95, 3) * std, rel=0.05)
 
 
 def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_of):
