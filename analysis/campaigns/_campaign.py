@@ -236,10 +236,13 @@ def _of_one_experiment(
     results = _labelled(results)
     usable = [result for result in results if isinstance(result, SessionResult)]
     common = usable[most_common([session.experiment for session in usable])]
+    stated = [result.experiment for result in results if result.experiment]
+    alike = sum(common.experiment.difference(each) is None for each in stated)
+    as_in = ", as in most" if 2 * alike > len(stated) else ""
     sessions: list[SessionResult] = []
     failures: list[SessionFailure] = []
     for result in results:
-        reason = _reason_against(result, common, sessions)
+        reason = _reason_against(result, common, as_in, sessions)
         if reason is None and isinstance(result, SessionResult):
             sessions.append(result)
         elif reason is None and isinstance(result, SessionFailure):
@@ -284,14 +287,20 @@ def _labelled(
 
 
 def _reason_against(
-    result: SessionResult | SessionFailure, common: SessionResult, before: Sequence[SessionResult]
+    result: SessionResult | SessionFailure,
+    common: SessionResult,
+    as_in: str,
+    before: Sequence[SessionResult],
 ) -> str | None:
-    """Say why a session does not belong to those it came with, None if nothing speaks against."""
+    """Say why a session does not belong to those it came with, None if nothing speaks against.
+
+    `as_in` says of the common one whether it stands for most.
+    """
     experiment = result.experiment
     difference = experiment and common.experiment.difference(experiment)
     if difference:
         return (
-            f"{difference} in {common.path}, as in most; a campaign repeats one experiment on one "
+            f"{difference} in {common.path}{as_in}; a campaign repeats one experiment on one "
             "specimen: analyse this one by itself, or correct the metadata."
         )
     if isinstance(result, SessionFailure):

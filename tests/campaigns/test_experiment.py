@@ -108,3 +108,11 @@ def test_a_session_without_a_label_is_of_the_only_labelled_specimen_or_of_none(c
     kept, left_out = _of_one_experiment([chirps(bare), one, two, other])
     assert [each.path.name for each in kept] == ["1.mcap", "2.mcap"]
     assert any("specimen is not stated, but “A”" in each.message for each in left_out)
+
+
+def test_as_in_most_is_said_of_a_majority_only(chirps):
+    first, odd, third = chirps("0.mcap"), chirps("1.mcap", excitation="step"), chirps("2.mcap")
+    (failure,) = _of_one_experiment([first, odd])[1]
+    assert "excitation is step, but chirp in 0.mcap; a campaign" in failure.message
+    (failure,) = _of_one_experiment([first, odd, third])[1]
+    assert "excitation is step, but chirp in 0.mcap, as in most; a campaign" in failure.message
