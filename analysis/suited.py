@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.models import LARGEST_SHARE_OF_RATE, PAPER_BAND_HZ, RECORD_BAND_HZ
+from analysis.models import (
+    LARGEST_SHARE_OF_RATE,
+    PAPER_BAND_HZ,
+    RECORD_BAND_HZ,
+    WelchSettings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
 
@@ -18,11 +22,18 @@ Band = tuple[float, float]
 
 _NO_SWEEP: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
+    "move": "a move excites all frequencies at one moment, which averaging over segments loses",
+    "touch": "a touch excites little, and a beam that meets something responds as another one",
     "multisine": "a multisine excites single lines, and segments spread noise between them",
     "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
     "until": "a search excites little beside the modes, and the response between them is noise",
 }
 """Excitation → why Welch's method does not suit it."""
+
+_TOUCH: Final = (
+    "The session is a touch, but the fits take the beam to be free: they hold only if it met "
+    "nothing. analyze touch finds where, when and how hard it did."
+)
 
 _WHOLE: Final = 0.99
 """Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
@@ -97,10 +108,12 @@ def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
     asked_hz : tuple of float, optional
         Band that was asked for, in Hz.
     """
+    said = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
     _, last_hz = record_band_hz(record, asked_hz)
     if asked_hz is not None or last_hz == RECORD_BAND_HZ[1]:
-        return ()
+        return said
     return (
+        *said,
         f"Fits end at {last_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the record's rate of "
         f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
     )
@@ -164,7 +177,10 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
     """
     kind = record.metadata.get("excitation", "")
     if kind in _NO_SWEEP:
-        return f"{_NO_SWEEP[kind]} (--method welch makes them nevertheless)"
+        usual = WelchSettings().segmentation(record.rate_hz)
+        fits = record.sweep_samples >= usual.segment_length
+        option = "--method welch" if fits else "--method welch --frf fft"
+        return f"{_NO_SWEEP[kind]} ({option} makes them nevertheless)"
     planned_s = _number(record, "duration_s")
     swept_s = record.sweep_samples / record.rate_hz
     if asked_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:

@@ -66,7 +66,7 @@ def test_a_band_asked_for_is_of_all_fits(record_of):
     assert welch_settings(record_of(10), own).band_hz == (1.0, 60.0)
 
 
-@pytest.mark.parametrize("kind", ["step", "multisine", "modes"])
+@pytest.mark.parametrize("kind", ["step", "multisine", "modes", "move", "touch"])
 def test_welch_s_method_is_for_sweeps(record_of, kind):
     record = record_of(excitation=kind, duration_s="4.0")
     assert kind in f"{against_welch(record)} modes"
@@ -75,6 +75,24 @@ def test_welch_s_method_is_for_sweeps(record_of, kind):
     assert left_out.startswith("Welch fits left out: ")
     chosen = WelchSettings(segment_length=1000, types=("I",), weightings=("const",))
     assert welch_analysis(record, chosen, optional=True)[0] is not None
+
+
+def test_an_option_that_is_said_to_make_the_fits_makes_them(record_of):
+    """Of 4 s the usual segments are too long, and only an estimator without them is left."""
+    record = record_of(excitation="step")
+    assert "(--method welch --frf fft makes them nevertheless)" in against_welch(record)
+    with pytest.raises(EstimateError):
+        welch_analysis(record, WelchSettings(), optional=False)
+    chosen = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
+    assert welch_analysis(record, chosen, optional=False)[0] is not None
+    longer = replace(record, sweep=slice(0, 17266))
+    assert "(--method welch makes them nevertheless)" in against_welch(longer)
+
+
+def test_of_a_touch_it_is_said_that_the_fits_take_the_beam_to_be_free(record_of):
+    (said,) = remarks(record_of(excitation="touch"))
+    assert "analyze touch finds where" in said
+    assert remarks(record_of(excitation="chirp")) == ()
 
 
 def test_a_stopped_sweep_is_not_fitted_beyond_where_it_went(record_of):
