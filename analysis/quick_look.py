@@ -337,7 +337,9 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  doubtful: {doubt}" for doubt in doubts)
     unseen = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
     if unseen:
-        yield f"  not visible in this record: mode {' and '.join(unseen)}"
+        *others, last = unseen
+        named = f"modes {', '.join(others)} and {last}" if others else f"mode {last}"
+        yield f"  not visible in this record: {named}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])

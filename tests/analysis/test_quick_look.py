@@ -104,6 +104,17 @@ def look_with(*hz, **others):
     return common | {"file": "before.mcap", "modes": modes} | others
 
 
+@pytest.mark.parametrize(
+    ("unseen", "words"), [(1, "mode 1"), (2, "modes 1 and 2"), (3, "modes 1, 2 and 3")]
+)
+def test_modes_that_do_not_show_are_listed_in_english(unseen, words):
+    look = look_with(2.5, 16.0, 44.0, session_id="now", flags=[], against_last=None)
+    look["coherence"] = quick_look._no_coherence()
+    for mode in look["modes"][:unseen]:
+        mode["shown"] = False
+    assert f"  not visible in this record: {words}" in quick_look._text(look)
+
+
 def test_a_change_counts_from_three_standard_deviations_on():
     before = look_with(2.5, 16.0, 44.0)
     now = look_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
