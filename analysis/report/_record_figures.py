@@ -13,6 +13,7 @@ what the model lacks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -40,6 +41,12 @@ if TYPE_CHECKING:
     from rigd.spectral import FrequencyResponse
 
 
+_LABEL_IN: Final = 0.15
+"""Height of a label with the space that it needs."""
+_LABELS_CLOSE: Final = 1 / math.log10(2.0)
+"""Labels for which a decade must have room if 1, 2 and 5 are to stand apart in it."""
+
+
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
     """Make the vertical axis logarithmic from `low` to `high`, with as many labels as fit."""
     axes.set_yscale("log")
@@ -47,7 +54,9 @@ def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
     if high < 5 * low:
         axes.yaxis.set_major_locator(MaxNLocator(4))
     else:
-        digits = (1.0, 2.0, 5.0) if high < 1000 * low else (1.0,)
+        height_in = axes.bbox.height / axes.figure.dpi
+        room = height_in / (_LABEL_IN * math.log10(high / low))
+        digits = (1.0, 2.0, 5.0) if high < 1000 * low and room > _LABELS_CLOSE else (1.0,)
         axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=12))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())

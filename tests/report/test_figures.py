@@ -1,6 +1,7 @@
 """Each figure as pixels: it is there, filled, in the colours that carry its meaning."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from analysis.record import load_record
 from analysis.report import _style as style
 from analysis.report._folder import OutputExistsError
 from analysis.report._frf_figure import frf_figure
+from analysis.report._record_figures import plain_logarithmic
 from analysis.report._signal_figures import best_model, torque_figure
 from analysis.report._signal_figures import paper_signals_figure as signals_figure
 
@@ -174,3 +176,25 @@ def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
     with style.styled(), pytest.raises(OutputExistsError):
         style.save(style.new_figure(4, 3, "a", "b"), target)
     assert target.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("span", [8.0, 150.0, 900.0, 1e4])
+@pytest.mark.parametrize("height_in", [0.5, 3.0])
+def test_labels_of_a_logarithmic_axis_stand_apart(span, height_in):
+    """The width of a band is drawn in half an inch, where 1, 2 and 5 of two decades overlap."""
+    with style.styled():
+        figure = style.new_figure(8.0, 4.0)
+        axes = figure.add_axes((0.1, 0.1, 0.8, height_in / 4.0))
+        plain_logarithmic(axes, 0.3, 0.3 * span)
+        figure.canvas.draw()
+        low, high = axes.get_ylim()
+        boxes = sorted(
+            (
+                label.get_window_extent()
+                for value, label in zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+                if low <= value <= high
+            ),
+            key=lambda box: box.y0,
+        )
+    assert boxes
+    assert all(below.y1 <= above.y0 for below, above in pairwise(boxes))
