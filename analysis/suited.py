@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 Band = tuple[float, float]
 
+LEFT_OUT: Final = "Welch fits left out: "
+"""Begin of the sentence that says why there are none."""
+
 _NO_SWEEP: Final = {
     "step": "a step excites all frequencies at one moment, which averaging over segments loses",
     "move": "a move excites all frequencies at one moment, which averaging over segments loses",
@@ -163,7 +166,7 @@ def welch_analysis(
             if not optional or isinstance(error, SettingsError):
                 raise
             reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
-    return None, f"Welch fits left out: {reason}."
+    return None, f"{LEFT_OUT}{reason}."
 
 
 def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:

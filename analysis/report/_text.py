@@ -13,6 +13,7 @@ from rich.text import Text
 from analysis.identify import MISREAD
 from analysis.report import _record_tables as tables
 from analysis.report._table import MARK, estimate, terminal_table
+from analysis.suited import LEFT_OUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -54,6 +55,9 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         if whole is None:
             shown += spaced((tables.welch_fits_table(welch),))
         shown += _warnings(result)
+    else:
+        # Why Welch's fits are left out was told when they were.
+        shown += [each for each in _warnings(result) if LEFT_OUT not in each.plain]
     return Group(*shown)
 
 
@@ -90,7 +94,7 @@ def _bare(table: Table) -> Table:
     return replace(table, caption="", notes=notes)
 
 
-def _warnings(result: RecordResult) -> list[RenderableType]:
+def _warnings(result: RecordResult) -> list[Text]:
     return [Text(f"Warning: {warning}", style="yellow") for warning in result.warnings]
 
 

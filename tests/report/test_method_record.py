@@ -58,3 +58,16 @@ def test_the_band_is_the_whole_record_s(done):
     (record,) = done[2]["records"]
     assert record["band_hz"] == [1.0, 20.0]
     assert {mode["mode"] for mode in done[2]["modes"]} == {1, 2}
+
+
+def test_warnings_are_told_where_welch_s_fits_are_not_made(
+    write_session, make_signals, tmp_path, monkeypatch
+):
+    """They went to page and JSON alone."""
+    monkeypatch.chdir(tmp_path)
+    signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
+    write_session("a.mcap", signals, metadata={"excitation": "touch"})
+    for method in ("record", "all"):
+        result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method])
+        assert result.stdout.count("Warning: The session is a touch") == 1
+        assert result.output.count("Welch fits left out") == (method == "all")
