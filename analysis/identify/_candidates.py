@@ -67,9 +67,6 @@ _A_STEP: Final = 3
 _CROSS_CHECKS: Final = 3
 _NEARLY: Final = 1e-3
 
-_DOUBTFUL: Final = 0.01
-"""Probability of a residual's shape by chance, below which all modes are searched again."""
-
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
@@ -488,8 +485,7 @@ class CandidateSet:
     def all_but_white(self, fit: RecordFit) -> bool:
         """Whether chance may have shaped what a fit leaves, once in a hundred records at least."""
         counts = self.noise.counts
-        found = whiteness(fit.residual[counts], self.comparison.frequency_hz[counts])
-        return found.probability > _DOUBTFUL and not found.loud
+        return whiteness(fit.residual[counts], self.comparison.frequency_hz[counts]).all_but_white
 
 
 def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:

@@ -13,6 +13,7 @@ from analysis.identify._comparison import Comparison
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
 from analysis.identify._problem import Objective
+from analysis.identify._residual_tests import whiteness
 from analysis.identify._result import RecordAnalysis, RecordFit
 from analysis.identify._search import CoarseResponse, Descent, Search
 from analysis.identify._uncertainty import (
@@ -133,6 +134,8 @@ def fit_record(
         noise, descents = _under_its_noise(searches, closest, reference, descents)
         closest = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference = descents[closest]
+        if not _explains(reference, noise):
+            break  # what none of these explains is not told apart any better by them
         renewed = reference.renewed(noise, _BEFORE_LINES)
         if renewed is reference:
             break
@@ -173,6 +176,14 @@ def _under_its_noise(
             found = search.under(noise).to_minimum(noise, _TOLERANCE, (_PATIENCE, most))
         descents.append(found)
     return noise, descents
+
+
+def _explains(closest: Descent, noise: Noise) -> bool:
+    """Whether chance may have shaped what a structure leaves."""
+    objective, counts = closest.objective, noise.counts
+    residual = objective.project(objective.linearise(closest.x), noise.weight).residual
+    hz = objective.comparison.frequency_hz
+    return whiteness(residual[counts], hz[counts]).all_but_white
 
 
 def _still_behind(before: Descent, noise: Noise, most: float) -> Descent | None:

@@ -43,6 +43,9 @@ def largest_of(count: int) -> float:
 _LEVEL: Final = 1e-6
 """Probability of chance: what `SURE` means for the other tests."""
 
+_DOUBTFUL: Final = 0.01
+"""The same where a doubt is looked into, at the cost of time alone."""
+
 _WINDOWS: Final = (8, 32)
 _LOUD: Final = 1.4
 """Power over that of the noise, which is itself known to 10-20 % only."""
@@ -91,6 +94,11 @@ class Whiteness:
     def white(self) -> bool:
         """Whether nothing speaks against noise alone."""
         return self.probability > _LEVEL and not self.loud
+
+    @property
+    def all_but_white(self) -> bool:
+        """Whether chance may have shaped it, once in a hundred records at least."""
+        return self.probability > _DOUBTFUL and not self.loud
 
 
 @dataclass(frozen=True, slots=True)
