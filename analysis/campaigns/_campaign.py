@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.campaigns._experiment import CampaignError, labelled, most_common, stated_specimens
+from analysis.campaigns._experiment import (
+    CampaignError,
+    labelled,
+    most_common,
+    stated_specimens,
+    told_apart,
+)
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._orders import freest_estimate
 from analysis.campaigns._pooling import PooledEstimate, pooled_estimates
@@ -205,9 +211,15 @@ def campaign_result(
     lost : sequence of LostTrial, optional
         Sessions that were to be predicted and were not.
     """
+    names = told_apart([*(each.path for each in sessions), *(each.path for each in failures)])
+    sessions = [replace(each, name=name) for each, name in zip(sessions, names, strict=False)]
+    failures = [
+        replace(each, name=name)
+        for each, name in zip(failures, names[len(sessions) :], strict=True)
+    ]
     pooled = pooled_estimates(sessions)
-    usable = [(each.path, each.experiment) for each in sessions]
-    left_out = [(each.path, each.experiment) for each in failures]
+    usable = [(each.name, each.experiment) for each in sessions]
+    left_out = [(each.name, each.experiment) for each in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     alike = homogeneity(sessions, pooled, specimens)
     return CampaignResult(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rigd.session import added_metadata
@@ -12,7 +14,6 @@ from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
     from analysis.campaigns._session import SessionFailure
     from analysis.record import Record
@@ -161,6 +162,23 @@ class Experiment:
         )
 
 
+def told_apart(paths: Sequence[Path]) -> list[str]:
+    """Name files by as much of the end of each path as no other has.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    """
+    names = [path.name for path in paths]
+    for depth in range(2, max((len(path.parts) for path in paths), default=0) + 1):
+        often = Counter(names)
+        names = [
+            str(Path(*path.parts[-depth:])) if often[name] > 1 else name
+            for path, name in zip(paths, names, strict=True)
+        ]
+    return names
+
+
 @dataclass(frozen=True, slots=True)
 class StatedSpecimen:
     """One specimen, as files state it.
@@ -169,42 +187,42 @@ class StatedSpecimen:
     ----------
     facts : mapping of str to (str or float)
         Beam and tool inertia by the keys of the session files.
-    paths : tuple of Path
-        Files that state it, whether they can be used or not.
+    files : tuple of str
+        Names of the files that state it, whether they can be used or not.
     """
 
     facts: Mapping[str, str | float]
-    paths: tuple[Path, ...]
+    files: tuple[str, ...]
 
 
 def stated_specimens(
-    stated: Iterable[tuple[Path, Experiment | None]], of_campaign: Experiment
+    stated: Iterable[tuple[str, Experiment | None]], of_campaign: Experiment
 ) -> tuple[StatedSpecimen, ...]:
     """Group files by the specimen that they state; first that of the campaign, then as they come.
 
     Parameters
     ----------
-    stated : iterable of (Path, Experiment or None)
-        None of a file that could not be read.
+    stated : iterable of (str, Experiment or None)
+        Name of each file, with None of one that could not be read.
     of_campaign : Experiment
         Experiment of the sessions that are pooled.
     """
-    found: list[tuple[Experiment, list[Path]]] = [(of_campaign, [])]
-    for path, experiment in stated:
+    found: list[tuple[Experiment, list[str]]] = [(of_campaign, [])]
+    for file, experiment in stated:
         if experiment is None:
             continue
-        for specimen, paths in found:
+        for specimen, files in found:
             if specimen.same_specimen(experiment):
-                paths.append(path)
+                files.append(file)
                 break
         else:
-            found.append((experiment, [path]))
+            found.append((experiment, [file]))
     return tuple(
         StatedSpecimen(
             {key: specimen.facts[key] for key in _OF_SPECIMEN if key in specimen.facts},
-            tuple(paths),
+            tuple(files),
         )
-        for specimen, paths in found
+        for specimen, files in found
     )
 
 

@@ -164,7 +164,7 @@ def homogeneity(
     """
     name = common_structure(sessions, pooled)
     by_name = [
-        (session.path.name, each)
+        (session.name, each)
         for session in sessions
         for each in session.record_estimates
         if each.name == name
@@ -200,7 +200,7 @@ def _of_parameters(
     for parameter in shared.parameters:
         name = parameter.name
         values = (
-            (session.path.name, each.parameters[name], each.std[name] or 0.0)
+            (session.name, each.parameters[name], each.std[name] or 0.0)
             for session in sessions
             for each in session.record_estimates
             if each.name == shared.name and name in each.determined

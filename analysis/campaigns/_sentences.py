@@ -126,7 +126,7 @@ def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
     keys = in_dispute(found)
     each = "; ".join(
         f"{', '.join(f'{key} {told(key, one.facts[key])}' for key in keys if key in one.facts)} "
-        f"in {_files([path.name for path in one.paths])}"
+        f"in {_files(one.files)}"
         for one in found
     )
     first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)

@@ -47,6 +47,11 @@ class SessionFailure:
     """Why, a sentence for the operator."""
     experiment: Experiment | None = None
     """Specimen and rig, None if nothing is known of them."""
+    name: str = ""
+    """What tables call it: see `told_apart`; by itself the name of its file."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or self.path.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +86,8 @@ class SessionResult:
         As used.
     record_band_hz : tuple of float
         Band of the whole-record fits.
+    name : str
+        What tables and sentences call it: see `told_apart`; by itself the name of its file.
     """
 
     path: Path
@@ -98,6 +105,10 @@ class SessionResult:
     headline: Mapping[str, Any] | None = None
     settings: WelchSettings = _USUAL
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or self.path.name)
 
     def without_welch(self) -> SessionResult:
         """Leave out what is there by Welch's method."""

@@ -76,7 +76,7 @@ def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, .
     for session in judged:
         for finding in session.verdict.findings if session.verdict else ():
             kind = finding.kind, _FIGURE.sub("#", finding.sentence)
-            found.setdefault(kind, []).append((session.path.name, finding))
+            found.setdefault(kind, []).append((session.name, finding))
     counted = [_counted(group, len(judged)) for group in found.values()]
     return tuple(sorted(counted, key=lambda each: -len(each.files)))
 
@@ -239,5 +239,5 @@ def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[D
             own = min(by_name.values(), key=lambda each: each.bic)
             margin = by_name[best.name].bic - own.bic
             if margin > STRONG:
-                found.append(Dissent(session.path.name, own.name, margin))
+                found.append(Dissent(session.name, own.name, margin))
     return tuple(sorted(found, key=lambda each: -each.margin))

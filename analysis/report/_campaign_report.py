@@ -78,7 +78,7 @@ def campaign_tables(
     if verbose or with_paper or campaign.headline is None:
         parts += spaced(paper_tables(campaign, with_paper=with_paper))
     parts += [
-        Text(f"Warning: {session.path.name}: {warning}", style="yellow")
+        Text(f"Warning: {session.name}: {warning}", style="yellow")
         for session in campaign.sessions
         for warning in session.warnings
     ]
@@ -144,7 +144,7 @@ def _warnings(campaign: CampaignResult) -> list[str]:
             for each in campaign.lost_trials
         ),
         *(
-            f"{session.path.name}: {warning}"
+            f"{session.name}: {warning}"
             for session in campaign.sessions
             for warning in session.warnings
         ),

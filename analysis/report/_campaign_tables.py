@@ -94,7 +94,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         ),
         (
             (
-                Cell(str(each.path), each.path.name),
+                Cell(str(each.path), each.name),
                 said(its.start_utc if its else ""),
                 said(its.label if its else ""),
                 said(its.operator if its else ""),
@@ -247,7 +247,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         own = trial.own_error if trial else None
         found = [each.kind for each in verdict.findings] if verdict else []
         return (
-            session.path.name,
+            session.name,
             f"type {session.selected}" if session.selected else ABSENT,
             None if own is None else 100 * (1 - own),
             trial.error if trial else None,
@@ -256,7 +256,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         )
 
     left_out: list[tuple[Entry, ...]] = [
-        (each.path.name, "left out", None, None, ABSENT, each.message) for each in campaign.failures
+        (each.name, "left out", None, None, ABSENT, each.message) for each in campaign.failures
     ]
     return Table.of(
         "sessions",

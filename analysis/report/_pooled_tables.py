@@ -259,11 +259,11 @@ def specimens_table(campaign: CampaignResult) -> Table:
         tuple(
             {
                 **{key: Cell(value, told(key, value)) for key, value in each.facts.items()},
-                "files": len(each.paths),
+                "files": len(each.files),
                 "here": each is specimens[0],
                 "names": Cell(
-                    " ".join(path.name for path in each.paths),
-                    ", ".join(path.name for path in each.paths),
+                    " ".join(each.files),
+                    ", ".join(each.files),
                 ),
             }
             for each in specimens

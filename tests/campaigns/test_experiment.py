@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns._campaign import _of_one_experiment
-from analysis.campaigns._experiment import most_common, stated_specimens
+from analysis.campaigns._experiment import most_common, stated_specimens, told_apart
 from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 
 
@@ -94,9 +94,17 @@ def test_specimens_are_told_apart_by_their_labels_before_anything_else(chirps):
     kept, left_out = _of_one_experiment(sessions)
     assert [each.path.name for each in kept] == ["2.mcap", "3.mcap", "4.mcap"]
     assert "specimen is “A”, but “B” in 2.mcap" in left_out[0].message
-    stated = [(each.path, each.experiment) for each in (*kept, *left_out)]
+    stated = [(each.name, each.experiment) for each in (*kept, *left_out)]
     first, second = stated_specimens(stated, kept[0].experiment)
     assert (first.facts["specimen"], second.facts["specimen"]) == ("B", "A")
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders():
+    paths = ["/a/x.mcap", "/b/c/x.mcap", "/d/c/x.mcap", "/a/y.mcap", "/e/z.mcap", "/e/z.mcap"]
+    assert told_apart([Path(path) for path in paths]) == [
+        "a/x.mcap", "b/c/x.mcap", "d/c/x.mcap", "y.mcap", "/e/z.mcap", "/e/z.mcap",
+    ]  # fmt: skip
+    assert told_apart([]) == []
 
 
 def test_a_session_without_a_label_is_of_the_only_labelled_specimen_or_of_none(chirps):

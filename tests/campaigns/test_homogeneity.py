@@ -3,13 +3,13 @@
 import math
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from analysis.campaigns import _sentences as specimen_sentences
 from analysis.campaigns import campaign
+from analysis.campaigns._campaign import campaign_result
 from analysis.campaigns._experiment import stated_specimens
 from analysis.campaigns._homogeneity import Homogeneity, groups, homogeneity
 from analysis.report._campaign_document import campaign_document
@@ -109,12 +109,25 @@ def test_groups_are_told_only_where_gaps_are_clear(values, parts):
     assert groups(np.array(values), np.ones(len(values))) == parts
 
 
+def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate):
+    sessions = []
+    for folder, value in zip("abcd", (2.5, 2.6, 2.5, 2.6), strict=True):
+        estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
+        mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=1e-3)
+        sessions.append(
+            make_session(f"/{folder}/x.mcap", estimates=[replace(estimate, modes=(mode,))])
+        )
+    found = campaign_result(sessions).homogeneity
+    _, where, *_ = specimen_sentences.specimens(found)
+    assert "2.500 Hz in 2 files (a/x.mcap, c/x.mcap); 2.600 Hz in 2 files" in where
+
+
 def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
     one = make_experiment("a", tool_inertia_kg_m2=0.0)
     other = make_experiment("b", tool_inertia_kg_m2=1e-5)
-    stated = [(Path("a"), one), (Path("b"), other), (Path("torn"), None), (Path("c"), one)]
+    stated = [("a", one), ("b", other), ("torn", None), ("c", one)]
     first, second = stated_specimens(stated, one)
-    assert (first.paths, second.paths) == ((Path("a"), Path("c")), (Path("b"),))
+    assert (first.files, second.files) == (("a", "c"), ("b",))
     (said,) = specimen_sentences.specimens(Homogeneity((first, second), ()))
     assert (
         "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
