@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library import change_between
+from rigd.printable import listed
 from rigd.runtime import begin_background, give_way, raise_on
 from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_line, read_look
 from rigd.units import decimals
@@ -337,9 +338,8 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  doubtful: {doubt}" for doubt in doubts)
     unseen = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
     if unseen:
-        *others, last = unseen
-        named = f"modes {', '.join(others)} and {last}" if others else f"mode {last}"
-        yield f"  not visible in this record: {named}"
+        kind = "mode" if len(unseen) == 1 else "modes"
+        yield f"  not visible in this record: {kind} {listed(unseen)}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])

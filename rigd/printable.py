@@ -1,6 +1,6 @@
 """What terminals show: text from outside made harmless, counts, progress with the time left."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -45,6 +45,24 @@ def grouped(count: int) -> str:
     136 000 1200
     """
     return f"{count:,}".replace(",", " ") if count >= _FROM else str(count)
+
+
+def listed(parts: Sequence[str]) -> str:
+    """Return the parts of a list as a sentence has them.
+
+    Parameters
+    ----------
+    parts
+        One at least.
+
+    Examples
+    --------
+    >>> from rigd.printable import listed
+    >>> print(listed(["alpha"]), listed(["1", "2", "3"]), sep="; ")
+    alpha; 1, 2 and 3
+    """
+    *others, last = parts
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def counts_text(counts: Mapping[str, Any]) -> str:

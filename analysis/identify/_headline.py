@@ -89,6 +89,16 @@ class Quantity:
     flag: str | None = None
     std_any_rig: float | None = None
 
+    def admits(self, value: float) -> bool:
+        """Whether a value lies in the 95 % interval; any does where there is none.
+
+        Parameters
+        ----------
+        value : float
+        """
+        low, high = self.interval_95 or (-math.inf, math.inf)
+        return low <= value <= high
+
     def flagged(self, flag: str | None) -> Quantity:
         """Give it a flag, unless it has one.
 
@@ -113,8 +123,7 @@ class Quantity:
         flag : str or None
             The reason for doubt, if that value lies outside the interval here.
         """
-        low, high = self.interval_95 or (-math.inf, math.inf)
-        told = self if low <= value <= high else self.flagged(flag)
+        told = self if self.admits(value) else self.flagged(flag)
         so_far = self.std_any_rig
         if so_far is None:
             if self.std is None or self.flag not in (None, *_BY_RIVALS):
@@ -515,16 +524,12 @@ def _doubted_by(told: Headline, other: Candidate, *, flagging: bool) -> Headline
     flag = reason if flagging else None
     values, std = other.fit.parameters, other.fit.std
 
-    def elsewhere(size: Quantity, value: float) -> bool:
-        low, high = size.interval_95 or (-math.inf, math.inf)
-        return not low <= value <= high
-
     parameters = {
         name: each.with_rival(values[name], std[name], flag) if name in values else each
         for name, each in told.parameters.items()
     }
     sizes = tuple(
-        each.flagged(flag) if flag and elsewhere(each.size, _loss(values, each)) else each
+        each if flag is None or each.size.admits(_loss(values, each)) else each.flagged(flag)
         for each in told.sizes
     )
     theirs = {mode.number: mode for mode in other.fit.modes}

@@ -9,6 +9,7 @@ from analysis.identify._candidate import MODES_FREE
 from analysis.identify._headline import ONE_MODE
 from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
+from rigd.printable import listed
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -105,13 +106,9 @@ def _types(names: tuple[str, ...]) -> str:
     for name in sorted(set(names) - set(plain)):
         structure, beam = name.split(", ", 1)
         others.setdefault(beam, []).append(structure)
-    groups = [_listed(plain)] if plain else []
-    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
+    groups = [listed(plain)] if plain else []
+    groups += [f"with {beam} {listed(each)}" for beam, each in others.items()]
     return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _condition(simpler: Simpler) -> str:

@@ -261,10 +261,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
                 **{key: Cell(value, told(key, value)) for key, value in each.facts.items()},
                 "files": len(each.files),
                 "here": each is specimens[0],
-                "names": Cell(
-                    " ".join(each.files),
-                    ", ".join(each.files),
-                ),
+                "names": Cell(" ".join(each.files), ", ".join(each.files)),
             }
             for each in specimens
         ),

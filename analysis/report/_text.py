@@ -14,6 +14,7 @@ from analysis.identify import MISREAD
 from analysis.report import _record_tables as tables
 from analysis.report._table import MARK, estimate, terminal_table
 from analysis.suited import LEFT_OUT
+from rigd.printable import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -54,10 +55,10 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     elif welch is not None:
         if whole is None:
             shown += spaced((tables.welch_fits_table(welch),))
-        shown += _warnings(result)
+        shown += _warnings(result.warnings)
     else:
         # Why Welch's fits are left out was told when they were.
-        shown += [each for each in _warnings(result) if LEFT_OUT not in each.plain]
+        shown += _warnings(each for each in result.warnings if not each.startswith(LEFT_OUT))
     return Group(*shown)
 
 
@@ -94,8 +95,8 @@ def _bare(table: Table) -> Table:
     return replace(table, caption="", notes=notes)
 
 
-def _warnings(result: RecordResult) -> list[Text]:
-    return [Text(f"Warning: {warning}", style="yellow") for warning in result.warnings]
+def _warnings(sentences: Iterable[str]) -> list[Text]:
+    return [Text(f"Warning: {sentence}", style="yellow") for sentence in sentences]
 
 
 def tables_text(result: RecordResult) -> str:
@@ -123,7 +124,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
                 *(() if modes is None else (modes,)),
             )
         ),
-        *_warnings(result),
+        *_warnings(result.warnings),
     )
 
 
@@ -203,11 +204,11 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
             return ()
         return (
             "Part of the record is unexplained. If that causes no bias, the antenna's damping "
-            f"ratio would be {_listed(shown)}.",
+            f"ratio would be {listed(shown)}.",
         )
     if shown:
         found.append(
-            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals, "
+            f"The antenna's damping ratio is {listed(shown)} (in brackets: 95 % intervals, "
             "statistical only)."
         )
     found.extend(
@@ -258,9 +259,3 @@ def _order(told: Headline, each: Size) -> str:
         return f"; its order {symbol} is not known"
     value, low, high = estimate((order.value, *order.interval_95), order.std)
     return f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
-
-
-def _listed(parts: list[str]) -> str:
-    if len(parts) == 1:
-        return parts[0]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -181,3 +181,8 @@ class Devices:
     """Force-torque sensor under the clamp."""
     simulated: bool
     """No motor moves: the rig may run under the virtual clock."""
+
+    @property
+    def on_lines(self) -> bool:
+        """Whether the drive is at the other end of a line, simulated or not."""
+        return self.drive.health().bits is not None

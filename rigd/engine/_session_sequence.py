@@ -364,7 +364,7 @@ class SessionSequence:
 
         Where there are lines it does not for long: a tick now and then holds the last angle.
         """
-        on_lines = self._cycle.devices.drive.health().bits is not None
+        on_lines = self._cycle.devices.on_lines
         begun_s = time.monotonic()
         while pieces.waits(tick) and self._stop_reason() is None:
             if on_lines and time.monotonic() - begun_s > SIGN_OF_LIFE_S:

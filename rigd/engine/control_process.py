@@ -155,7 +155,7 @@ class _ControlServer:
         self._obtained = obtained
         self._zero_rad = 0.0
         self._silent = 0
-        self._on_lines = devices.drive.health().bits is not None
+        self._on_lines = devices.on_lines
         # A simulated motor is as cold as it was made.
         warm = not devices.simulated
         self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)

@@ -21,6 +21,7 @@ from rigd.engine import (
     Word,
 )
 from rigd.runner._precision_search import Stated, in_words, stated, targets_json
+from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
     from rigd.engine import ReferenceSpec
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from rigd.profile import Profile, RealtimeSettings
     from rigd.runner._process_group import ProcessGroup
 
-_READY_PATIENCE_S: Final = 20.0
-"""Time for the process to start on a busy computer; nothing moves yet."""
 _LAST_PATIENCE_S: Final = 60.0
 """Time for the fit of the whole record, when the torque is off; a stop skips it."""
 _STOP_PATIENCE_S: Final = 5.0
@@ -103,11 +102,9 @@ class OnlineFit:
         meanwhile
             Called some times a second; says whether to go on waiting.
         """
-        deadline_s = time.monotonic() + _READY_PATIENCE_S
-        while not (self._ready or self._lost) and meanwhile():
-            self._listen(_POLL_S)
-            if time.monotonic() > deadline_s:
-                self._lose(f"The fit process was not ready within {_READY_PATIENCE_S:g} s.")
+        late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
+        if late:
+            self._lose(f"The fit process was {late}.")
         return self._lost
 
     def begin(self, header: FileHeader) -> None:

@@ -6,7 +6,8 @@ import what they need while the supervisor reads the profile and plans.
 
 import contextlib
 import os
-from collections.abc import Collection
+import time
+from collections.abc import Callable, Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -25,6 +26,36 @@ if TYPE_CHECKING:
     from rigd.engine import Channels
 
 _DESCRIPTORS = 6
+_PREPARING_S = 20.0
+"""Time for a process of one session to prepare on a busy computer; nothing moves yet."""
+_POLL_S = 0.05
+
+
+def await_ready(
+    settled: Callable[[], bool], listen: Callable[[float], None], meanwhile: Callable[[], bool]
+) -> str:
+    """Wait until a process of one session is ready, or is lost.
+
+    Parameters
+    ----------
+    settled
+        Says whether it is either.
+    listen
+        Takes what it sends, waiting for so many seconds at most.
+    meanwhile
+        Called some times a second; says whether to go on waiting.
+
+    Returns
+    -------
+    str
+        How long was waited in vain; empty where that was not too long.
+    """
+    deadline_s = time.monotonic() + _PREPARING_S
+    while not settled() and meanwhile():
+        listen(_POLL_S)
+        if not settled() and time.monotonic() > deadline_s:
+            return f"not ready within {_PREPARING_S:g} s"
+    return ""
 
 
 class ProcessGroup:

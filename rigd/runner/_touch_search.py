@@ -24,6 +24,7 @@ from rigd.engine import (
 )
 from rigd.excitation import Excitation
 from rigd.profile import Profile
+from rigd.runner._process_group import await_ready
 from rigd.session import packed_touches, touch_line
 
 if TYPE_CHECKING:
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 _STEP_STD: Final = 1 / sqrt(12)
 """Standard deviation of a value that is rounded to steps of 1."""
-_READY_PATIENCE_S: Final = 20.0
-"""Time for the estimator to prepare on a busy computer; nothing moves yet."""
 _LAST_PATIENCE_S: Final = 30.0
 """Time for the last estimate after the end of a record; one that takes longer is not told."""
 _POLL_S: Final = 0.05
@@ -164,11 +163,9 @@ class TouchEstimates:
         meanwhile
             Called some times a second; says whether to go on waiting.
         """
-        deadline_s = time.monotonic() + _READY_PATIENCE_S
-        while not (self._ready or self._lost) and meanwhile():
-            self._listen(_POLL_S)
-            if not self._ready and time.monotonic() > deadline_s:
-                self._lose(f"The touch process was not ready within {_READY_PATIENCE_S:g} s.")
+        late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
+        if late:
+            self._lose(f"The touch process was {late}.")
 
     def attend(self) -> list[Event]:
         """Take what has come, and return what the operator is to be told."""

@@ -13,7 +13,6 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from typing import Any, BinaryIO, Final, Self, cast
 
 from rigd.engine import (
@@ -27,7 +26,6 @@ from rigd.engine import (
     Parent,
     PieceWriter,
     RecordEnded,
-    SearchEnded,
     Word,
     attach_channels,
     keep_off_loop,
@@ -178,7 +176,8 @@ class _Follower:
                 case RecordEnded(ticks):
                     self._ended_after = ticks
                     if self._search is not None and self._search.due is not None:
-                        self._parent.send(self._ended(ticks, self._search))
+                        before, begun = self._board[Word.HELD_BEFORE], self._board[Word.BEGUN]
+                        self._parent.send(self._search.ended(ticks, before, begun))
 
     def _begin(self, header: FileHeader) -> None:
         """Begin with what the file says of the session."""
@@ -218,12 +217,6 @@ class _Follower:
             if self._ticks >= tick:
                 self._request(tick, whole=search.may_be_last)
 
-    def _decided(self, answer: dict[str, Any], search: Search) -> Iterator[object]:
-        return search.answered(answer, self._board[Word.HELD], self._board[Word.HELD_BEFORE])
-
-    def _ended(self, ticks: int, search: Search) -> SearchEnded:
-        return search.ended(ticks, self._board[Word.HELD_BEFORE], self._board[Word.BEGUN])
-
     def _request(self, tick: int, *, whole: bool) -> None:
         self._number += 1
         self._asked = EstimateRequest(_FIRST_ASKED + self._number, tick, whole)
@@ -238,7 +231,8 @@ class _Follower:
             self._asked = None
         if search is not None and not final:
             if self._ended_after is None:
-                for message in self._decided(answer, search):
+                held, before = self._board[Word.HELD], self._board[Word.HELD_BEFORE]
+                for message in search.answered(answer, held, before):
                     self._parent.send(message)
             return False
         answer["text"] = estimate_lines(answer, self._before)
