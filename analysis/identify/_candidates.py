@@ -104,7 +104,23 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure; the freest alone where a sign or a unit is wrong.
+        """Fit every structure on every kind of rig that promises something.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used.
+        """
+        return cls.of_uniform(measurement, fixed, band_hz).with_other_rigs(fixed, band_hz)
+
+    @classmethod
+    def of_uniform(
+        cls,
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> CandidateSet:
+        """Fit every structure on a uniform beam; the freest alone where a sign or a unit is wrong.
 
         Raises
         ------
@@ -115,15 +131,31 @@ class CandidateSet:
             # No beam explains such a record: one structure shows what remains as well as all.
             return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
         field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
-        field = field._without_leakage()
+        return field._without_leakage()
+
+    def with_other_rigs(
+        self, fixed: tuple[Setting, ...], band_hz: tuple[float, float]
+    ) -> CandidateSet:
+        """Add what `of_uniform` leaves out: modes with stiffnesses of their own, and extras.
+
+        Parameters
+        ----------
+        fixed : tuple of str
+            As there.
+        band_hz : tuple of float
+            As there.
+        """
+        if self.misread:
+            return self
+        field, measurement = self, self.comparison.measurement
         likeliest = field.likeliest
         if not field.all_but_white(likeliest):
             found = knock_in(field) if not measurement.knocks else None
             if found is not None and found.obvious:
-                struck = cls.of(with_knock(measurement, found), fixed, band_hz)
+                struck = self.of(with_knock(measurement, found), fixed, band_hz)
                 if struck.all_but_white(struck.likeliest):
                     return struck
-        if len(visible_modes(field.comparison, field.noise, likeliest)) > 1:
+        if field.shows_modes:
             field = (
                 field._with_modes_free(likeliest)
                 if field.all_but_white(likeliest)
@@ -247,6 +279,11 @@ class CandidateSet:
     def bic(self) -> float:
         """The lowest, comparable between fields whose noise has been estimated again."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
+
+    @property
+    def shows_modes(self) -> bool:
+        """Whether the record shows two modes at least: one alone has no stiffness of its own."""
+        return len(visible_modes(self.comparison, self.noise, self.likeliest)) > 1
 
     def unknowns(
         self, structure: Structure, uniform: bool, extras: tuple[str, ...] = ()

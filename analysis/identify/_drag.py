@@ -23,16 +23,19 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import Candidate
+from analysis.identify._candidates import FREE_STIFFNESS
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
-from analysis.identify._refit import Refit
+from analysis.identify._refit import MISSED, Refit
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
+    from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Noise
@@ -45,12 +48,22 @@ if TYPE_CHECKING:
 _SCORED: Final = ("III", "VI", "VII")
 """Structures beside which drag is looked for: those that have either damping."""
 
+_EVIDENT: Final = 100.0
+_ALL_BUT_NOISE: Final = 0.8
+"""Squares, and share of what a uniform beam leaves unexplained, that a small drag saves where it is
+evident. In records of all that rigs may have else (`benchmarks/wrong_models.py`) the column saves
+less than a third, or asks for air that pushes; with drag it saves all and more, since part of what
+drag leaves counts as noise."""
+
 _PROMISE: Final = 6.0
 """Deviance by which the first order may fail to foresee what drag saves."""
 
 _ROUNDS: Final = 15
 _FEW: Final = 12
 """Evaluations of a descent before the drag is recomputed."""
+
+_A_LOOK: Final = 4
+"""Evaluations that show whether a structure is hopeless."""
 
 _MANY: Final = 40
 _HOPELESS: Final = 50.0
@@ -109,6 +122,42 @@ class DragEstimate:
     covariance: tuple[tuple[float, ...], ...]
 
 
+def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
+    """Refit with the air's drag, where that is the explanation before any other has been tried.
+
+    To first order it saves all that a uniform beam leaves unexplained, which nothing else does that
+    a rig may have; with it, nothing but noise is left.
+
+    Parameters
+    ----------
+    uniform : CandidateSet
+        Without drag, on a uniform beam only.
+
+    Returns
+    -------
+    CandidateSet
+        The one given, unless drag is evident; else with `drag` in all candidates, beams whose modes
+        have stiffnesses of their own among them.
+    """
+    if uniform.misread or not any(_is_evident(uniform, c) for c in uniform.candidates):
+        return uniform
+    kinds = [(c.structure, True) for c in uniform.candidates]
+    if uniform.shows_modes:
+        kinds += [(structure, False) for structure in FREE_STIFFNESS]
+    found = _with_drag(uniform, kinds)
+    return found if found.drag is not None and found.all_but_white(found.likeliest) else uniform
+
+
+def _is_evident(field: CandidateSet, candidate: Candidate) -> bool:
+    """Whether a small drag beside a candidate would explain what that leaves."""
+    if candidate.structure.name not in _SCORED:
+        return False
+    refit = field.refit(candidate, 1)
+    size, saved = _first_amplitude(refit)
+    expected = 2 * np.count_nonzero(field.noise.counts) * field.comparison.measurement.torque_share
+    return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - expected))
+
+
 def with_air_drag(field: CandidateSet) -> CandidateSet:
     """Refit all candidates with the air's drag, if that explains the record better.
 
@@ -118,7 +167,7 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     Parameters
     ----------
     field : CandidateSet
-        Without drag.
+        Without drag, on all kinds of rig that promise something.
 
     Returns
     -------
@@ -127,6 +176,11 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     """
     if not _promising(field):
         return field
+    return _with_drag(field, [(c.structure, c.uniform) for c in _without_extras(field)])
+
+
+def _with_drag(field: CandidateSet, kinds: Sequence[tuple[Structure, bool]]) -> CandidateSet:
+    """Fit structures, on uniform beams or not, with drag; the set given if that is no better."""
     lead = next(
         (c for c in _without_extras(field) if c.uniform and c.structure.name == _LEAD), None
     )
@@ -137,13 +191,14 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     if settled is None:
         return field
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    settled = _settled(field, _Point.of(settled), STRUCTURES[_FREEST], uniform=True) or settled
-    found = _all(field, settled)
+    known, freest = settled.objective.comparison, STRUCTURES[_FREEST]
+    settled = _settled(field, _Point.of(settled), freest, uniform=True, known=known) or settled
+    found = _all(field, settled, kinds)
     if not found.best.uniform:
         best = found.best
         point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
         settled = _settled(field, point, best.structure, uniform=False) or settled
-        found = _all(field, settled)
+        found = _all(field, settled, kinds)
     assert found.drag is not None
     return found if found.drag.value_m > 0 and found.bic < field.bic else field
 
@@ -210,11 +265,19 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
 
 
 def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
-    """First order of the drag beside a fit without it; None if the air would have to push."""
-    plant, structure = lead.fit.plant, lead.structure
-    unknowns = field.unknowns(structure, lead.uniform)
-    size, _ = _first_amplitude(field.descent(unknowns, unknowns.vector(plant), 1))
-    return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
+    """Fit with the first order of the drag; None if the air would have to push."""
+    unknowns, plant = field.unknowns(lead.structure, lead.uniform), lead.fit.plant
+    column = _first_order(field.comparison, plant)
+    refit = Refit.descend(
+        field.comparison,
+        unknowns,
+        unknowns.vector(plant),
+        field.noise,
+        column,
+        max_evaluations=_FEW,
+    )
+    size = float(refit.amplitudes()[0][0])
+    return _Point(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
 
 
 def _settled(
@@ -224,6 +287,7 @@ def _settled(
     *,
     uniform: bool,
     tolerance: float = _SETTLED,
+    known: Comparison | None = None,
 ) -> Refit | None:
     """Fit one structure with drag.
 
@@ -237,6 +301,8 @@ def _settled(
     uniform : bool
     tolerance : float
         Squares that a further step may still save.
+    known : Comparison, optional
+        With the drag at that start.
 
     Returns
     -------
@@ -246,27 +312,31 @@ def _settled(
     unknowns = field.unknowns(structure, uniform)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
+    comparison, roughly = known, tolerance > _SETTLED
     for _ in range(_ROUNDS):
-        plant = unknowns.plant(x)
-        # Without drag the beam seemed to be another, and so what the rest of the angle did.
-        try:
-            comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
-        except DragError:
-            return None
-        assert comparison.drag is not None
-        descent = partial(Refit.descend, comparison, unknowns, x)
-        columns = comparison.drag.by_law[: 1 + two]
-        here = descent(noise, columns, max_evaluations=1)
-        if here.cost - here.promised_cost < tolerance:
-            # With damping that is not the beam's, a second number would be its stopgap.
-            roughly = tolerance > _SETTLED
-            if two or roughly or _known_to(here) > _ONE_NUMBER:
-                return here
-            two, columns = True, comparison.drag.by_law
-        here = descent(noise, columns, max_evaluations=_FEW)
+        if comparison is None:
+            plant = unknowns.plant(x)
+            # Without drag the beam seemed to be another, and so what the rest of the angle did.
+            try:
+                comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+            except DragError:
+                return None
+        drag = comparison.drag
+        assert drag is not None
+        descent = partial(Refit.descend, comparison, unknowns, noise=noise)
+        here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
+        settled = here.cost - here.promised_cost < tolerance
+        if settled and (two or roughly or _known_to(here) > _ONE_NUMBER):
+            return here
+        here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=_FEW)
+        # With damping that is not the beam's, a second number would be its stopgap.
+        if not (two or roughly or _known_to(here) > _ONE_NUMBER):
+            two = True
+            here = descent(here.x, columns=drag.by_law, max_evaluations=_FEW)
         x, law, noise = here.x, _law_at(here), here.noise_here()
-        if law.at(comparison.drag.speed_m_s) <= 0:
+        if law.at(drag.speed_m_s) <= 0:
             return None
+        comparison = None
     return None
 
 
@@ -285,23 +355,40 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
-    """Fit all candidates without extras with the drag settled in one, and say how large it is."""
+def _all(
+    field: CandidateSet, settled: Refit, kinds: Iterable[tuple[Structure, bool]]
+) -> CandidateSet:
+    """Fit structures with the drag settled in one, and say how large it is."""
     other = replace(
         field,
         comparison=settled.objective.comparison,
         columns=settled.columns,
         noise=settled.noise_here(),
     )
-    plant = settled.plant
     least = other.descent(settled.objective.unknowns, settled.x, 1).cost
-    candidates = []
-    for before in _without_extras(field):
-        unknowns = other.unknowns(before.structure, before.uniform)
-        refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
-        if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
-            refit = refit.further(_MANY)
-        candidates.append(refit.candidate())
+    most = least * math.exp(_HOPELESS / field.best.values)
+    begun = []
+    for structure, uniform in kinds:
+        unknowns = other.unknowns(structure, uniform)
+        refit = Refit.descend(
+            other.comparison,
+            unknowns,
+            unknowns.vector(settled.plant),
+            other.noise,
+            other.columns,
+            max_evaluations=_FEW,
+            relative_tolerance=MISSED,
+            hopeless=(_A_LOOK, most),
+        )
+        begun.append((refit.candidate(), refit))
+    best = min((candidate for candidate, _ in begun), key=lambda each: each.bic)
+    candidates = [
+        # Of beams of another kind nothing counts but their BIC.
+        refit.further(_MANY).candidate()
+        if candidate.kind == best.kind and refit.promised_cost < most
+        else candidate
+        for candidate, refit in begun
+    ]
     found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))
 

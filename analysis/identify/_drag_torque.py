@@ -229,18 +229,18 @@ class DragResponse:
         modes = [mode for mode in modes if self._pairs[mode - 1][0].imag > 0]
         spectra = self._spectra(forces)
         moved = self._driven + self._yield * spectra[:-1]
-        sources: list[tuple[list[int], Real]] = []
+        sources: list[tuple[int, Real]] = []
         direct = []
         carried = self._leverage[:, None] * self._follow * spectra[:-1]
         for mode in modes:
             pole = self._pairs[mode - 1][0]
             share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
             for change in (share + mirror, 1j * (share - mirror)):
-                sources.append(([mode - 1], self._fine(moved[mode - 1 : mode] * change)))
+                sources.append((mode - 1, self._fine(moved[mode - 1] * change)))
                 direct.append(self.in_time(carried[mode - 1] * change))
         for mode in _LOWEST:
             for change in (1 / self._inertial, self.s / self._inertial):
-                sources.append(([mode], self._fine(self._driven[mode : mode + 1] * change)))
+                sources.append((mode, self._fine(self._driven[mode] * change)))
                 direct.append(self.in_time(carried[mode] * change))
         changed = self._perturbed(speed, law, sources)
         by = [self._torque(change) for change in changed]
@@ -284,9 +284,10 @@ class DragResponse:
 
     def _brake(self, speed: Real, law: DragLaw) -> None:
         """Turn the speeds without drag into those with it, in place."""
-        step, of_force = self._stepping()
-        of_force = of_force @ self._grid.to_modes
-        state, force, magnitude = np.zeros(len(step) - POINTS), *np.zeros((2, POINTS))
+        told, by_state, by_force = self._stepping()
+        step = np.concatenate([self._grid.shapes.T @ told, by_state])
+        of_force = by_force @ self._grid.to_modes
+        state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, POINTS))
         out = np.zeros(len(step))
         braked, later = out[:POINTS], out[POINTS:]
         constant, slowing = -HALF_DENSITY * law.constant_m, -HALF_DENSITY * law.slowing
@@ -307,50 +308,50 @@ class DragResponse:
             of_force_dot(force, state)
             add(state, later, state)
 
-    def _perturbed(
-        self, speed: Real, law: DragLaw, sources: list[tuple[list[int], Real]]
-    ) -> list[Real]:
+    def _perturbed(self, speed: Real, law: DragLaw, sources: list[tuple[int, Real]]) -> list[Real]:
         """Change the forces, as `_modal` has them, by a mode's speed and by the law.
+
+        To first order the points are not needed for that: what the speed of one mode does to the
+        force on another is one number at each step.
 
         Parameters
         ----------
         speed : ndarray, shape (3 m, POINTS)
             With drag.
-        sources : list of (list of int, ndarray of shape (modes, 3 m))
-            Which modes (from 0) move faster, and by how much.
+        sources : list of (int, ndarray of shape (3 m,))
+            Which mode (from 0) moves faster, and by how much.
         """
-        step, of_force = self._stepping()
-        of_force = of_force @ self._grid.to_modes
-        runs = len(sources) + 2
-        weights = self._to_root
+        told, by_state, by_force = self._stepping()
+        step = np.concatenate([told, by_state])
+        of_force = np.hstack([by_force, np.zeros((len(by_force), 1))])  # none of the moment
+        runs, weights = len(sources) + 2, self._to_root
+        coupling = (weights[:, None] * self._grid.shapes).reshape(-1, POINTS).T
         changed = np.empty((len(speed), len(weights), runs))
-        state, out = np.zeros((len(step) - POINTS, runs)), np.zeros((len(step), runs))
-        braked, later = out[:POINTS], out[POINTS:]
-        dot, multiply, add = np.dot, np.multiply, np.add
+        state, out = np.zeros((len(by_state), runs)), np.zeros((len(step), runs))
+        braked, later = out[:MODES], out[MODES:]
+        force, dot, add = np.empty(changed.shape[1:]), np.dot, np.add
         for first in range(0, len(speed), _CHUNK):
             chunk = slice(first, first + _CHUNK)
-            magnitude = np.abs(speed[chunk])
+            now, magnitude = changed[chunk], np.abs(speed[chunk])
+            slower = np.cbrt(magnitude)
             slope = -2 * HALF_DENSITY * law.constant_m * magnitude
             if law.slowing:
-                slope -= (1 + _SLOWING) * HALF_DENSITY * law.slowing * np.cbrt(magnitude)
-            steep = slope[:, :, None]
-            force = np.empty((len(slope), POINTS, runs))
-            for run, (modes, faster) in enumerate(sources):
-                force[:, :, run] = faster[:, chunk].T @ self._grid.shapes[modes]
-            force[:, :, : len(sources)] *= steep
-            force[:, :, len(sources)] = -HALF_DENSITY * magnitude * speed[chunk]
-            force[:, :, -1] = -HALF_DENSITY * np.cbrt(magnitude) * speed[chunk]
-            for at, now in zip(force, steep, strict=True):
+                slope -= (1 + _SLOWING) * HALF_DENSITY * law.slowing * slower
+            by_speed = (slope @ coupling).reshape(-1, len(weights), MODES)
+            for run, (mode, faster) in enumerate(sources):
+                np.multiply(by_speed[:, :, mode], faster[chunk, None], out=now[:, :, run])
+            for run, power in (-2, magnitude), (-1, slower):
+                now[:, :, run] = (-HALF_DENSITY * power * speed[chunk]) @ weights.T
+            for at, matrix in zip(now, by_speed, strict=True):
                 dot(step, state, out)
-                multiply(braked, now, braked)
-                add(at, braked, at)
+                dot(matrix, braked, force)
+                add(at, force, at)
                 dot(of_force, at, state)
                 add(state, later, state)
-            np.matmul(weights, force, out=changed[chunk])
         return list(np.ascontiguousarray(changed.transpose(2, 1, 0)))
 
-    def _stepping(self) -> tuple[Real, Real]:
-        """Matrices of a step: speed at the points and next state, by the state; by the new force.
+    def _stepping(self) -> tuple[Real, Real, Real]:
+        """Matrices of a step: modes' speeds and next state, by the state; by the new force.
 
         The state holds two numbers a mode, then the modes' forces of the last three steps.
         """
@@ -385,8 +386,7 @@ class DragResponse:
         for back, factor in enumerate((3.0, -3.0, 1.0)):
             columns = slice((2 + back) * n, (3 + back) * n)
             foreseen[:, columns] += factor * by_force[: 2 * n]
-        speed = self._grid.shapes.T @ (told[:, : 2 * n] @ foreseen)
-        return np.concatenate([speed, by_state]), by_force
+        return told[:, : 2 * n] @ foreseen, by_state, by_force
 
     def _slopes(self) -> Complex:
         """Slope of Z at the poles, shape (MODES, 2)."""

@@ -15,7 +15,7 @@ from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._diagnostics import findings, unexplained
-from analysis.identify._drag import damping_with_amplitude, with_air_drag
+from analysis.identify._drag import damping_with_amplitude, with_air_drag, with_evident_drag
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
@@ -179,15 +179,17 @@ def _selected(
     measurement: Measurement, fixed: tuple[Setting, ...], band_hz: tuple[float, float]
 ) -> _Told[Selection]:
     """Choose the structure with what is known to have struck the beam."""
-    linear = CandidateSet.of(measurement, fixed, band_hz)
+    linear = CandidateSet.of_uniform(measurement, fixed, band_hz)
+    field = with_evident_drag(linear)
+    if field is linear:
+        linear = linear.with_other_rigs(fixed, band_hz)
+        field = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = (
-        (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
-    )
+    field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
     field, changes = along_time(field.with_orders_free())
     if forces or field.drag is not None:
         # What changes along the record may have looked like an amplitude, which does so as well.
-        other, other_changes = along_time(linear.with_orders_free())
+        other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
         if other_changes and other.bic < field.bic:
             field, forces, changes = other, (), other_changes
     field, *profiles = profiled(field, walk=untold_reason(field, visible) is None)

@@ -57,6 +57,10 @@ _GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness"
 _GAIN: Final = SURE**2 + 2 * math.log(20)
 """Deviance that a column must save: four of them are tried on four candidates."""
 
+_IN_SIGHT: Final = 0.75
+"""Share of a rival's lower BIC that a column has to promise. The first order foretells it to a
+tenth."""
+
 _UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 8
 _SETTLED: Final = 0.01
@@ -91,8 +95,17 @@ class Change:
         return self.behind < -STRONG
 
 
-def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
+def along_time(
+    field: CandidateSet, rival_bic: float = math.inf
+) -> tuple[CandidateSet, tuple[Change, ...]]:
     """Find what changes along the record; refit all with it if nothing else explains it as well.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    rival_bic : float
+        What else explains the record has this BIC (`CandidateSet.bic`): only what promises to come
+        near it is fitted.
 
     Returns
     -------
@@ -104,9 +117,10 @@ def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
     if field.misread:
         return field, ()
     lag = _lag_of_play(field.comparison)
+    most = field.best.bic + min(STRONG, _IN_SIGHT * (rival_bic - field.bic))
     tried: dict[What, tuple[float, Refit]] = {}
     for lead in _leads(field):
-        for what, promised in _promising(field, lead, lag):
+        for what, promised in _promising(field, lead, lag, most):
             if promised < tried.get(what, (math.inf,))[0]:
                 refit, bic = _fitted(field, lead, what, lag)
                 if bic < tried.get(what, (math.inf,))[0]:
@@ -142,7 +156,7 @@ def _leads(field: CandidateSet) -> Iterator[Candidate]:
 
 
 def _promising(
-    field: CandidateSet, lead: Candidate, lag: NDArray[np.float64]
+    field: CandidateSet, lead: Candidate, lag: NDArray[np.float64], most_bic: float
 ) -> Iterator[tuple[What, float]]:
     """Columns that to first order would make a candidate the best, with the BIC they promise."""
     refit = field.refit(lead, 1)
@@ -152,7 +166,7 @@ def _promising(
         left = max(refit.cost - squares, 1e-3 * refit.cost)
         gain = lead.values * math.log(refit.cost / left)
         bic = lead.bic - gain + math.log(lead.values)
-        if gain > _GAIN and bic < field.best.bic + STRONG:
+        if gain > _GAIN and bic < most_bic:
             yield what, bic
 
 
