@@ -251,7 +251,12 @@ def _as_stated(field: CandidateSet, name: Setting) -> bool:
         values = candidate.values
         saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
         enough = values * math.exp(saved / values)
-        if held.refit(candidate, 1).promised_cost < enough and held.refit(candidate).cost < enough:
+        # Where it is not enough with the setting free, it is not with the setting held.
+        if (
+            candidate.fit.cost < enough
+            and held.refit(candidate, 1).promised_cost < enough
+            and held.refit(candidate).cost < enough
+        ):
             return True
     return False
 

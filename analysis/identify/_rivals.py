@@ -97,7 +97,7 @@ def _promising(field: CandidateSet, lead: Candidate) -> list[Refit]:
     for name in EXTRAS:
         begun = (
             _begun(field, other, name, size)
-            for other in ((lead, field.best) if doubtful else (lead,))
+            for other in ((lead, field.best) if doubtful and name in _AT_ENDS else (lead,))
             for size in _starts(name, other, doubtful=doubtful)
         )
         first = min(begun, key=lambda refit: refit.promised_cost)
