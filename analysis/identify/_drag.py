@@ -191,8 +191,13 @@ def _with_drag(field: CandidateSet, kinds: Sequence[tuple[Structure, bool]]) -> 
     if settled is None:
         return field
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    known, freest = settled.objective.comparison, STRUCTURES[_FREEST]
-    settled = _settled(field, _Point.of(settled), freest, uniform=True, known=known) or settled
+    known, point = settled.objective.comparison, _Point.of(settled)
+    for name in (_FREEST, _LEAD):
+        settled = _settled(field, point, STRUCTURES[name], uniform=True, known=known)
+        if settled is not None:
+            break
+    else:
+        return field
     found = _all(field, settled, kinds)
     if not found.best.uniform:
         best = found.best
@@ -324,13 +329,14 @@ def _settled(
         drag = comparison.drag
         assert drag is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
-        here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
-        settled = here.cost - here.promised_cost < tolerance
-        if settled and (two or roughly or _known_to(here) > _ONE_NUMBER):
-            return here
+        at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
         here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=_FEW)
-        # With damping that is not the beam's, a second number would be its stopgap.
-        if not (two or roughly or _known_to(here) > _ONE_NUMBER):
+        if two or roughly or _known_to(here) > _ONE_NUMBER:
+            # What a step promises is more than it saves where a damping has vanished.
+            if at_first.cost - max(at_first.promised_cost, here.cost) < tolerance:
+                return at_first
+        else:
+            # With damping that is not the beam's, a second number would be its stopgap.
             two = True
             here = descent(here.x, columns=drag.by_law, max_evaluations=_FEW)
         x, law, noise = here.x, _law_at(here), here.noise_here()

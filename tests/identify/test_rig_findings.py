@@ -11,8 +11,10 @@ from analysis.identify import Measurement, select
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import clipping, stops, wrong_scale
 from analysis.identify._comparison import Comparison
+from analysis.identify._drag import with_evident_drag
 from analysis.identify._headline import MISREAD
 from analysis.identify._leakage import repeats_after_s
+from analysis.identify._time_varying import along_time
 from analysis.report._text import damping_sentences
 from rigd.beam import Beam
 
@@ -85,6 +87,22 @@ def test_a_tip_mass_is_named_beside_what_explains_it_as_well():
     assert field.best.fit.parameters["tip_mass_kg"] == pytest.approx(1.5e-4, rel=0.02)
     assert all(mode.damping_ratio_std > 0 for mode in field.best.fit.modes)
     assert field.freest.extras == ("tip_mass_kg",)
+
+
+@pytest.mark.parametrize(
+    ("more", "hidden"),
+    [
+        ({"tip_mass_kg": 1.5e-4}, True),
+        ({"filter_hz": 120.0}, True),
+        further({"clock": 1e-5}, True),
+        further({"clamp_nm_per_rad": 30.0}, False),
+        ({}, False),
+    ],
+)
+def test_nothing_else_is_evident_drag(more, hidden):
+    uniform = CandidateSet.of_uniform(record(**more), (), (0.0, 50.0))
+    assert uniform.all_but_white(uniform.likeliest) != hidden
+    assert with_evident_drag(uniform) is uniform
 
 
 def test_a_plain_rig_carries_nothing():
@@ -213,6 +231,18 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8):
     known = np.ones(noise.size, dtype=bool)
     torque_nm = torque[::finer] + noise
     return Measurement("x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known)
+
+
+def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted():
+    uniform = CandidateSet.of_uniform(changing(damping=0.2), (), (0.0, 50.0))
+    assert with_evident_drag(uniform) is uniform
+    with_change, (change,) = along_time(uniform)
+    assert change.what == "damping"
+    saved = uniform.bic - with_change.bic
+    again, changes = along_time(uniform, rival_bic=uniform.bic - saved)
+    assert changes == (change,)
+    assert again.bic == with_change.bic
+    assert along_time(uniform, rival_bic=uniform.bic - 2 * saved) == (uniform, ())
 
 
 @pytest.mark.parametrize(
