@@ -79,6 +79,12 @@ the recomputed drag promised a step of half a standard deviation, always the sam
 rounds and more: it led away from the truth, and each round cost a second.
 """
 
+_IN_VAIN: Final = 20.0
+"""Squares that a step may save and yet be the last, if the one before saved no more than twice as
+much. Where external damping has vanished, or is an inertia, each step along its order promises what
+the recomputed drag does not keep.
+"""
+
 _LEAD: Final = "III"
 _FREEST: Final = "VI"
 
@@ -317,7 +323,7 @@ def _settled(
     unknowns = field.unknowns(structure, uniform)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
-    comparison, roughly = known, tolerance > _SETTLED
+    comparison, roughly, saved = known, tolerance > _SETTLED, math.inf
     for _ in range(_ROUNDS):
         if comparison is None:
             plant = unknowns.plant(x)
@@ -332,8 +338,8 @@ def _settled(
         at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
         here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=_FEW)
         if two or roughly or _known_to(here) > _ONE_NUMBER:
-            # What a step promises is more than it saves where a damping has vanished.
-            if at_first.cost - max(at_first.promised_cost, here.cost) < tolerance:
+            before, saved = saved, at_first.cost - max(at_first.promised_cost, here.cost)
+            if saved < tolerance or before / 2 < saved < _IN_VAIN:
                 return at_first
         else:
             # With damping that is not the beam's, a second number would be its stopgap.
