@@ -109,10 +109,11 @@ def select(
     with an elastic clamp, a tip mass, a filter or another clock. On the kind of rig with the lowest
     BIC the orders are freed as well, and kinds of rig are told apart by these freest structures.
     The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of
-    the air along the beam makes the lowest lower, all are fitted with it. If restoring forces that
-    are not linear, or a change along the record, save far more than chance would, all are fitted
-    again with these beside the beam. Where all that leaves more than noise, a knock on the beam is
-    looked for; if it explains the rest, all is done again with it.
+    the air along the beam makes the lowest lower, all are fitted with it; where it is evident,
+    before other kinds of rig are tried. If restoring forces that are not linear, or a change along
+    the record, save far more than chance would, all are fitted again with these beside the beam.
+    Where all that leaves more than noise, a knock on the beam is looked for; if it explains the
+    rest, all is done again with it.
 
     Parameters
     ----------
