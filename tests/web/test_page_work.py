@@ -19,6 +19,7 @@ from fake_web_server import (
 )
 from online_fits import online_fit
 from playwright.sync_api import expect
+from processes import eventually
 
 
 @pytest.fixture
@@ -199,8 +200,8 @@ def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(ser
     # Rounded down, so that it passes; and predicted again.
     page.click("#take-largest")
     assert page.input_value("#parameter-amplitude_rad") == "0.0286"
+    assert eventually(lambda: server.requests[-1]["parameters"]["amplitude_rad"] == 0.0286)
     page.wait_for_selector("#prediction:not(.outdated)")
-    assert server.requests[-1]["parameters"]["amplitude_rad"] == 0.0286
     page.fill("#parameter-duration_s", "60")
     page.wait_for_selector("#prediction.outdated")
 
