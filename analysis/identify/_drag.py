@@ -145,7 +145,7 @@ def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
         The one given, unless drag is evident; else with `drag` in all candidates, beams whose modes
         have stiffnesses of their own among them.
     """
-    if uniform.misread or not any(_is_evident(uniform, c) for c in uniform.candidates):
+    if uniform.misread or not _is_evident(uniform):
         return uniform
     kinds = [(c.structure, True) for c in uniform.candidates]
     if uniform.shows_modes:
@@ -154,14 +154,12 @@ def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
     return found if found.drag is not None and found.all_but_white(found.likeliest) else uniform
 
 
-def _is_evident(field: CandidateSet, candidate: Candidate) -> bool:
-    """Whether a small drag beside a candidate would explain what that leaves."""
-    if candidate.structure.name not in _SCORED:
-        return False
-    refit = field.refit(candidate, 1)
+def _is_evident(uniform: CandidateSet) -> bool:
+    """Whether a small drag beside the freest structure would explain what that leaves."""
+    freest = next(c for c in uniform.candidates if c.structure.name == _FREEST)
+    refit = uniform.refit(freest, 1)
     size, saved = _first_amplitude(refit)
-    expected = 2 * np.count_nonzero(field.noise.counts) * field.comparison.measurement.torque_share
-    return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - expected))
+    return size > 0 and saved > max(_EVIDENT, _ALL_BUT_NOISE * (refit.cost - refit.expected_cost))
 
 
 def with_air_drag(field: CandidateSet) -> CandidateSet:
@@ -246,9 +244,7 @@ def _promising(field: CandidateSet) -> bool:
     for candidate in _without_extras(field):
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
-        unknowns = field.unknowns(candidate.structure, candidate.uniform)
-        plant = candidate.fit.plant
-        refit = field.descent(unknowns, unknowns.vector(plant), 1)
+        refit = field.refit(candidate, 1)
         size, saved = _first_amplitude(refit)
         before = refit.cost
         cost = max(before - saved, 1e-3 * before)
@@ -277,16 +273,8 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
 
 def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
     """Fit with the first order of the drag; None if the air would have to push."""
-    unknowns, plant = field.unknowns(lead.structure, lead.uniform), lead.fit.plant
-    column = _first_order(field.comparison, plant)
-    refit = Refit.descend(
-        field.comparison,
-        unknowns,
-        unknowns.vector(plant),
-        field.noise,
-        column,
-        max_evaluations=_FEW,
-    )
+    column = _first_order(field.comparison, lead.fit.plant)
+    refit = replace(field, columns=column).refit(lead, _FEW)
     size = float(refit.amplitudes()[0][0])
     return _Point(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
 
@@ -336,7 +324,7 @@ def _settled(
         assert drag is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         at_first = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=1)
-        here = descent(x, columns=drag.by_law[: 1 + two], max_evaluations=_FEW)
+        here = at_first.further(_FEW)
         if two or roughly or _known_to(here) > _ONE_NUMBER:
             before, saved = saved, at_first.cost - max(at_first.promised_cost, here.cost)
             if saved < tolerance or before / 2 < saved < _IN_VAIN:

@@ -354,8 +354,7 @@ def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
     in_time = _in_time(comparison, knock)
-    cost = refit.cost
-    expected = 2 * np.count_nonzero(refit.noise.counts) * comparison.measurement.torque_share
+    cost, expected = refit.cost, refit.expected_cost
     shared = bool(cost < _OVERWHELMING * expected)
     beside, residual = refit.beside(comparison.spectrum(in_time), beam_free=shared)
     free = beside.view(np.float64)

@@ -186,6 +186,12 @@ class Refit:
         return self.equations.cost
 
     @property
+    def expected_cost(self) -> float:
+        """What it is where noise alone is left."""
+        share = self.objective.comparison.measurement.torque_share
+        return float(2 * np.count_nonzero(self.noise.counts) * share)
+
+    @property
     def promised_cost(self) -> float:
         """What it would be at the minimum, as far as can be seen from here."""
         return max(self.cost + float(self.equations.gradient @ self.promised_step), 0.0)
