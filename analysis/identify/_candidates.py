@@ -11,7 +11,7 @@ import numpy as np
 from analysis.identify._candidate import FAR_BEHIND, Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
-from analysis.identify._fit import fit_record
+from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._knock import knock_in, with_knock
 from analysis.identify._leakage import without_leakage
 from analysis.identify._parametrization import Unknowns
@@ -24,7 +24,7 @@ from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
 
-_FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
+_FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["V"], STRUCTURES["VI"])
 """Fitted there as well if such a beam is the best, as on any other kind. Where the modes are free
 their frequencies say nothing of the orders, only their damping does."""
 
@@ -154,7 +154,13 @@ class CandidateSet:
             if found is not None and found.obvious:
                 struck = self.of(with_knock(measurement, found), fixed, band_hz)
                 if struck.all_but_white(struck.likeliest):
-                    return struck
+                    # Obvious beside a uniform beam; another rig may need no knock.
+                    without = (
+                        None
+                        if struck.best.kind == _PLAIN
+                        else self.from_earlier(struck.candidates, measurement, fixed, band_hz)
+                    )
+                    return without or struck
         if field.shows_modes:
             field = (
                 field._with_modes_free(likeliest)
@@ -162,6 +168,54 @@ class CandidateSet:
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
         return with_extras(field.cross_checked()._renewed())._renewed()
+
+    @classmethod
+    def from_earlier(
+        cls,
+        earlier: Sequence[Candidate],
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> CandidateSet | None:
+        """Fit what was fitted to an earlier part of the record, each from where it was.
+
+        Parameters
+        ----------
+        earlier : sequence of Candidate
+            The lowest BIC first.
+        measurement : Measurement
+        fixed : tuple of str
+        band_hz : tuple of float
+
+        Returns
+        -------
+        CandidateSet or None
+            None if the first leaves more than noise now: a search has to find out why.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used.
+        """
+        first, *others = earlier
+        plain = first.kind == _PLAIN
+        if first.columns:
+            return None  # what was not linear is looked for anew, beside what is
+        free = tuple(name for name in SETTINGS if name not in fixed)
+        modes = 1 + len(first.fit.plant.stiffness_offsets)
+        unknowns = Unknowns.of(first.structure, measurement.nominal, free, modes, first.extras)
+        found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
+        if found is None:
+            return None
+        field = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
+        before = replace(field, candidates=tuple(earlier))
+        every = (before._brought_to(field, c, MANY) for c in others if not (plain and c.extras))
+        field = field.ranked((*field.candidates, *every))._without_leakage().cross_checked()
+        if plain:  # little speaks for anything beside such a beam: more data may change that
+            if field.shows_modes and all(c.uniform for c in field.candidates):
+                field = field._with_modes_free(field.likeliest).cross_checked()
+            field = with_extras(field)
+        return field._renewed()
 
     @classmethod
     def of_freest(
@@ -186,12 +240,21 @@ class CandidateSet:
     @classmethod
     def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
         """Take over what was fitted with a uniform beam."""
-        comparison = uniform.comparison
+        return cls._fitted(
+            uniform, fixed, (Candidate(fit.structure, True, fit) for fit in uniform.fits)
+        )
+
+    @classmethod
+    def _fitted(
+        cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
+    ) -> CandidateSet:
+        """Take over what was fitted, as candidates."""
+        comparison = analysis.comparison
         return cls(
             comparison=comparison,
-            noise=uniform.noise,
+            noise=analysis.noise,
             free=tuple(name for name in SETTINGS if name not in fixed),
-            candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
+            candidates=_ranked(candidates),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
 

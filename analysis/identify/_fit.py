@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._data import Measurement
     from analysis.identify._noise import Noise
-    from analysis.identify._plant import Setting
+    from analysis.identify._plant import Plant, Setting
     from analysis.identify._problem import Projected
     from analysis.models import Structure
 
@@ -141,6 +141,46 @@ def fit_record(
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
     return RecordAnalysis.of(fits, noise, comparison)
+
+
+def refit_record(
+    measurement: Measurement,
+    unknowns: Unknowns,
+    plant: Plant,
+    *,
+    band_hz: tuple[float, float] = BAND_HZ,
+) -> RecordAnalysis | None:
+    """Fit one structure from a plant that explained an earlier part of the record.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    unknowns : Unknowns
+    plant : Plant
+    band_hz : tuple of float
+
+    Returns
+    -------
+    RecordAnalysis or None
+        None where that leaves more than noise, or a hum: then a search is needed.
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used.
+    """
+    comparison = Comparison.of(measurement, band_hz).following_reference(plant)
+    here = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
+    here = here.to_minimum(here.noise(), _BEFORE_LINES)
+    here = here.renewed(here.noise(), _BEFORE_LINES)
+    if here.hum():
+        return None
+    noise = here.noise(with_lines=True)
+    here = here.to_minimum(noise, _TOLERANCE)
+    if not _explains(here, noise):
+        return None
+    comparison = here.objective.comparison
+    return RecordAnalysis.of([summary(here.objective, here.x, noise)], noise, comparison)
 
 
 def _under_its_noise(

@@ -47,7 +47,7 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Sequence
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._data import Measurement
@@ -101,6 +101,7 @@ def select(
     *,
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
+    earlier: Sequence[Candidate] = (),
 ) -> Selection:
     """Choose the structure that a record supports, and say what is known.
 
@@ -121,6 +122,9 @@ def select(
     fixed : iterable of str
         Settings that stay as the file states them.
     band_hz : tuple of float
+    earlier : sequence of Candidate, optional
+        Those of an earlier part of the record. All start from there where the first of them
+        explains all of it, in half the time; of several minima one may be missed.
 
     Raises
     ------
@@ -130,7 +134,7 @@ def select(
         There is no such setting.
     """
     fixed = tuple(fixed)
-    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz)).said
+    return _with_knocks(measurement, lambda each: _selected(each, fixed, band_hz, earlier)).said
 
 
 _T = TypeVar("_T")
@@ -177,13 +181,17 @@ def _with_knocks(measurement: Measurement, tell: Callable[[Measurement], _Told[_
 
 
 def _selected(
-    measurement: Measurement, fixed: tuple[Setting, ...], band_hz: tuple[float, float]
+    measurement: Measurement,
+    fixed: tuple[Setting, ...],
+    band_hz: tuple[float, float],
+    earlier: Sequence[Candidate],
 ) -> _Told[Selection]:
     """Choose the structure with what is known to have struck the beam."""
-    linear = CandidateSet.of_uniform(measurement, fixed, band_hz)
-    field = with_evident_drag(linear)
+    again = CandidateSet.from_earlier(earlier, measurement, fixed, band_hz) if earlier else None
+    linear = again or CandidateSet.of_uniform(measurement, fixed, band_hz)
+    field = linear if again else with_evident_drag(linear)
     if field is linear:
-        linear = linear.with_other_rigs(fixed, band_hz)
+        linear = again or linear.with_other_rigs(fixed, band_hz)
         field = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)

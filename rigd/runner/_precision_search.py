@@ -296,6 +296,16 @@ class Search:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
 
+    def looks_ahead(self, *, whole: bool) -> bool:
+        """Whether the next estimate may be the last, and the last one was of the freest alone.
+
+        Parameters
+        ----------
+        whole
+            Whether the estimate that was answered last tried every structure.
+        """
+        return self.due is not None and self.may_be_last and not whole
+
     def is_begun(self, begun: int) -> bool:
         """Whether what was planned last is being played: only then is it known from which tick on.
 

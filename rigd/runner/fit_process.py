@@ -152,6 +152,7 @@ class _Follower:
         self._job = job
         self._search: Search | None = None
         self._asked: EstimateRequest | None = None
+        self._ahead = False
         self._before: dict[str, Any] | None = None
         self._ticks = self._number = 0
         self._ended_after: int | None = None
@@ -215,25 +216,25 @@ class _Follower:
             # Read after the samples: the loop counts what it holds before it gives the sample.
             tick = search.due + self._board[Word.HELD]
             if self._ticks >= tick:
-                self._request(tick, whole=search.may_be_last)
+                self._request(tick, whole=search.may_be_last, from_last=True)
 
-    def _request(self, tick: int, *, whole: bool) -> None:
+    def _request(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
         self._number += 1
-        self._asked = EstimateRequest(_FIRST_ASKED + self._number, tick, whole)
+        self._asked = EstimateRequest(_FIRST_ASKED + self._number, tick, whole, from_last)
         write_request(self._program.input, self._asked)
 
     def _answered(self, answer: dict[str, Any]) -> bool:
         """Tell of an estimate, and plan by it; say whether it is of the whole record."""
         asked, search = self._asked, self._search
-        answers = asked is not None and asked.id == answer["id"]
-        final = answers and asked is not None and asked.tick == self._ended_after
-        if answers:
-            self._asked = None
+        if asked is not None and asked.id != answer["id"]:
+            asked = None
+        final = asked is not None and asked.tick == self._ended_after and not asked.from_last
+        ahead = self._ahead
+        if asked is not None:
+            self._asked, self._ahead = None, False
         if search is not None and not final:
-            if self._ended_after is None:
-                held, before = self._board[Word.HELD], self._board[Word.HELD_BEFORE]
-                for message in search.answered(answer, held, before):
-                    self._parent.send(message)
+            if asked is not None and self._ended_after is None and not ahead:
+                self._decide(search, asked, answer)
             return False
         answer["text"] = estimate_lines(answer, self._before)
         if search is None:
@@ -242,6 +243,17 @@ class _Follower:
             answer["search"] = search.state(answer)
         self._parent.send(FitTold(answer, final=final))
         return final
+
+    def _decide(self, search: Search, asked: EstimateRequest, answer: dict[str, Any]) -> None:
+        """Plan by an estimate."""
+        held, before = self._board[Word.HELD], self._board[Word.HELD_BEFORE]
+        for message in search.answered(answer, held, before):
+            self._parent.send(message)
+        if search.looks_ahead(whole=asked.whole):
+            # While what is planned is played, and nobody waits: the judgement of all of it starts
+            # from what all structures make of the samples before.
+            self._request(asked.tick, whole=True, from_last=True)
+            self._ahead = True
 
 
 if __name__ == "__main__":

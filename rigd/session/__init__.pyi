@@ -28,6 +28,7 @@ from ._online_fit import estimate_lines as estimate_lines
 from ._online_fit import mode_line as mode_line
 from ._online_fit import read_frames as read_frames
 from ._online_fit import read_start as read_start
+from ._online_fit import unseen_modes as unseen_modes
 from ._online_fit import write_request as write_request
 from ._online_fit import write_samples as write_samples
 from ._online_fit import write_start as write_start

@@ -18,13 +18,14 @@ estimate (docs/online_fit.md).
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from rigd.printable import listed
 from rigd.session._format import Buffer, SessionError, decode_samples
 from rigd.units import decimals, with_half_width
 
@@ -58,6 +59,8 @@ class EstimateRequest:
     """Samples from this tick on are left out."""
     whole: bool
     """Whether every structure is tried, as `analyze` does; else the freest alone is fitted."""
+    from_last: bool = False
+    """Whether that may start from what the last such estimate found, in a third of the time."""
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
@@ -161,7 +164,9 @@ def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateReq
 
 
 def _request(found: Mapping[str, Any]) -> EstimateRequest:
-    return EstimateRequest(int(found["id"]), int(found["tick"]), bool(found["whole"]))
+    return EstimateRequest(
+        int(found["id"]), int(found["tick"]), bool(found["whole"]), bool(found["from_last"])
+    )
 
 
 def _broken(what: str) -> SessionError:
@@ -217,10 +222,28 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
             change = _change(earlier[mode["mode"]], mode) if mode["mode"] in earlier else ""
             doubt = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
             lines.append(f"  {mode_line(mode)}{change}{f' (doubtful: {doubt})' if doubt else ''}")
-    unseen = [str(mode["mode"]) for mode in answer["modes"] if not mode["shown"]]
+    unseen = unseen_modes(answer["modes"])
     if unseen:
-        lines.append(f"  not visible so far: mode {' and '.join(unseen)}")
+        lines.append(f"  not visible so far: {unseen}")
     return [*lines, *found]
+
+
+def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
+    """Name the modes that the record does not show so far; empty if it shows all.
+
+    Parameters
+    ----------
+    modes
+        As answers of the online fit have them.
+
+    Examples
+    --------
+    >>> from rigd.session import unseen_modes
+    >>> unseen_modes([{"mode": n, "shown": n == 1} for n in (1, 2, 3)])
+    'modes 2 and 3'
+    """
+    unseen = [str(mode["mode"]) for mode in modes if not mode.get("shown", True)]
+    return f"mode{'s' if len(unseen) > 1 else ''} {listed(unseen)}" if unseen else ""
 
 
 def _change(before: Mapping[str, Any], mode: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from rigd.session import unseen_modes
 from rigd.units import suffix_of, unit_of, with_half_width, with_share
 from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
 from rigd.view._session_info import plain
@@ -164,9 +165,9 @@ def fit_table(fit: Fit | None) -> str:
     modes = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
     if modes:
         parts.append(_markdown("mode", "frequency (Hz)", "damping ratio (%)", rows=modes))
-    unseen = [str(mode["mode"]) for mode in fit.get("modes", ()) if not mode.get("shown", True)]
+    unseen = unseen_modes(fit.get("modes", ()))
     if unseen:
-        parts.append(f"Not visible so far: mode {' and '.join(unseen)}.")
+        parts.append(f"Not visible so far: {unseen}.")
     rows = [_parameter_row(*each) for each in fit.get("parameters", {}).items()]
     if rows:
         parts.append(_markdown("parameter", "value", rows=[row for row in rows if row]))

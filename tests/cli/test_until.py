@@ -63,6 +63,8 @@ def test_it_ends_when_the_precision_is_reached(done):
         assert damping["std"] <= ASKED * damping["value"]
     assert "Reached: damping of mode 1" in errors
     assert errors.count("± one standard deviation") == 1
+    decided_s = [float(row.split()[0]) for row in errors.splitlines() if ROW.match(row)]
+    assert decided_s == sorted(set(decided_s))  # by one estimate of each part of the record
 
 
 def test_analyze_says_of_the_file_what_the_session_said_last(done, record):

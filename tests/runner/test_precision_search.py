@@ -163,6 +163,18 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
     assert bench.search.due is None
 
 
+def test_before_a_judgement_all_structures_are_fitted_to_what_there_is(bench):
+    """So that the judgement has a start; a judgement has one already."""
+    bench.told(ON_THE_WAY)
+    assert not bench.search.looks_ahead(whole=False)
+    while not bench.search.may_be_last:
+        bench.told(CERTAIN)
+    assert bench.search.looks_ahead(whole=False)
+    assert not bench.search.looks_ahead(whole=True)
+    bench.told(CERTAIN)
+    assert not bench.search.looks_ahead(whole=False)  # it has ended
+
+
 @pytest.mark.further  # as a doubtful record
 def test_a_doubted_number_is_not_reached(bench):
     while not bench.search.may_be_last:

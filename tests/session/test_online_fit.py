@@ -31,7 +31,9 @@ STARTS = st.builds(
     segments=st.dictionaries(st.text(), st.tuples(TICKS, TICKS)),
     every_s=st.none() | st.floats(0.1, 1e3),
 )
-REQUESTS = st.builds(EstimateRequest, id=TICKS, tick=TICKS, whole=st.booleans())
+REQUESTS = st.builds(
+    EstimateRequest, id=TICKS, tick=TICKS, whole=st.booleans(), from_last=st.booleans()
+)
 BLOCKS = st.lists(st.tuples(TICKS, *[st.floats(width=64, allow_nan=False)] * 3), max_size=5).map(
     lambda rows: b"".join(packed(*row) for row in rows)
 )
