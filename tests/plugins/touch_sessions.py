@@ -1,5 +1,6 @@
 """A session whose antenna strikes an obstacle, simulated by other code than the estimator's."""
 
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,10 +83,14 @@ def written(path, struck, *, marked=True, metadata=None, profile=PROFILE, length
 
 
 @pytest.fixture(scope="session")
-def touch_file(tmp_path_factory):
-    struck: Struck
-    (struck,) = simulate([OBSTACLE], [Slew(1.0)], duration_s=0.95, steps=40, modes=24, seed=7)
-    path = written(tmp_path_factory.mktemp("touches") / "touch.mcap", struck)
+def touch_file(made_once):
+    def make(folder):
+        (made,) = simulate([OBSTACLE], [Slew(1.0)], duration_s=0.95, steps=40, modes=24, seed=7)
+        written(folder / "touch.mcap", made)
+        (folder / "struck.pickle").write_bytes(pickle.dumps(made))
+
+    path = made_once("touches", make) / "touch.mcap"
+    struck: Struck = pickle.loads(path.with_name("struck.pickle").read_bytes())
 
     def write(other, **changes):
         return written(other, struck, **changes)
