@@ -6,8 +6,6 @@ import threading
 import time
 from pathlib import Path
 
-import dask
-import distributed
 import pytest
 
 from analysis.campaigns import CampaignError, campaign
@@ -20,6 +18,8 @@ ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 @pytest.fixture(scope="module")
 def cluster():
     """Scheduler and one worker with two threads, in this process."""
+    import distributed  # here, as half a second for every worker is spared
+
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0"
     ) as made:
@@ -74,6 +74,8 @@ def test_a_worker_of_other_versions_is_told(said, words):
 
 
 def test_a_cluster_without_workers_is_told(monkeypatch):
+    import distributed
+
     monkeypatch.setattr(dask_workers, "_WORKERS_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
@@ -100,6 +102,9 @@ def test_without_dask_it_is_said_what_to_install(monkeypatch):
 
 @pytest.mark.further  # as test_workers.py
 def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
+    import dask
+    import distributed
+
     with (
         dask.config.set(ONE_DEATH_IS_ENOUGH),
         distributed.LocalCluster(
@@ -121,6 +126,8 @@ def until_it_is_gone(number):
 
 
 def test_a_scheduler_that_goes_away_is_told():
+    import distributed
+
     GONE.clear()
     processes = distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"

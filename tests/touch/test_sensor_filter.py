@@ -5,7 +5,6 @@ from math import pi, sqrt
 
 import numpy as np
 import pytest
-from scipy.signal import TransferFunction, lsim
 from struck_beam import OBSTACLES, cut
 from touch_records import DAMPED, LINK, SHEAR_NOISE_N, TORQUE_NOISE_NM, Slew, simulate
 
@@ -41,6 +40,8 @@ def test_a_low_pass_filter_is_the_one_of_the_books(kernels, order):
     low_pass = SensorFilter(corner_hz=150.0, order=order)
     seen = contact_kernels(LINK, DAMPED, PLACE, STEP_S, 400, low_pass)
     u = np.array([1 / corner, 1.0])
+    from scipy.signal import TransferFunction, lsim  # half a second for every worker
+
     system = TransferFunction([1.0], u if order == 1 else [u[0] ** 2, sqrt(2) * u[0], 1.0])
     _, told, _ = lsim(system, kernels.shear[0], np.arange(400) * STEP_S)
     assert seen.shear[0] == pytest.approx(told, abs=1e-2 * np.abs(told).max())
