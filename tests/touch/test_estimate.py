@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import further
 from struck_beam import MISTAKEN, OBSTACLES, begin_s, cut
 
 from rigd.touch import TouchRecord, estimate_touch
@@ -68,8 +69,19 @@ def test_what_is_no_obstacle_at_rest_is_not_called_one(told, name):
         assert low - 2e-3 < OBSTACLES[name].x_m < high + 2e-3
 
 
-@pytest.mark.parametrize("noticed", [4, 6])
-@pytest.mark.parametrize("name", MISTAKEN)
+# Each is noticed early or late; the other way round it is further.
+EARLY, LATE = 4, 6
+NOTICED_LATE = ("gives way slowly", "flees")
+
+
+@pytest.mark.parametrize(
+    ("name", "noticed"),
+    [
+        (name, noticed) if (noticed == LATE) == (name in NOTICED_LATE) else further(name, noticed)
+        for name in MISTAKEN
+        for noticed in (EARLY, LATE)
+    ],
+)
 def test_never_sure_of_a_wrong_point_or_kind(estimator, mistaken, name, noticed):
     """Bounces of what gives way, moves or comes in pairs fit an obstacle at rest elsewhere, too."""
     estimate = estimator.estimate(cut(mistaken[name], 190, noticed=noticed), scan=False)
