@@ -11,7 +11,8 @@ from analysis.campaigns._pooling import pooled_bic
 from analysis.campaigns._statistics import ranked_structures
 
 QUICK = (
-    "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50"
+    "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50",
+    "--figures", "png",
 )  # fmt: skip
 
 

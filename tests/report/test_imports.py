@@ -46,7 +46,7 @@ from analysis.cli.sessions import Outputs, session_command
 from analysis.models import WelchSettings
 from analysis.results import Routes
 from contextlib import redirect_stdout
-settings = WelchSettings(types=("I",), weightings=("const",), estimator="fft")
+settings = WelchSettings(types=("I",), weightings=("const",), estimator="fft", band_hz=(1.0, 20.0))
 routes = Routes(settings, paper=True, whole_record=True, fixed=(), figures=("png",))
 with redirect_stdout(sys.stderr):
     assert session_command([Path(sys.argv[1])], routes, Outputs(Path(sys.argv[2]))) == 0

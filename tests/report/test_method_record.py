@@ -67,7 +67,8 @@ def test_warnings_are_told_where_welch_s_fits_are_not_made(
     monkeypatch.chdir(tmp_path)
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     write_session("a.mcap", signals, metadata={"excitation": "touch"})
+    brief = ("--band", "1,20", "--figures", "png")
     for method in ("record", "all"):
-        result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method])
+        result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method, *brief])
         assert result.stdout.count("Warning: The session is a touch") == 1
         assert result.output.count("Welch fits left out") == (method == "all")

@@ -13,7 +13,7 @@ from analysis.report import _style as style
 from analysis.report._document import document_text
 from analysis.report._folder import write_new
 
-ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
+ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega", "--figures", "png")
 
 
 @pytest.fixture(scope="module")
