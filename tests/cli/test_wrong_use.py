@@ -81,8 +81,10 @@ def test_an_absurd_option_is_refused(rigd_here, tmp_path, arguments, words):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken"]
 
 
-def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(rigd, tmp_path):
-    done = rigd("run", "chirp", "--fast", "--amplitude", "0.25")
+def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(
+    rigd_here, tmp_path
+):
+    done = rigd_here("run", "chirp", "--fast", "--amplitude", "0.25")
     assert_refused(done, 2, "torque", "0.9 N·m", "peak_torque_nm")
     assert not (tmp_path / "sessions").exists()
 

@@ -103,11 +103,8 @@ def test_wrong_use(rigd_here, tmp_path, options, code, words):
     assert not list(tmp_path.rglob("*.mcap*"))
 
 
-def test_a_session_of_another_kind_is_refused(rigd, rigd_here, tmp_path):
-    ran = rigd("run", "hold", "--fast", "--duration", "1", "--output", "out")
-    assert ran.returncode == 0, ran.stderr
-    file = next((tmp_path / "out").iterdir())
-    done = rigd_here("identify", "motor", "--from", file)
+def test_a_session_of_another_kind_is_refused(rigd_here, short_chirps):
+    done = rigd_here("identify", "motor", "--from", short_chirps[0])
     assert done.returncode == 1
     assert "was not recorded by rigd identify motor" in done.stderr
     assert done.stdout == ""
