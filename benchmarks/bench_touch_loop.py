@@ -1,0 +1,125 @@
+"""What the detection of touches costs the control loop: lateness and work of a tick.
+
+    python benchmarks/bench_touch_loop.py [PASSES] [ROUNDS]
+
+In each round two whole real-time sessions of the simulated rig with the same reference, 4 s a pass,
+in turn the one or the other first: passes in search of an obstacle, of which there is none, and the
+same passes of which the loop is not told that they are a search. Both have the recorder; with the
+search go the detector in each tick and the waiting process of the estimates. Ratios and differences
+are of each round; the best and the median over the rounds are printed.
+"""
+
+import statistics
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rigd.bench import Figures, Measurement, figures, measurement
+from rigd.bench import _loops as loops
+from rigd.bench._measure import UsageMeter
+from rigd.checks import settings_granted
+from rigd.excitation import Excitation, touch
+from rigd.profile import Profile, load_profile
+from rigd.runner import LoopPreview, Order, SessionProgress
+from rigd.runner._touch_search import touch_search
+from rigd.runtime import StopRequest, use_one_thread
+from rigd.session import Status, read_session
+
+RATE_HZ = 1000.0
+WITHOUT, WITH = "without detector", "with detector"
+MOST_LATER, MOST_WORK_US = 1.2, 15.0
+"""Targets: ratio of the lateness, and what is added to the work of a tick."""
+
+
+def search(profile: Profile, passes: int) -> Excitation:
+    """Return passes in search of an obstacle."""
+    return touch(
+        rate_hz=RATE_HZ,
+        angle_rad=0.8,
+        passes=passes,
+        rest_s=0.5,
+        ring_down_s=0.5,
+        rig=LoopPreview(profile),
+    )
+
+
+def session(name: str, profile: Profile, excitation: Excitation) -> Measurement:
+    """Run a session and measure its loop."""
+    with (
+        tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
+        loops.connected(profile) as (rig, group),
+    ):
+        meter = UsageMeter(group.control.pid)
+
+        def watch(progress: SessionProgress, _: object) -> None:
+            meter.look(progress.phase)
+
+        order = Order(
+            profile,
+            excitation,
+            Path(folder) / "bench.mcap",
+            touch=touch_search(profile, excitation),
+        )
+        result = rig.run(order, StopRequest(), watch)
+        if result.outcome != "complete" or result.path is None:
+            raise SystemExit(f"The session {name} was not completed: {result.reason}")
+        samples = read_session(result.path).samples
+    if np.any(samples["status"] & int(Status.TOUCHED)):
+        raise SystemExit("A touch was detected where there was none: the motions differ.")
+    return measurement(
+        name,
+        RATE_HZ,
+        samples,
+        scheduled=excitation.reference_rad.size,
+        cpu_percent=meter.cpu_percent,
+        page_faults=meter.page_faults,
+    )
+
+
+def show(one: Measurement) -> tuple[Figures, Figures]:
+    """Print a session, in µs; return its lateness and work."""
+    late, work = figures(one.lateness_us), figures(one.work_us)
+    cpu = "" if one.cpu_percent is None else f"  CPU {one.cpu_percent:.1f} %"
+    print(
+        f"  {one.name:17s} late p50 {late.p50:5.1f} p99 {late.p99:6.1f} max {late.largest:6.0f}  "
+        f"missed {one.missed} of {one.scheduled}  "
+        f"work p50 {work.p50:5.1f} p99 {work.p99:5.1f}{cpu}",
+        flush=True,
+    )
+    return late, work
+
+
+def main() -> None:
+    """Print every session, then what the detector adds."""
+    passes = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    rounds = int(sys.argv[2]) if len(sys.argv) > 2 else 6
+    use_one_thread()
+    profile = loops.rig_for(load_profile("sim"), RATE_HZ, 0.0)
+    granted = settings_granted(profile.realtime)
+    print("; ".join(f"{name} {text}" for name, text in granted.items()))
+    searching = search(profile, passes)
+    motions = {WITHOUT: replace(searching, approach=None), WITH: searching}
+    later: dict[str, list[float]] = {"p50": [], "p99": []}
+    more_us: dict[str, list[float]] = {"p50": [], "p99": []}
+    for number in range(rounds):
+        print(f"round {number + 1}")
+        order = list(motions) if number % 2 == 0 else list(reversed(motions))
+        found = {name: show(session(name, profile, motions[name])) for name in order}
+        (late, work), (late_with, work_with) = found[WITHOUT], found[WITH]
+        for which in ("p50", "p99"):
+            later[which].append(getattr(late_with, which) / getattr(late, which))
+            more_us[which].append(getattr(work_with, which) - getattr(work, which))
+    for which in ("p50", "p99"):
+        print(
+            f"{which}: lateness with the detector over without, best {min(later[which]):.2f}, "
+            f"median {statistics.median(later[which]):.2f} (at most {MOST_LATER:g}); work of a "
+            f"tick, best {min(more_us[which]):+.1f} µs, median "
+            f"{statistics.median(more_us[which]):+.1f} µs (at most +{MOST_WORK_US:g})"
+        )
+
+
+if __name__ == "__main__":
+    main()
