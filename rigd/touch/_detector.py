@@ -4,8 +4,8 @@ The innovations of the last ticks are compared with the signatures of touches. E
 product with a unit vector: a normal deviate of standard deviation 1 in white noise, and the largest
 that any linear test can make of a touch of that place, shape and age. The tail of the normal
 distribution sets the threshold for a stated rate of false alarms. The model's error is allowed for
-by a share of the torque and shear that it predicts, and by what the innovations of the last moments
-have been: where a chirp passes a mode that is not quite where the model has it, they grow.
+by a share of the torque and shear that it predicts, and by how large the comparisons of the last
+moments have been: where a chirp passes a mode that is not quite where the model has it, they grow.
 
 References
 ----------
@@ -32,7 +32,7 @@ standard deviations."""
 _AGE_TICKS: Final = 8
 """Ticks over which an error of the model is taken to add up."""
 _RECENT: Final = 1 / 600
-"""Share of a tick in the power of the last moments, from the oldest one that is compared on."""
+"""Share of a tick in the mean square of the last moments, as far back as a touch may have begun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,8 @@ class DetectorSettings:
         Examples
         --------
         >>> from rigd.touch import DetectorSettings
-        >>> round(DetectorSettings().threshold(1000.0, signatures=216), 2)
-        6.57
+        >>> round(DetectorSettings().threshold(1000.0, signatures=500), 2)
+        6.69
         """
         tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT * signatures)
         return -NormalDist().inv_cdf(0.5 * self.false_alarms_per_hour / tests_per_hour)
@@ -93,9 +93,10 @@ class TouchDetector:
         "_compared",
         "_filter",
         "_last",
+        "_mean_squares",
         "_measuring",
         "_place",
-        "_powers",
+        "_recent",
         "_squares",
         "_threshold",
         "_ticks",
@@ -114,14 +115,16 @@ class TouchDetector:
         self._measuring = True
         self._squares = [0.0, 0.0]
         self._ticks = 0
-        self._compare = np.asfortranarray(signatures).dot
-        self._compared = np.empty(len(signatures))
+        # Single precision: in each tick half as much memory has to come back into the cache.
+        self._compare = np.asfortranarray(signatures, np.float32).dot
+        self._compared = np.empty(len(signatures), np.float32)
         # The last innovations stand twice in a ring, so that they always lie in one piece.
         width = signatures.shape[1]
-        self._last = np.zeros(2 * width)
+        self._last = np.zeros(2 * width, np.float32)
         self._windows = [self._last[start : start + width] for start in range(2, width + 2, 2)]
         self._place = 0
-        self._powers = [1.0, 1.0]
+        self._mean_squares = [1.0] * len(self._windows)
+        self._recent = 1.0
         self.noise = (1.0, 1.0)
         self.level = 0.0
 
@@ -134,7 +137,9 @@ class TouchDetector:
         self._measuring = False
         self._armed = True
         self._last[:] = 0.0
-        self._powers = [1.0, 1.0]
+        # In white noise the comparisons have a mean square of 1.
+        self._mean_squares = [1.0] * len(self._windows)
+        self._recent = 1.0
 
     def disarm(self) -> None:
         """Go on following the beam, but judge no more."""
@@ -185,22 +190,22 @@ class TouchDetector:
                 self._ticks += 1
             return False
         torque_noise, shear_noise = self.noise
-        last, place, powers = self._last, self._place, self._powers
+        last, place = self._last, self._place
         half = last.size >> 1
-        old_torque, old_shear = last[2 * place : 2 * place + 2].tolist()
-        powers[0] += _RECENT * (old_torque * old_torque - powers[0])
-        powers[1] += _RECENT * (old_shear * old_shear - powers[1])
         last[2 * place] = last[2 * place + half] = torque / torque_noise
         last[2 * place + 1] = last[2 * place + 1 + half] = shear / shear_noise
-        compared = self._compared
+        compared, mean_squares = self._compared, self._mean_squares
         self._compare(self._windows[place], compared)
+        # A touch must not raise the level against itself: those that reach back to it wait.
+        self._recent += _RECENT * (mean_squares[place] - self._recent)
+        mean_squares[place] = float(compared.dot(compared)) / compared.size
         self._place = place + 1 if place + 1 < len(self._windows) else 0
         u, v = filter_.predicted
         u /= torque_noise
         v /= shear_noise
         largest = max(compared.max(), -compared.min())
         error2 = self._tolerance2 * (u * u + v * v)
-        # The power and not its root: an error that swings adds up over the ticks.
-        excess = max(1.0, *powers) * sqrt(1.0 + error2)
+        # Not its root: an error that is growing is larger than it was in the moments before.
+        excess = max(1.0, self._recent) * sqrt(1.0 + error2)
         self.level = float(largest) / (self._threshold * excess)
         return self.level > 1.0

@@ -44,9 +44,10 @@ _WEIGHTED_FROM_HZ, _KNEE_HZ = 0.3, 50.0
 """Band in which the relative error counts fully. No motor moves much above, where a close fit
 would only make more of the encoder's steps."""
 _OBSERVED_MODES = 4
-_OBSERVER_RAD_S = 15.0
-"""How fast the observer takes up ringing that it did not foresee: slow against a touch (10 ms),
-fast against the drift in phase of a model whose frequencies are 1 % wrong."""
+_OBSERVER_RAD_S = 6.0
+"""How fast the observer takes up ringing that it did not foresee: slow against a touch (at 15 rad/s
+it takes up a tenth of one within 10 ms), fast against the drift in phase of a model whose
+frequencies are 1 % wrong."""
 _ZERO_RAD_S = 0.5
 """The same of the zero of a channel."""
 

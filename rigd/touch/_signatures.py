@@ -1,19 +1,22 @@
 """Signatures of touches: what the innovations look like in the first ticks after a contact.
 
-A touch far from the root shows late and with many signs, a soft one rises slowly. For a grid of
-places and a few shapes of the force the exact model tells torque and base shear, with the motor
-held; the filter of the innovations makes of them what the detector has to look for.
+A touch far from the root shows late and with many signs, one of a soft obstacle rises slowly, and a
+hard one lets go of the beam at once. The contact is linear but for the letting go, so that its
+shape does not depend on the speed: with the motor held, the beam is marched against obstacles of a
+grid of places and stiffnesses, and the filter of the innovations makes of torque and base shear
+what the detector has to look for. Of those that look alike one is enough.
 """
 
 from dataclasses import dataclass
-from math import pi
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping, PointForceGrid
+from rigd.beam import Beam, Damping
+from rigd.touch._contact import march, responses
 from rigd.touch._innovations import InnovationFilter, Noise, ObservedBeam, observed_beam
+from rigd.touch._kernels import contact_kernels
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 if TYPE_CHECKING:  # a loop that watches does not read models
@@ -21,18 +24,17 @@ if TYPE_CHECKING:  # a loop that watches does not read models
 
 Real = NDArray[np.float64]
 
-_PLACES = np.array([0.05, 0.1, 0.16, 0.23, 0.31, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98])
+_PLACES = np.linspace(0.04, 1.0, 33)
 """As shares of the length."""
-_PULSES_S = (1.5e-3, 6e-3)
-"""Half sines: hard obstacles let go of the beam at once."""
-_RISE_S = 0.03
-"""A soft one pushes harder and harder."""
-_AGES_S = (3e-3, 5e-3, 7e-3, 10e-3, 14e-3, 24e-3)
+_STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
+_AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
 """Time from the contact to the tick that is judged."""
-_FINER = 8
+_PHASES = 2
+"""Instants of the contact within a tick: bending waves change their sign from tick to tick."""
+_FINER = 16
 """Steps of the calculation in a tick."""
-_WRAPPED = 10.0
-"""The end of the transform's period wraps around to exp(-10) of itself."""
+_ALIKE = 0.9
+"""Correlation with a signature above which no other is needed: of 6864 remain 500."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +79,7 @@ def signatures(
     model: ObservedBeam,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> Real:
-    """Return unit vectors of the last innovations, one for each place, shape of force and age.
+    """Return unit vectors of the last innovations after contacts at any place, of any age.
 
     Parameters
     ----------
@@ -95,41 +97,54 @@ def signatures(
     ndarray of shape (signatures, 2 · ticks)
         Torque and shear of the oldest tick first.
     """
-    ages = [max(1, round(age_s * rate_hz)) for age_s in _AGES_S]
-    ticks = max(ages)
+    ages = np.maximum(1, np.round(_AGES_S * rate_hz)).astype(int)
+    ticks = int(ages.max())
     step_s = 1 / (_FINER * rate_hz)
-    steps = 8 * _FINER * ticks
-    t = np.arange(steps) * step_s
-    shift = _WRAPPED / (steps * step_s)
-    grown = np.exp(shift * t)
-    s = shift + 2j * pi * np.fft.rfftfreq(steps, step_s)
-    grid = PointForceGrid(s, beam, damping)
     places = beam.length_m * _PLACES
-    per_force = np.stack([grid.torque_per_force(places), grid.shear_per_force(places)])
-    per_force *= sensor_filter.response(s)[:, None]
-    forces = [np.where(t < pulse, np.sin(pi * t / pulse), 0.0) for pulse in _PULSES_S]
-    forces.append(np.minimum(t / _RISE_S, 1.0))
+    kernels = contact_kernels(beam, damping, places, step_s, _FINER * ticks + 1, sensor_filter)
+    approach = places[:, None] * step_s * np.arange(kernels.steps)
+    per_tick = _impulse_responses(model, ticks)
 
     found = []
-    for force in forces:
-        transform = np.fft.rfft(force / grown)[:, None]
-        readings = np.fft.irfft(per_force * transform, steps, axis=1) * grown[:, None]
-        for torque, shear in np.moveaxis(readings[:, ::_FINER], -1, 0):
-            white = _whitened(model, torque[: ticks + 1], shear[: ticks + 1])[1:]
+    for stiffness in _STIFFNESSES_N_PER_M:
+        force = march(kernels.displacement, approach, np.full(places.size, stiffness), step_s)
+        readings = responses(
+            (kernels.torque, kernels.shear), force, _FINER // _PHASES, _PHASES * ticks + 1
+        )
+        for phase in range(1, _PHASES + 1):
+            at_ticks = readings[:, :, phase::_PHASES].transpose(0, 2, 1).reshape(-1, 2 * ticks)
+            white = at_ticks @ per_tick
             for age in ages:
-                vector = np.zeros((ticks, 2))
-                vector[ticks - age :] = white[:age]
-                found.append(vector.ravel())
-    rows = np.array(found)
-    size = np.linalg.norm(rows, axis=1)
-    told: Real = rows[size > 0] / size[size > 0, None]
-    return told
+                rows = np.zeros_like(white)
+                rows[:, 2 * (ticks - age) :] = white[:, : 2 * age]
+                found.append(rows)
+    every = np.concatenate(found)
+    size = np.linalg.norm(every, axis=1)
+    return _distinct(every[size > 0] / size[size > 0, None])
 
 
-def _whitened(model: ObservedBeam, torque: Real, shear: Real) -> Real:
-    filter_ = InnovationFilter(model)
-    white = np.empty((torque.size, 2))
-    for tick, readings in enumerate(zip(torque.tolist(), shear.tolist(), strict=True)):
-        filter_.step(0.0, *readings)
-        white[tick] = filter_.whitened
-    return white
+def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
+    """Return (2 · ticks, 2 · ticks): [torque, shear] of each tick times it are the innovations."""
+    table = np.zeros((2 * ticks, 2 * ticks))
+    for channel, impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
+        filter_ = InnovationFilter(model)
+        for tick in range(ticks):
+            filter_.step(0.0, *(impulse if tick == 0 else (0.0, 0.0)))
+            for begin in range(ticks - tick):
+                at = 2 * (begin + tick)
+                table[2 * begin + channel, at : at + 2] = filter_.whitened
+    return table
+
+
+def _distinct(rows: Real) -> Real:
+    """Return so many of the unit vectors that each of the others is like one of them.
+
+    The next one is always that which is least like those before.
+    """
+    chosen = [0]
+    likeness = np.abs(rows @ rows[0])
+    while likeness.min() < _ALIKE:
+        farthest = int(likeness.argmin())
+        chosen.append(farthest)
+        np.maximum(likeness, np.abs(rows @ rows[farthest]), out=likeness)
+    return rows[chosen]
