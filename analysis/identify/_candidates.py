@@ -40,12 +40,9 @@ if TYPE_CHECKING:
 FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
 
-_FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["V"], STRUCTURES["VI"])
-"""Fitted there as well if such a beam is the best, as on any other kind. Where the modes are free
-their frequencies say nothing of the orders, only their damping does."""
-
 _DISMISSED: Final = 10.0
-"""Difference of BIC by which these must be better for the noise to be estimated again."""
+"""Difference of BIC by which another kind of rig must be better to be told instead of a uniform
+beam, and by which orders that are freed must be better for the noise to be estimated again."""
 
 _SHOWS: Final = 4.0
 """Deviance that a damping must save to stay in the freest structure: one that saves less moves no
@@ -273,16 +270,24 @@ class CandidateSet:
         the order would be. The uniform beam without anything beside it gives way to a BIC that is
         lower by 10 only.
         """
-        plain = self._freest_of(_PLAIN)
-        other = self._freest_of(self.best.kind)
+        plain = self.freest_of(_PLAIN)
+        other = self.freest_of(self.best.kind)
         if plain is None or (other is not None and other.bic < plain.bic - _DISMISSED):
             return other or self.best
         return plain
 
-    def _freest_of(self, kind: Kind) -> Candidate | None:
+    def freest_of(self, kind: Kind) -> Candidate | None:
         """Find the freest on one kind of rig; a damping that does not show is left out.
 
-        None if no structure was fitted with its orders free there.
+        Parameters
+        ----------
+        kind : tuple of bool and tuple of str
+            As `Candidate.kind`.
+
+        Returns
+        -------
+        Candidate or None
+            None if no structure was fitted with its orders free there.
         """
         alike = {c.structure.name: c for c in self.candidates if c.kind == kind}
         freest = alike.get(_FREEST.name)
@@ -476,9 +481,7 @@ class CandidateSet:
         fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
         doubtful = [_INTEGER] if not low <= 1 <= high else []
-        for structure, other in zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True):
-            if other is None or other.value < _CERTAIN * other.std:
-                doubtful.append(structure)
+        doubtful += _may_lack_one(fit)
         found = []
         for structure in doubtful:
             unknowns = self.unknowns(structure, uniform=True)
@@ -551,15 +554,23 @@ class CandidateSet:
     def with_orders_free(self) -> CandidateSet:
         """Free the orders too, on a beam of the best's kind, if that was not done."""
         best = self.best
-        known = {c.structure.name for c in self.candidates if c.kind == best.kind}
-        found = []
-        for structure in _FREE_ORDERS:
-            if structure.name not in known:
-                unknowns = self.unknowns(structure, best.uniform, best.extras)
-                found.append(self.descent(unknowns, unknowns.vector(best.fit.plant), MANY))
+        alike = {c.structure.name: c.fit for c in self.candidates if c.kind == best.kind}
+        found: list[Refit] = []
+        added: list[Candidate] = []
+
+        def fitted(structure: Structure) -> RecordFit:
+            unknowns = self.unknowns(structure, best.uniform, best.extras)
+            found.append(self.descent(unknowns, unknowns.vector(best.fit.plant), MANY))
+            added.append(found[-1].candidate())
+            return added[-1].fit
+
+        freest = alike.get(_FREEST.name) or fitted(_FREEST)
+        for structure in _may_lack_one(freest):
+            if structure.name not in alike:
+                fitted(structure)
         if not found:
             return self
-        freed = self.ranked((*self.candidates, *(refit.candidate() for refit in found)))
+        freed = self.ranked((*self.candidates, *added))
         if freed.best.bic > best.bic - _DISMISSED:
             return freed.cross_checked()
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
@@ -586,6 +597,16 @@ class CandidateSet:
         """Whether chance may have shaped what a fit leaves, once in a hundred records at least."""
         counts = self.noise.counts
         return whiteness(fit.residual[counts], self.comparison.frequency_hz[counts]).all_but_white
+
+
+def _may_lack_one(fit: RecordFit) -> list[Structure]:
+    """Structures without one of the dampings, where a fit does not show it beyond doubt."""
+    beside = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    return [
+        structure
+        for structure, other in beside
+        if other is None or other.value < _CERTAIN * other.std
+    ]
 
 
 def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:

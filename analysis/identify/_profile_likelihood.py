@@ -147,6 +147,7 @@ def profile(field: CandidateSet, candidate: Candidate, order: Order) -> Profiled
     """
     walk = Walk(field, candidate, order)
     walk.both_ways()
+    walk.from_candidates()
     walk.elsewhere()
     values, deviance = walk.curve()
     bottoms = valleys(values, deviance)
@@ -276,7 +277,7 @@ class Walk:
     def __init__(self, field: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
         self.structure = with_order(candidate.structure, order)
-        self._field, self._values = field, candidate.values
+        self._field, self._values, self._kind = field, candidate.values, candidate.kind
         self._unknowns = unknowns = field.unknowns(
             self.structure, candidate.uniform, candidate.extras
         )
@@ -306,6 +307,24 @@ class Walk:
         """Walk from where it stands."""
         for sign in (-1.0, 1.0):
             self._outwards(sign)
+
+    def from_candidates(self) -> None:
+        """Walk from where special cases lie that are as good, and outside of what is admitted.
+
+        The order is fixed there, mostly to 1. A ridge over which no refit leads may part them from
+        the minimum.
+        """
+        coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
+        for candidate in self._field.candidates:
+            special = candidate.structure.has(coefficient) and free > set(candidate.structure.free)
+            if candidate.kind != self._kind or not special:
+                continue
+            (low, high), *_ = admitted(*self.curve())
+            behind = self._values * math.log(candidate.fit.cost / min(self.costs.values()))
+            if behind < CHI_SQUARE_95 and not low <= candidate.fit.parameters[self.order] <= high:
+                start = self._unknowns.vector(candidate.fit.plant)
+                self._stand_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
+                self.both_ways()
 
     def elsewhere(self) -> None:
         """Look for another valley, if much of the range is admitted, and walk it."""

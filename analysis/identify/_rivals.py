@@ -62,10 +62,13 @@ _QUIETER: Final = 0.98
 
 def with_extras(field: CandidateSet) -> CandidateSet:
     """Add the candidates that explain more than the same structure does without an extra."""
+    freest = field.freest_of((True, ()))
+    # Without the damping that does not show: compared are kinds of rig, not what it costs to ask.
+    structures = _STRUCTURES if freest is None else (*_STRUCTURES, freest.structure)
     bare = {
         c.structure.name: c
         for c in field.candidates
-        if c.uniform and not c.extras and c.structure in _STRUCTURES
+        if c.uniform and not c.extras and c.structure in structures
     }
     lead = min(bare.values(), key=lambda c: c.fit.cost, default=None)
     if lead is None or "VI" not in bare:
@@ -189,9 +192,7 @@ def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> It
     if refit.promised_cost > max(most, bare["VI"].fit.cost * math.exp(-_HOPELESS / values)):
         return
     refit = refit.further(MANY)
-    for structure in _STRUCTURES:
-        if structure.name not in bare:
-            continue
+    for structure in (each.structure for each in bare.values()):
         if structure is not unknowns.structure:
             own = field.unknowns(structure, uniform=True, extras=unknowns.extras)
             first = field.descent(own, own.vector(refit.plant), 1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.identify._profile_likelihood import Walk, admitted, valleys
+from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
 
 COUNT = 1000
@@ -55,6 +56,23 @@ def test_both_valleys_are_found_from_either(start):
     assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
     assert high == pytest.approx(1.4 + WIDTH * (limit - 1) ** 0.5, abs=3e-3)
     assert is_open == [False, False]
+
+
+@pytest.mark.parametrize(("behind", "found"), [(1.0, True), (5.0, False)])
+def test_a_special_case_that_is_as_good_begins_a_walk(behind, found):
+    """As where order 1 fits as well, beyond a ridge that no refit crosses."""
+    at = 1.4
+    walk = DoubleWell(0.6)
+    walk.structure, walk._kind = STRUCTURES["VI"], "a rig"
+    walk._unknowns = SimpleNamespace(vector=lambda plant: np.array([plant]))
+    fit = SimpleNamespace(
+        cost=COUNT * math.exp(behind / COUNT), parameters={"lambda": at}, plant=at
+    )
+    special = SimpleNamespace(kind="a rig", structure=STRUCTURES["III"], fit=fit)
+    walk._field = SimpleNamespace(candidates=[special])
+    walk.both_ways()
+    walk.from_candidates()
+    assert (len(valleys(*walk.curve())) == 2) == found
 
 
 class Astray(DoubleWell):
