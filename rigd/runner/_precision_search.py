@@ -230,7 +230,7 @@ class Search:
         first, scan_rad = search.scan
         self._stretches = [_Stretch("scan", scan_rad, first, first)]
         self._pieces = self._scans = 0
-        self._shows_modes = False
+        self._shows_modes = self._judged = False
         self._hopeless = self._doubtful = self._between = 0
         self._share = 1.0
         self._course = _Course()
@@ -255,6 +255,7 @@ class Search:
         """
         last = self._stretches[-1]
         last.begins = last.place + held_before
+        self._judged |= self.may_be_last
         if document["problem"] or "plant" not in document:
             problem = document["problem"] or "Nothing could be fitted."
             if self._columns:
@@ -296,15 +297,13 @@ class Search:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
 
-    def looks_ahead(self, *, whole: bool) -> bool:
-        """Whether the next estimate may be the last, and the last one was of the freest alone.
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether all structures are to be fitted to what there is, while the rest is played.
 
-        Parameters
-        ----------
-        whole
-            Whether the estimate that was answered last tried every structure.
+        Before a pause, after which the first judgement would otherwise start from nothing.
         """
-        return self.due is not None and self.may_be_last and not whole
+        return self._stretches[-1].name == "pause" and not self._judged and self.due is not None
 
     def is_begun(self, begun: int) -> bool:
         """Whether what was planned last is being played: only then is it known from which tick on.

@@ -249,9 +249,9 @@ class _Follower:
         held, before = self._board[Word.HELD], self._board[Word.HELD_BEFORE]
         for message in search.answered(answer, held, before):
             self._parent.send(message)
-        if search.looks_ahead(whole=asked.whole):
-            # While what is planned is played, and nobody waits: the judgement of all of it starts
-            # from what all structures make of the samples before.
+        if search.looks_ahead:
+            # Nobody waits yet: the judgement of all of it starts from what all structures make of
+            # the samples before.
             self._request(asked.tick, whole=True, from_last=True)
             self._ahead = True
 

@@ -163,16 +163,22 @@ def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
     assert bench.search.due is None
 
 
-def test_before_a_judgement_all_structures_are_fitted_to_what_there_is(bench):
-    """So that the judgement has a start; a judgement has one already."""
-    bench.told(ON_THE_WAY)
-    assert not bench.search.looks_ahead(whole=False)
+def test_before_the_first_judgement_all_structures_are_fitted_to_what_there_is(
+    profile, quick_pauses
+):
+    """So that it has a start; later ones have that of the one before."""
+    bench = Bench(profile)
+    assert not bench.search.looks_ahead
+    bench.told(CERTAIN)
+    assert bench.search.may_be_last
+    assert bench.search.looks_ahead
+    bench.told(CERTAIN, flag="part of the record is unexplained")
     while not bench.search.may_be_last:
         bench.told(CERTAIN)
-    assert bench.search.looks_ahead(whole=False)
-    assert not bench.search.looks_ahead(whole=True)
+    assert not bench.search.looks_ahead
     bench.told(CERTAIN)
-    assert not bench.search.looks_ahead(whole=False)  # it has ended
+    assert bench.search.due is None
+    assert not bench.search.looks_ahead
 
 
 @pytest.mark.further  # as a doubtful record
