@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 Kind = tuple[bool, tuple[str, ...]]
 """Kind of rig: whether the beam is uniform, and what else is free."""
 
+PLAIN: Final[Kind] = (True, ())
+"""A uniform beam, and nothing beside it."""
+
 
 MODES_FREE: Final = "modes free"
 """What tables call a beam whose modes have stiffnesses of their own."""

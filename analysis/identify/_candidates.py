@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND, Candidate, Kind
+from analysis.identify._candidate import FAR_BEHIND, PLAIN, Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._knock import knock_in, with_knock
 from analysis.identify._leakage import without_leakage
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._plant import SETTINGS
+from analysis.identify._plant import free_settings
 from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._rivals import with_extras
@@ -50,9 +50,6 @@ other parameter by more than two standard deviations, and only makes them uncert
 
 _CERTAIN: Final = 5.0
 """Size of a damping, in its standard deviations, from which it shows in any case."""
-
-_PLAIN: Final[Kind] = (True, ())
-"""Kind of rig: a uniform beam, and nothing beside it."""
 
 _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
@@ -151,12 +148,10 @@ class CandidateSet:
             if found is not None and found.obvious:
                 struck = self.of(with_knock(measurement, found), fixed, band_hz)
                 if struck.all_but_white(struck.likeliest):
-                    # Obvious beside a uniform beam; another rig may need no knock.
-                    without = (
-                        None
-                        if struck.best.kind == _PLAIN
-                        else self.from_earlier(struck.candidates, measurement, fixed, band_hz)
-                    )
+                    if struck.best.kind == PLAIN:
+                        return struck
+                    # Obvious beside a uniform beam: this rig may need no knock.
+                    without = self.from_earlier(struck.candidates, measurement, fixed, band_hz)
                     return without or struck
         if field.shows_modes:
             field = (
@@ -195,10 +190,10 @@ class CandidateSet:
             The record cannot be used.
         """
         first, *others = earlier
-        plain = first.kind == _PLAIN
+        plain = first.kind == PLAIN
         if first.columns:
             return None  # what was not linear is looked for anew, beside what is
-        free = tuple(name for name in SETTINGS if name not in fixed)
+        free = free_settings(fixed)
         modes = 1 + len(first.fit.plant.stiffness_offsets)
         unknowns = Unknowns.of(first.structure, measurement.nominal, free, modes, first.extras)
         found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
@@ -250,7 +245,7 @@ class CandidateSet:
         return cls(
             comparison=comparison,
             noise=analysis.noise,
-            free=tuple(name for name in SETTINGS if name not in fixed),
+            free=free_settings(fixed),
             candidates=_ranked(candidates),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
@@ -270,7 +265,7 @@ class CandidateSet:
         the order would be. The uniform beam without anything beside it gives way to a BIC that is
         lower by 10 only.
         """
-        plain = self.freest_of(_PLAIN)
+        plain = self.freest_of(PLAIN)
         other = self.freest_of(self.best.kind)
         if plain is None or (other is not None and other.bic < plain.bic - _DISMISSED):
             return other or self.best
@@ -332,7 +327,7 @@ class CandidateSet:
         tuple of Candidate
             The lowest BIC first.
         """
-        beaten = {_PLAIN, self.freest.kind}
+        beaten = {PLAIN, self.freest.kind}
         ranked = _ranked(self.candidates)
         return tuple(
             each for each in ranked if each.kind not in beaten and each.bic < ranked[0].bic + within
@@ -363,8 +358,19 @@ class CandidateSet:
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
         """Descend from where a candidate is."""
-        unknowns = self.unknowns(candidate.structure, candidate.uniform, candidate.extras)
-        return self.descent(unknowns, unknowns.vector(candidate.fit.plant), max_evaluations)
+        plant = candidate.fit.plant
+        return self.descent_from(plant, candidate.structure, candidate.kind, max_evaluations)
+
+    def descent_from(
+        self,
+        plant: Plant,
+        structure: Structure,
+        kind: Kind = PLAIN,
+        max_evaluations: int = MANY,
+    ) -> Refit:
+        """Descend from a plant, with a structure on a kind of rig."""
+        unknowns = self.unknowns(structure, *kind)
+        return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
     def descent(
         self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
@@ -460,8 +466,7 @@ class CandidateSet:
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
-        unknowns = self.unknowns(structure, candidate.uniform, candidate.extras)
-        outlook = self.descent(unknowns, unknowns.vector(plant), 1)
+        outlook = self.descent_from(plant, structure, candidate.kind, 1)
         least = candidate.fit.cost * (1 - MISSED)
         if outlook.promised_cost > least:
             return candidate
@@ -482,10 +487,7 @@ class CandidateSet:
         low, high = fit.interval["alpha"] or (math.inf, -math.inf)
         doubtful = [_INTEGER] if not low <= 1 <= high else []
         doubtful += _may_lack_one(fit)
-        found = []
-        for structure in doubtful:
-            unknowns = self.unknowns(structure, uniform=True)
-            found.append(self.descent(unknowns, unknowns.vector(fit.plant), MANY).candidate())
+        found = (self.descent_from(fit.plant, structure).candidate() for structure in doubtful)
         field = self.ranked((*self.candidates, *found)).cross_checked()
         return field.led_by(field.freest)
 
@@ -498,10 +500,9 @@ class CandidateSet:
             As the judgement of an earlier part of the record has found it.
         """
         extras = tuple(name for name, size in plant.extras.items() if size)
-        unknowns = self.unknowns(_FREEST, not plant.stiffness_offsets, extras)
-        refit = self.descent(unknowns, unknowns.vector(plant), MANY)
+        refit = self.descent_from(plant, _FREEST, (not plant.stiffness_offsets, extras))
         field = self.ranked((*self.candidates, refit.candidate()))
-        if field.best.kind != _PLAIN and field.best.bic < self.best.bic - _DISMISSED:
+        if field.best.kind != PLAIN and field.best.bic < self.best.bic - _DISMISSED:
             # What the plain beam does not explain counted as noise.
             field = field.under(refit.noise_here())._renewed()
         return field.led_by(field.freest)
@@ -559,8 +560,7 @@ class CandidateSet:
         added: list[Candidate] = []
 
         def fitted(structure: Structure) -> RecordFit:
-            unknowns = self.unknowns(structure, best.uniform, best.extras)
-            found.append(self.descent(unknowns, unknowns.vector(best.fit.plant), MANY))
+            found.append(self.descent_from(best.fit.plant, structure, best.kind))
             added.append(found[-1].candidate())
             return added[-1].fit
 

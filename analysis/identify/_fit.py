@@ -11,7 +11,7 @@ import numpy as np
 from analysis.identify._candidate import FAR_BEHIND
 from analysis.identify._comparison import Comparison
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._plant import SETTINGS
+from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._result import RecordAnalysis, RecordFit
@@ -96,7 +96,7 @@ def fit_record(
     unknown = sorted(set(fixed) - set(SETTINGS))
     if unknown:
         raise ValueError(f"{unknown} cannot be fixed: choose from {SETTINGS}.")
-    free = tuple(name for name in SETTINGS if name not in fixed)
+    free = free_settings(fixed)
     comparison = Comparison.of(measurement, band_hz)
     nominal = measurement.nominal
     coarse = CoarseResponse(comparison)

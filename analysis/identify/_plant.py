@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rigd.beam import Beam, Damping
 
 Setting = Literal[
@@ -19,6 +21,17 @@ SETTINGS: Final[tuple[Setting, ...]] = (
 )
 """What is free beside the damping unless it is fixed: rho/EI in s²/m⁴, EI in N·m², by how much the
 torque is older than the angle, and the inertia between torque sensor and beam."""
+
+
+def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
+    """All `SETTINGS` but some, in their order.
+
+    Parameters
+    ----------
+    fixed : collection of str
+    """
+    return tuple(name for name in SETTINGS if name not in fixed)
+
 
 Extra = Literal[
     "root_compliance_rad_per_nm",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._candidate import PLAIN
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import ln_stiffness_with_tip
 from analysis.identify._plant import EXTRAS
@@ -62,7 +63,7 @@ _QUIETER: Final = 0.98
 
 def with_extras(field: CandidateSet) -> CandidateSet:
     """Add the candidates that explain more than the same structure does without an extra."""
-    freest = field.freest_of((True, ()))
+    freest = field.freest_of(PLAIN)
     # Without the damping that does not show: compared are kinds of rig, not what it costs to ask.
     structures = _STRUCTURES if freest is None else (*_STRUCTURES, freest.structure)
     bare = {
@@ -194,8 +195,7 @@ def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> It
     refit = refit.further(MANY)
     for structure in (each.structure for each in bare.values()):
         if structure is not unknowns.structure:
-            own = field.unknowns(structure, uniform=True, extras=unknowns.extras)
-            first = field.descent(own, own.vector(refit.plant), 1)
+            first = field.descent_from(refit.plant, structure, (True, unknowns.extras), 1)
             if first.promised_cost > most:
                 continue
             first = first.further(FEW)

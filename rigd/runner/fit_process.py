@@ -228,6 +228,7 @@ class _Follower:
         asked, search = self._asked, self._search
         if asked is not None and asked.id != answer["id"]:
             asked = None
+        # The last estimate alone is asked for from nothing.
         final = asked is not None and asked.tick == self._ended_after and not asked.from_last
         ahead = self._ahead
         if asked is not None:
