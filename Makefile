@@ -4,9 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Hundreds of processes start in the tests: each would compile every module once more.
 unexport PYTHONDONTWRITEBYTECODE
-# The operator's page in a browser: its driver keeps an event loop running, beside which no other
-# test can have one. So it has processes of its own, a file of tests in each.
-BROWSER := -n 2 --dist loadfile tests/web
+# Each worker takes what others have not begun: some tests take a second, some a millisecond.
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
 .PHONY: demo test test-further test-all test-fast check bench fuzz chaos endurance clean
 
@@ -19,22 +18,19 @@ demo: $(VENV)/ready
 
 # Five minutes on two processors: every behaviour once.
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not further and not slow and not browser"
-	$(BIN)/python -m pytest $(BROWSER) -m "browser and not further and not slow"
+	$(PYTEST) -m "not further and not slow"
 
 # What is shown once more: over another transport, with other values, at more length.
 test-further: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "further and not slow and not browser"
-	$(BIN)/python -m pytest $(BROWSER) -m "browser and further and not slow"
+	$(PYTEST) -m "further and not slow"
 
 # Without what starts processes or fits models: a minute, for every edit.
 test-fast: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser and not process and not fit"
+	$(PYTEST) -m "not slow and not browser and not process and not fit"
 
 # All tests, also what is shown once more at full length.
 test-all: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not browser"
-	$(BIN)/python -m pytest $(BROWSER) -m browser
+	$(PYTEST)
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .
@@ -48,7 +44,7 @@ bench: $(VENV)/ready
 # The long run of what the tests do briefly: other examples of each property, a million frames at
 # each parser, 1200 damaged session files, and 1000 that are hostile; half an hour.
 fuzz: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis --hypothesis-profile=others
+	$(PYTEST) -m hypothesis --hypothesis-profile=others
 	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
 	$(BIN)/python tests/devices/ati/fuzz_ati.py 1000000
 	$(BIN)/python tests/sim/wire/drive/fuzz_drive_node.py 1000000

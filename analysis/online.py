@@ -417,7 +417,7 @@ _ALL: Final = 1 << 32
 
 
 def _answer(fit: OnlineFit, request: EstimateRequest) -> None:
-    estimate = fit.estimate(request.tick, whole=request.whole)
+    estimate = fit.estimate(request.tick, whole=request.whole, from_last=request.from_last)
     line = json.dumps({"id": request.id, **estimate.as_json()}, allow_nan=False)
     sys.stdout.write(line + "\n")
     sys.stdout.flush()

@@ -11,7 +11,7 @@ import pytest
 from cases import further
 
 from analysis.identify import Measurement, freest_alone, select
-from analysis.online import OnlineFit
+from analysis.online import OnlineEstimate, OnlineFit, serve
 from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
@@ -313,6 +313,21 @@ def test_the_program_answers_to_requests(session, program):
     noise = answers[1]["noise"]
     white = np.median(noise["nm2_per_hz"]) * 500
     assert white == pytest.approx(session_noise_nm2(session), rel=0.5)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("from_last", [False, True])
+def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, capsys, whole, from_last):
+    asked = []
+
+    def estimate(_, tick, **how):
+        asked.append((tick, how))
+        return OnlineEstimate(tick, 1.0, whole, 0.0, problem="None here.")
+
+    monkeypatch.setattr(OnlineFit, "estimate", estimate)
+    serve(StreamStart({}, {}, None), iter([EstimateRequest(7, 9000, whole, from_last)]))
+    assert asked == [(9000, {"whole": whole, "from_last": from_last})]
+    assert json.loads(capsys.readouterr().out)["id"] == 7
 
 
 def session_noise_nm2(session) -> float:
