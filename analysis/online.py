@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import (
-        Candidate,
         Finding,
         Headline,
         OrderVerdict,
         Plant,
         RecordAnalysis,
         RecordFit,
+        Selection,
     )
     from analysis.record import Record
     from rigd.session import StreamStart
@@ -227,7 +227,7 @@ class OnlineFit:
         self._blocks: list[NDArray[np.void]] = []
         self._count = 0
         self._found: Plant | None = None
-        self._judged: tuple[Candidate, ...] = ()
+        self._judged: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
         """Take the next samples.
@@ -321,10 +321,9 @@ class OnlineFit:
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
             orders: tuple[OrderVerdict, ...] = ()
             if whole:
-                selection = select(
-                    measurement, band_hz=band_hz, earlier=self._judged if from_last else ()
-                )
-                self._judged = selection.candidates
+                before = self._judged if from_last else None
+                selection = select(measurement, band_hz=band_hz, earlier=before)
+                self._judged = selection
                 told, analysis = selection.headline, selection.analysis
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)

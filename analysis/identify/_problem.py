@@ -217,9 +217,11 @@ class Objective:
                 max_evaluations=max_evaluations,
                 hopeless=hopeless,
             )
-            converged = np.abs(found.x - x).max() < _CONVERGED
+            settled = objective is self or np.abs(found.x - x).max() < _CONVERGED
             x = found.x
-            if converged or objective is self:
+            # A descent that did not end does not end with torques that are put anew.
+            given_up = hopeless is not None and found.equations.cost > hopeless[1]
+            if settled or given_up or found.evaluations >= max_evaluations:
                 break
         return objective, found
 

@@ -20,6 +20,8 @@ from analysis.identify._refit import MISSED, Refit
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
@@ -131,7 +133,9 @@ class Profiled:
     cost: float
 
 
-def profile(field: CandidateSet, candidate: Candidate, order: Order) -> Profiled:
+def profile(
+    field: CandidateSet, candidate: Candidate, order: Order, *, elsewhere: bool = True
+) -> Profiled:
     """Walk away from the minimum both ways until the record excludes what lies beyond.
 
     Each refit starts on the tangent of the last, and each step goes to where the deviance, were it
@@ -144,11 +148,14 @@ def profile(field: CandidateSet, candidate: Candidate, order: Order) -> Profiled
     candidate : Candidate
         In whose structure the order is freed, if it is not free.
     order : str
+    elsewhere : bool
+        Whether there may be another valley.
     """
     walk = Walk(field, candidate, order)
     walk.both_ways()
     walk.from_candidates()
-    walk.elsewhere()
+    if elsewhere:
+        walk.elsewhere()
     values, deviance = walk.curve()
     bottoms = valleys(values, deviance)
     interval, open_below, open_above = admitted(values, deviance)
@@ -179,7 +186,9 @@ _ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
 _ROUNDS: Final = 3
 
 
-def profiled(field: CandidateSet, *, walk: bool = True) -> tuple[CandidateSet, Profile, Profile]:
+def profiled(
+    field: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
+) -> tuple[CandidateSet, Profile, Profile]:
     """Profile alpha and lambda in the freest structure on the best beam.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
@@ -188,6 +197,8 @@ def profiled(field: CandidateSet, *, walk: bool = True) -> tuple[CandidateSet, P
     Parameters
     ----------
     field : CandidateSet
+    settled : collection of str
+        Orders of which no other valley need be looked for.
     walk : bool
         Whether the orders can be told at all.
 
@@ -201,7 +212,7 @@ def profiled(field: CandidateSet, *, walk: bool = True) -> tuple[CandidateSet, P
         freest = field.freest
         # The order of a damping that does not show could be anything: no walk would tell more.
         walks = {
-            order: profile(field, freest, order)
+            order: profile(field, freest, order, elsewhere=order not in settled)
             for order in _ORDERS
             if walk and freest.structure.has(order)
         }
@@ -339,8 +350,9 @@ class Walk:
             start = self._first.x.copy()
             start[self._place] = value
             looks[value] = self._descend(start, _LOOKS, hold=(self.order,))
+        most = min(self.costs.values()) * math.exp(FAR_BEHIND / self._values)
         for value in dips({value: look.cost for value, look in looks.items()}):
-            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS)
+            bottom = self._descend(looks[value].x, _MAX_EVALUATIONS, hopeless=(_LOOKS, most))
             values, deviance = self.curve()
             at = float(bottom.x[self._place])
             here = self._values * math.log(bottom.cost / min(self.costs.values()))

@@ -47,12 +47,13 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable
 
-    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidate import Candidate, Kind
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._plant import Plant, Setting
+    from analysis.identify._profile_likelihood import Order
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
@@ -95,13 +96,26 @@ class Selection:
         """The fit that the headline's numbers are of."""
         return self.headline.fit
 
+    def settled(self, kind: Kind) -> frozenset[Order]:
+        """Orders that the record determines on a kind of rig: it admits one valley alone.
+
+        Parameters
+        ----------
+        kind : tuple of bool and tuple of str
+            As `Candidate.kind`; of any other than that of `fit` nothing is known.
+        """
+        if kind != next(each.kind for each in self.candidates if each.fit is self.fit):
+            return frozenset()
+        orders = (self.verdict.alpha, self.verdict.lambda_)
+        return frozenset(each.order for each in orders if each.profile.identifiable)
+
 
 def select(
     measurement: Measurement,
     *,
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
-    earlier: Sequence[Candidate] = (),
+    earlier: Selection | None = None,
 ) -> Selection:
     """Choose the structure that a record supports, and say what is known.
 
@@ -122,9 +136,9 @@ def select(
     fixed : iterable of str
         Settings that stay as the file states them.
     band_hz : tuple of float
-    earlier : sequence of Candidate, optional
-        Those of an earlier part of the record. All start from there where the first of them
-        explains all of it, in half the time; of several minima one may be missed.
+    earlier : Selection, optional
+        That of an earlier part of the record. All candidates start from its own where the first of
+        them explains all of it, in a third of the time; of several minima one may be missed.
 
     Raises
     ------
@@ -184,10 +198,11 @@ def _selected(
     measurement: Measurement,
     fixed: tuple[Setting, ...],
     band_hz: tuple[float, float],
-    earlier: Sequence[Candidate],
+    earlier: Selection | None,
 ) -> _Told[Selection]:
     """Choose the structure with what is known to have struck the beam."""
-    again = CandidateSet.from_earlier(earlier, measurement, fixed, band_hz) if earlier else None
+    before = earlier.candidates if earlier else ()
+    again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of_uniform(measurement, fixed, band_hz)
     field = linear if again else with_evident_drag(linear)
     if field is linear:
@@ -201,7 +216,9 @@ def _selected(
         other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
         if other_changes and other.bic < field.bic:
             field, forces, changes = other, (), other_changes
-    field, *profiles = profiled(field, walk=untold_reason(field, visible) is None)
+    # Another valley that a part of the record excludes, all of it does as well.
+    settled = earlier.settled(field.freest.kind) if earlier and again else ()
+    field, *profiles = profiled(field, settled, walk=untold_reason(field, visible) is None)
     told = field.led_by(field.freest)
     white, related, multiples = _tests(told, band_hz)
     explained = white.white and not related.related

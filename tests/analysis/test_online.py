@@ -179,6 +179,7 @@ def test_a_judgement_may_start_from_the_last(session, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr("analysis.identify._candidates.fit_record", search)
+        patched.setattr("analysis.identify._profile_likelihood.Walk.elsewhere", search)
         again = fit.estimate(whole=True, from_last=True)
     assert again.headline.name == alone.headline.name
     for each in (alone, again):  # and no knock, which a uniform beam would have needed
@@ -200,7 +201,7 @@ def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
     before = select(Measurement.of_record(fed_with(signals, session).record(6_000)))
     assert before.verdict.adequate
     record = Measurement.of_record(fed_with(humming, session).record())
-    again, alone = (select(record, earlier=each) for each in (before.candidates, ()))
+    again, alone = (select(record, earlier=each) for each in (before, None))
     assert again.headline.parameters == alone.headline.parameters
     assert again.headline.modes == alone.headline.modes
     assert again.verdict.findings == alone.verdict.findings

@@ -4,7 +4,7 @@ import pytest
 from analysis.identify import SETTINGS, Plant
 from analysis.identify._comparison import Comparison
 from analysis.identify._noise import Noise
-from analysis.identify._parametrization import Unknowns
+from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps, Unknowns
 from analysis.identify._problem import Objective
 from analysis.identify._refit import Refit
 from analysis.models import STRUCTURES
@@ -49,6 +49,35 @@ def test_a_descent_goes_on_as_one_begun_there_but_evaluates_once_less(objective,
     assert (on.x == anew.x).all()
     assert on.cost == anew.cost < first.cost
     assert going_on == len(evaluated) - 1 == 3
+
+
+@pytest.mark.parametrize(
+    ("most", "hopeless", "again"), [(5, None, False), (60, (5, 0.0), False), (60, None, True)]
+)
+def test_torques_are_put_anew_where_a_descent_has_ended(
+    sessions, monkeypatch, most, hopeless, again
+):
+    lost = np.arange(2000, 2100, 7)
+    measurement = sessions("VI", shaken=True).cut(5000).measured(noise_nm=1e-2, unknown_torque=lost)
+    comparison = Comparison.of(measurement, (0.0, 50.0))
+    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    evaluated = []
+    evaluate = Objective.normal_equations
+    monkeypatch.setattr(
+        Objective,
+        "normal_equations",
+        lambda *args, **k: evaluated.append(1) or evaluate(*args, **k),
+    )
+    _, found = Objective(comparison, unknowns).minimum(
+        unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8])),
+        np.ones(comparison.frequency_hz.size),
+        Steps.of(unknowns, NEXT_TO_NOTHING),
+        relative_tolerance=1e-8,
+        max_evaluations=most,
+        hopeless=hopeless,
+    )
+    assert (len(evaluated) > found.evaluations) == again
+    assert again or found.evaluations == 5
 
 
 def test_neither_free_decay_nor_a_drifting_zero_counts(objective):
