@@ -10,13 +10,13 @@ import os
 import platform
 import pwd
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.checks._rows import Row, Verdict, grade
 from rigd.engine import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
+from rigd.runtime import OWN_PYTHON
 
 # Rights
 
@@ -56,7 +56,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
         If there is no such process, or it fails.
     """
     numbers = settings.priority, settings.supervision_priority, settings.cpu
-    command = [sys.executable, "-c", _TRY, *map(str, numbers)]
+    command = [*OWN_PYTHON, "-c", _TRY, *map(str, numbers)]
     tried = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
     obtained: dict[str, str]
     obtained, supervision = json.loads(tried.stdout)

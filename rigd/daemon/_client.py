@@ -471,11 +471,11 @@ def _control_processes(pid: int) -> Iterator[int]:
     """Return the control processes of a supervisor: its number is their only argument."""
     from rigd.engine import CONTROL
 
-    wanted = [b"-m", CONTROL.module.encode(), str(pid).encode()]
+    wanted = [b"-m", CONTROL.module.encode(), str(pid).encode(), b""]
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
-                if (entry / "cmdline").read_bytes().split(b"\0")[1:4] == wanted:
+                if (entry / "cmdline").read_bytes().split(b"\0")[-4:] == wanted:
                     yield int(entry.name)
 
 

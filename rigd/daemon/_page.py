@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import NAME
 from rigd.runtime import (
+    OWN_PYTHON,
     SINGLE_THREADED,
     announce,
     file_name,
@@ -117,7 +118,7 @@ class PageProcess:
         """Start one and wait for its end."""
         with held_back():
             process = subprocess.Popen(
-                [sys.executable, *_PROGRAM],
+                [*OWN_PYTHON, *_PROGRAM],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=os.environ | SINGLE_THREADED,

@@ -21,7 +21,7 @@ from rigd.daemon._protocol import CommandError
 from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile
-from rigd.runtime import SINGLE_THREADED, killed_first
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
 
 _PATIENCE_S: Final = 60.0
 _MOST_BYTES: Final = 4 << 30
@@ -111,7 +111,7 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
     """
     try:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "rigd.daemon.background"),
+            *(*OWN_PYTHON, "-m", "rigd.daemon.background"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

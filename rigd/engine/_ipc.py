@@ -22,7 +22,7 @@ from typing import Any
 from rigd.engine._messages import MessageReader, encode, is_ready
 from rigd.engine._shared_state import Word
 from rigd.errors import FailureError
-from rigd.runtime import SINGLE_THREADED, held_back, signal_when_orphaned
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back, signal_when_orphaned
 
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
@@ -63,7 +63,7 @@ class Child:
         try:
             with held_back():
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", module, str(os.getpid())],
+                    [*OWN_PYTHON, "-m", module, str(os.getpid())],
                     bufsize=0,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,

@@ -9,7 +9,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -20,7 +19,7 @@ from typing import Any, Final
 
 from rigd.printable import printable
 from rigd.runner._session import SessionResult
-from rigd.runtime import SINGLE_THREADED
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.session import look_path, read_look
 
 _PROGRAM: Final = "analysis.quick_look"
@@ -182,9 +181,8 @@ class QuickLooks:
         self._left_s, self._looked_s = _LONGEST_S, time.monotonic()
         try:
             self._process = subprocess.Popen(
-                # -P: a folder named analysis where the operator works is another one.
                 [
-                    *(sys.executable, "-P", "-m", _PROGRAM),
+                    *(*OWN_PYTHON, "-m", _PROGRAM),
                     *(str(self._session), "--parent", str(os.getpid())),
                 ],
                 stdin=subprocess.DEVNULL,

@@ -11,7 +11,6 @@ import json
 import os
 import queue
 import subprocess
-import sys
 import threading
 from typing import Any, BinaryIO, Final, Self, cast
 
@@ -31,7 +30,7 @@ from rigd.engine import (
     keep_off_loop,
 )
 from rigd.runner._precision_search import Search
-from rigd.runtime import SINGLE_THREADED
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import (
     SAMPLE_SIZE,
@@ -83,7 +82,7 @@ class FitProgram:
     def __init__(self) -> None:
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _PROGRAM, "--parent", str(os.getpid())],
+                [*OWN_PYTHON, "-m", _PROGRAM, "--parent", str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=os.environ | SINGLE_THREADED,

@@ -5,6 +5,7 @@ from ._addresses import file_name as file_name
 from ._addresses import read_address as read_address
 from ._addresses import runtime_folder as runtime_folder
 from ._addresses import started_at as started_at
+from ._background import OWN_PYTHON as OWN_PYTHON
 from ._background import SINGLE_THREADED as SINGLE_THREADED
 from ._background import begin_background as begin_background
 from ._background import end_with as end_with

@@ -17,6 +17,10 @@ SINGLE_THREADED: Final = dict.fromkeys(
 )
 """Environment in which numpy starts no threads."""
 
+OWN_PYTHON: Final = (sys.executable, "-P")
+"""Begins the command line of a program of this project: a file where the operator works may have
+the name of any module, and is none of it."""
+
 _LOWEST_PRIORITY: Final = 19
 
 

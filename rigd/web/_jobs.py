@@ -7,21 +7,19 @@ import asyncio
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.runtime import SINGLE_THREADED, give_way
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, give_way
 
 Document = dict[str, Any]
 
 MOST_JOBS: Final = 16
 """Jobs that may wait."""
-# -P: a folder of that name among the sessions is another one.
-_PROGRAM: Final = (sys.executable, "-P", "-m", "analysis")
+_PROGRAM: Final = (*OWN_PYTHON, "-m", "analysis")
 _MORTAL: Final = """
 import os, signal, sys
 from rigd.runtime import end_with, killed_first
@@ -160,7 +158,7 @@ class Jobs:
 
     async def _perform(self, job: Job) -> None:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-c", _MORTAL, str(os.getpid())),
+            *(*OWN_PYTHON, "-c", _MORTAL, str(os.getpid())),
             *(*_PROGRAM, *job.arguments),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,

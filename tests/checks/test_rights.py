@@ -50,7 +50,7 @@ def test_an_ordinary_scheduler_may_be_wanted(asked):
 
 
 def test_a_trial_that_fails_is_told(asked, monkeypatch):
-    monkeypatch.setattr("rigd.checks._machine.sys.executable", "/no/such/python")
+    monkeypatch.setattr("rigd.checks._machine.OWN_PYTHON", ("/no/such/python",))
     (row,) = rights_rows(asked)
     assert row.verdict is Verdict.WARNING
     assert "could not be tried" in row.found

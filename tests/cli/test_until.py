@@ -28,12 +28,19 @@ ROW = re.compile(r" *\d+\.\d s 0\.")
 
 @pytest.fixture(scope="module")
 def done(made_once):
-    """A session that went on until the damping was known to 3 %: exit code, errors, result."""
+    """A session that went on until the damping was known to 3 %: exit code, errors, result.
+
+    Where the operator works there are files that have names of modules.
+    """
 
     def make(folder):
+        for name in ("analysis", "random", "rigd"):
+            (folder / f"{name}.py").write_text("raise SystemExit('of the operator')")
         command = [RIGD, "run", "until", "--damping", f"{100 * ASKED}%", "--at-most", "60"]
         command += ["--fast", "--json", "--no-look", "--output", folder]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=400)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=400, cwd=folder
+        )
         (folder / "told.json").write_text(json.dumps([done.returncode, done.stdout, done.stderr]))
 
     code, output, errors = json.loads((made_once("until", make) / "told.json").read_text())

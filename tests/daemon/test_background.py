@@ -67,7 +67,7 @@ def test_only_so_many_predictions_wait(operate, monkeypatch):
 
 
 def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
-    monkeypatch.setattr(background.sys, "executable", "/bin/true")
+    monkeypatch.setattr(background, "OWN_PYTHON", ("/bin/true",))
     told = operate().ask("predict", **CHIRP)
     assert isinstance(told, CommandError)
     assert "exit code 0" in str(told)

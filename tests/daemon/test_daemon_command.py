@@ -140,6 +140,8 @@ def test_what_cannot_be_served_is_refused_at_once(ask, profile, tmp_path):
 
 
 def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
+    for name in ("analysis", "random", "rigd"):  # the operator's own, not the modules
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('of the operator')")
     daemon = serve("--fast")
     code, out, err = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
                          "--operator", "Ada")  # fmt: skip
