@@ -50,6 +50,7 @@ from ._realtime import keep_off_loop as keep_off_loop
 from ._realtime import obtain as obtain
 from ._reference import PieceWriter as PieceWriter
 from ._reference import ReferenceSpec as ReferenceSpec
+from ._reference import is_whole as is_whole
 from ._reference import put_reference as put_reference
 from ._ring import Observer as Observer
 from ._ring import Ring as Ring

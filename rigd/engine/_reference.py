@@ -73,6 +73,23 @@ def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
     return memoryview(memory).cast("d")
 
 
+def is_whole(board: SharedState, scheduled: int, ticks: int) -> bool:
+    """Whether a record has all of its reference.
+
+    Parameters
+    ----------
+    board
+        Words of the session.
+    scheduled
+        Ticks of the record.
+    ticks
+        Those of the reference; of one that grows, the most.
+    """
+    if scheduled == ticks:
+        return True
+    return bool(board[Word.LAST_PIECE]) and scheduled >= board[Word.PLANNED] + board[Word.HELD] > 0
+
+
 class PieceWriter:
     """Appends pieces to a reference that is being followed.
 

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from rigd.engine._ipc import Parent
 from rigd.engine._messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
 from rigd.engine._realtime import Precedence
+from rigd.engine._reference import is_whole
 from rigd.engine._shared_state import Phase, SharedState, Word, read_events
 from rigd.engine._topics import (
     CONTROL,
@@ -207,8 +208,19 @@ class Recorder:
                 "reason": "Samples were lost before the recorder.",
             }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        path = self._writer.close(counted, segments)
+        path = self._writer.close(counted, {**self._so_far(scheduled), **segments})
         return Closed(path, counts, outcome["outcome"], outcome["reason"])
+
+    def _so_far(self, ticks: int) -> dict[str, tuple[int, int]]:
+        """Segments of a reference that grew: nothing was planned beyond the end of the record."""
+        board = self._channels.board
+        if self.header is None or not (board[Word.PLANNED] or board[Word.LAST_PIECE]):
+            return {}
+        return {
+            name: (first, min(end, ticks))
+            for name, (first, end) in self.header.segments.items()
+            if first < ticks
+        }
 
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""
@@ -223,7 +235,7 @@ class Recorder:
             self._writer.discard()
             return
         scheduled = board[Word.SCHEDULED]
-        whole = scheduled == max(end for _, end in self.header.segments.values())
+        whole = is_whole(board, scheduled, max(end for _, end in self.header.segments.values()))
         self.close(
             {
                 "outcome": "complete" if whole else "fault",

@@ -35,6 +35,7 @@ from rigd.engine import (
     SessionJob,
     Stop,
     Word,
+    is_whole,
     put_reference,
     read_events,
 )
@@ -431,7 +432,9 @@ class Session:
     def _as_finished(self, reason: str) -> Finished:
         """Make up the control process's result from its words on the board."""
         counts = self._counts()
-        whole = counts["scheduled"] == self._order.excitation.reference_rad.size
+        whole = is_whole(
+            self._board, counts["scheduled"], self._order.excitation.reference_rad.size
+        )
         return Finished(
             outcome="complete" if whole else "fault",
             reason=f"After the record: {reason}" if whole else reason,

@@ -180,7 +180,9 @@ def test_what_makes_no_sense_is_refused(rigd_here, options, words):
         pytest.param("rigd.runner.fit_process", signal.SIGSTOP, marks=pytest.mark.slow),
     ],
 )
-def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, victim, number):
+def test_a_lost_planner_ends_the_session_with_what_was_recorded(
+    start_rigd, tmp_path, victim, number
+):
     process = start_rigd(*LONG)
     for line in process.stderr:
         if ROW.match(line):
@@ -196,6 +198,9 @@ def test_a_lost_planner_ends_the_session_with_what_was_recorded(start_rigd, vict
     assert session["outcome"] == "complete"
     assert "The fit pro" in session["reason"]
     assert session["scheduled"] == session["recorded"] + session["missed"]
+    # Nothing was cut short: no more was planned.
+    _, end = read_session(tmp_path / session["path"]).segments["sweep"]
+    assert end == session["scheduled"]
 
 
 @pytest.mark.further  # as test_run.py has it of other sessions

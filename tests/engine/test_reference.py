@@ -15,6 +15,7 @@ from rigd.engine._reference import (
     PieceReader,
     PieceWriter,
     ReferenceSpec,
+    is_whole,
     map_reference,
     put_reference,
 )
@@ -50,6 +51,24 @@ def test_pieces_follow_each_other_without_a_gap():
     writer.append(np.array([20.0]))
     assert [reader.at(tick) for tick in range(6)] == [1, 2, 3, 10, 11, 20]
     assert board[Word.HELD] == 0
+
+
+def test_a_record_is_whole_with_the_last_piece_and_all_ticks_held():
+    writer, reader, board = growing(planned=3, room=40)
+    assert [reader.at(tick) for tick in range(5)] == [1, 2, 3, 3, 3]
+    writer.append(np.array([10.0, 11.0]))
+    assert [reader.at(tick) for tick in range(5, 7)] == [10, 11]
+    assert not is_whole(board, 7, 43)  # there may come more
+    board[Word.LAST_PIECE] = 1
+    assert reader.over(7)
+    assert is_whole(board, 7, 43)
+    assert not is_whole(board, 6, 43)
+    assert not is_whole(board, 0, 43)
+
+
+def test_a_record_of_what_was_given_is_whole_at_its_end():
+    board = SharedState.create(shared_memory_fd())
+    assert [is_whole(board, scheduled, 9) for scheduled in (0, 8, 9)] == [False, False, True]
 
 
 def test_the_last_angle_is_held_until_the_next_piece():
