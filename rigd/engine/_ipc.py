@@ -111,7 +111,7 @@ class Child:
         Raises
         ------
         ChildError
-            If the child has ended.
+            If the child has ended, or says what is no message.
         """
         try:
             return self._messages.next(timeout_s)
@@ -119,6 +119,8 @@ class Child:
             code = self._process.wait()
             how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
             raise ChildError(f"The {self.name} process was {how}.") from None
+        except ValueError as error:
+            raise ChildError(f"The {self.name} process sent {error}.") from None
 
     def messages(self, timeout_s: float) -> Iterator[object]:
         """Yield the messages that are there, waiting for the first only.
@@ -201,6 +203,9 @@ class Parent:
 
     def __init__(self) -> None:
         self._messages = MessageReader(sys.stdin.fileno())
+        # What a library prints goes to the operator, and does not stand among the messages.
+        self._messages_fd = os.dup(sys.stdout.fileno())
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         self._pid = int(sys.argv[1])
         # A recorder that is suspended has samples to write down, a control process devices to let
         # go of.
@@ -226,7 +231,7 @@ class Parent:
     def send(self, message: object) -> None:
         """Send one short message; there may be no receiver left."""
         with contextlib.suppress(BrokenPipeError):
-            os.write(sys.stdout.fileno(), encode(message))
+            os.write(self._messages_fd, encode(message))
 
     def alive(self) -> bool:
         """Whether the supervisor still runs; cheap enough for the loop."""

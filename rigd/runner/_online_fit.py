@@ -162,7 +162,7 @@ class OnlineFit:
                 "asked": [str(target) for target in targets],
                 "targets": targets_json(found),
                 "reached": not self.shortcoming,
-                "reason": self.shortcoming or self._reason,
+                "reason": self.shortcoming or self._success,
                 "pieces": self._pieces,
             }
         return document
@@ -185,6 +185,13 @@ class OnlineFit:
     def _reason(self) -> str:
         """Why a search for a precision ended, a sentence; empty if it was stopped."""
         return self._ended.reason if self._ended is not None else self._lost
+
+    @property
+    def _success(self) -> str:
+        """How what was asked for was reached, a sentence."""
+        if self._ended is not None and self._ended.reached:
+            return self._ended.reason
+        return "Reached by the fit of the whole record."
 
     def _judge(self, found: Sequence[Stated]) -> str:
         """Say what is missing of what was asked for; empty if the whole record has all of it."""

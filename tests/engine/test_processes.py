@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -68,6 +69,28 @@ def test_what_is_no_message_is_not_waited_for(pipe):
     os.write(write, b"Warning: something has been printed\n")
     with pytest.raises(ValueError, match="no message, but b'Warning: "):
         MessageReader(read).next(0.0)
+
+
+def test_what_is_no_message_is_told_with_the_name_of_the_process():
+    child = Child("recorder", "this", [])  # prints the Zen of Python
+    try:
+        with pytest.raises(ChildError, match="recorder process sent no message, but b'The Zen of"):
+            child.poll(60.0)
+    finally:
+        child.stop(5.0)
+
+
+def test_what_a_library_prints_does_not_stand_among_the_messages():
+    says = "from rigd.engine import Ended, Parent; import os; parent = Parent(); " + (
+        "print('of a library', flush=True); os.write(1, b'and so on'); parent.send(Ended(''))"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", says, str(os.getpid())],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    output, errors = child.communicate(timeout=60)
+    assert output == encode(Ended(""))
+    assert errors == b"of a library\nand so on"
 
 
 def test_a_process_may_be_stopped_twice():
