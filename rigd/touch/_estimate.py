@@ -1,9 +1,9 @@
 """Where, when and how hard the antenna has touched something.
 
 Innovations of torque and base shear are explained by a springy obstacle at rest, marched through
-its bounces; beside it stand obstacles that move or give way, a knock, and any force at all. The
-answer tells what the data tell: values with standard deviations and intervals that take in the
-noise, the model's uncertainty and every place that is about as likely.
+its bounces; beside it stand two obstacles, those that move or give way, a knock, and any force at
+all. The answer tells what the data tell: values with standard deviations and intervals that take in
+the noise, the model's uncertainty and every place that is about as likely.
 """
 
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ _DOUBTFUL = 9.0
 one that is at rest gains that much by chance in one of a hundred touches."""
 _POSSIBLE = 5.0
 """By so much less, that of two obstacles leaves open where the point is."""
-_HOPEFUL = 0.5
+_HOPEFUL = 0.8
 """By so much less, after a few iterations, two obstacles are worth more of them."""
 _WORSE = 3.5
 """By so many standard deviations may the sum of squared residuals exceed its expectation."""
@@ -444,9 +444,12 @@ class _Estimation:
         """Two obstacles, if they may explain more than one at rest does."""
         pairing = self._pairing()
         space = pairing.space(self.space(3))
-        starts = pairing.starts(rest.parameters, window, space, 2)
-        found = descend(pairing.channels, window, starts, space, rounds=4)
-        if found.chi2.min() > rest.chi2 - _HOPEFUL:
+        # The first samples tell in less time whether more iterations are worth while.
+        early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
+        starts = pairing.starts(rest.parameters, early, space, 2)
+        found = descend(pairing.channels, early, starts, space, rounds=4)
+        one = rest.parameters[None]
+        if found.chi2.min() > chi2_of(self.predicting(one), early, one)[0] - _HOPEFUL:
             return None
         likely = found.parameters[np.argsort(found.chi2)[:3]]
         starts = np.vstack([likely, pairing.exchanged(likely[:1])])
