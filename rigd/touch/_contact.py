@@ -113,6 +113,80 @@ def march(
     return np.ascontiguousarray(force.transpose(0, 2, 1)).reshape(shape)
 
 
+def march_two(
+    own: tuple[Real, Real],
+    cross: Real,
+    approach: tuple[Real, Real],
+    stiffness_n_per_m: tuple[Real, Real],
+) -> tuple[Real, Real]:
+    """Return the forces with which the beam presses on two obstacles at rest, at each step.
+
+    Parameters
+    ----------
+    own
+        Displacement at each place per hat of force there, shape (k, n).
+    cross
+        Displacement at one place per hat of force at the other, in the directions of the forces.
+    approach
+        How far the beam would be beyond each place without any force, shape (k, n); none at the
+        first step.
+    stiffness_n_per_m
+        Stiffness of each obstacle, shape (k,).
+
+    Returns
+    -------
+    tuple of ndarray, shape (k, n)
+        Magnitude in N, 0 where they are apart.
+    """
+    count, steps = cross.shape
+    # What the force of a step would be without all others, (n, 2, k).
+    gives = np.stack(
+        [k / (1 + k * kernel[:, 0]) for k, kernel in zip(stiffness_n_per_m, own, strict=True)]
+    )
+    wanted = np.stack([each.T for each in approach], axis=1) * gives
+    # Forces lessen each other's by so much, by the lag; axes: lag, lessened, lessening.
+    kernel = np.empty((steps, 2, 2, count))
+    kernel[:, 0, 0], kernel[:, 1, 1] = own[0].T, own[1].T
+    kernel[:, 0, 1] = kernel[:, 1, 0] = cross.T
+    kernel *= gives[:, None]
+    by_second, by_first = kernel[0, 0, 1], kernel[0, 1, 0]
+    both = 1 / (1 - by_second * by_first)
+    # The latest lag comes first, so that a product of two rows is the convolution.
+    reverse = np.ascontiguousarray(kernel[::-1].transpose(3, 1, 2, 0))
+    *outer, column = reverse.strides
+    force = np.zeros((count, 2, steps))
+    inside = np.empty((_BLOCK, 2, count))
+    product = np.empty((_BLOCK, 2, 2, count))
+    for begin in range(1, steps, _BLOCK):
+        end = min(begin + _BLOCK, steps)
+        part = inside[: end - begin]
+        part[:] = wanted[begin:end]
+        if begin > 1:
+            # Element (k, a, b, i, j): what the force of step 1 + j at b does at a, step begin + i.
+            effect = np.ndarray(
+                (count, 2, 2, end - begin, begin - 1),
+                buffer=reverse,
+                offset=(steps - begin) * column,
+                strides=(*outer, -column, column),
+            )
+            before = np.vecdot(effect, force[:, None, :, None, 1:begin]).sum(axis=2)
+            part -= before.transpose(2, 1, 0)
+        for i, now in enumerate(part):
+            first, second = now
+            # The second's if both press; then the first's, which is right in any case.
+            pressing = np.maximum((second - by_first * first) * both, 0.0)
+            np.maximum(first - by_second * pressing, 0.0, out=first)
+            np.maximum(second - by_first * first, 0.0, out=second)
+            later = part[i + 1 :]
+            lessened = np.multiply(
+                kernel[1 : len(later) + 1], now[None, None], out=product[: len(later)]
+            )
+            later -= lessened[:, :, 0]
+            later -= lessened[:, :, 1]
+        force[..., begin:end] = part.transpose(2, 1, 0)
+    return force[:, 0], force[:, 1]
+
+
 def shifted(table: Real, begin: Real, count: int) -> Real:
     """Values of each row from a place between its columns on (cubic, four points).
 

@@ -1,9 +1,9 @@
 """Where, when and how hard the antenna has touched something.
 
 Innovations of torque and base shear are explained by a springy obstacle at rest, marched through
-its bounces; beside it stand obstacles that move or give way, a knock, and any force at all. The
-answer tells what the data tell: values with standard deviations and intervals that take in the
-noise, the model's uncertainty and every place that is about as likely.
+its bounces; beside it stand two obstacles, those that move or give way, a knock, and any force at
+all. The answer tells what the data tell: values with standard deviations and intervals that take in
+the noise, the model's uncertainty and every place that is about as likely.
 """
 
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.touch._blind import Blind, BlindScan
-from rigd.touch._free_motion import BEFORE, FINER, FreeBeam, TouchRecord
-from rigd.touch._kernels import ContactKernels, contact_kernels, places
+from rigd.touch._blind import BlindScan
+from rigd.touch._free_motion import TouchRecord
+from rigd.touch._kernels import ContactKernels
 from rigd.touch._knock import Knocking
 from rigd.touch._model import TouchModel
+from rigd.touch._pair import Pairing
 from rigd.touch._physical import (
     SOFTEST,
     STIFFEST,
     Descended,
     Prediction,
     Space,
-    Starts,
     Touching,
     Window,
     chi2_of,
@@ -32,15 +32,12 @@ from rigd.touch._physical import (
 from rigd.touch._posterior import Posterior, sampled
 from rigd.touch._results import Estimated, TouchEstimate
 from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
+from rigd.touch._tables import GRID_S, NOTICED_S, Tables
+from rigd.touch._uncertain import deviations
 
 Real = NDArray[np.float64]
 
-_SPACING_M = 0.007
-_NOTICED_S = (0.013, 0.04, 0.12)
-"""A touch is noticed at most so long after it: the longer ones are tried if the shorter fail."""
 _TWO_SIDED_95 = 1.959964
-_GRID_S = 0.022
-"""After the detection: what the grid of starts is compared with."""
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
 """After the detection: what is explained, the longest only if the point is not well known yet."""
 _COVERED_S = 0.1
@@ -54,15 +51,16 @@ _BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
 _AT_TIP = 0.95
 """Beyond this share a longer record tells no more: its many short contacts fit anywhere."""
 
-_SMALLEST = np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])
-"""Least standard deviations that samples are drawn with."""
-_LOOSE = np.array([0.02, 2e-3, 1.0, 0.3, 0.3])
-"""Greatest ones."""
 _LEAST_SCALE = 1.2
 """Variance of the residuals at least assumed: the noise itself is known from few samples."""
 _LEAST_STD_M = (3e-4, 5e-4)
 """What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
 tip: in 130 simulated touches the errors agree with the intervals if this is added."""
+_DOUBT_OF_TWO = 4.0
+"""The sum of squared residuals of two obstacles that clearly explain more than one counts so many
+times less: which of their several minima is the lowest, the errors of the model decide."""
+_LEAST_OF_TWO_M = 2e-3
+"""What bounces leave unknown of the first of two, which are marched in longer steps."""
 _EARLY_S = (0.006, 0.01, 0.022)
 """After the detection: what a touch that nothing explains is compared with as well. Later a second
 point may be touched."""
@@ -75,6 +73,10 @@ _CLEAR = 16.0
 _DOUBTFUL = 9.0
 """By so much less, that of an obstacle that moves or gives way leaves open whether it is at rest:
 one that is at rest gains that much by chance in one of a hundred touches."""
+_POSSIBLE = 5.0
+"""By so much less, that of two obstacles leaves open where the point is."""
+_HOPEFUL = 0.8
+"""By so much less, after a few iterations, two obstacles are worth more of them."""
 _WORSE = 3.5
 """By so many standard deviations may the sum of squared residuals exceed its expectation."""
 _POOR = 2.0
@@ -118,7 +120,7 @@ class TouchEstimator:
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self._rate_hz = model, rate_hz
-        self._tables = _Tables(model, rate_hz)
+        self._tables = Tables(model, rate_hz)
 
     def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
         """Estimate one touch from what of the record is there.
@@ -133,11 +135,11 @@ class TouchEstimator:
         """
         told = None
         searched = record.angle_rad.size
-        for noticed in _NOTICED_S:
+        for noticed in NOTICED_S:
             if record.detected - round(noticed * self._rate_hz) < _LEAST_QUIET:
                 break
             here = _Estimation(self._tables, record, noticed)
-            last = noticed == _NOTICED_S[-1]
+            last = noticed == NOTICED_S[-1]
             # After one in which nothing explains the touch, only if it may have been before that.
             if (here.begins_too_late and not last) or here.seems_to_begin >= searched:
                 continue
@@ -172,45 +174,6 @@ class TouchEstimator:
         )
 
 
-class _Tables:
-    """What depends on the model and the rate only."""
-
-    def __init__(self, model: TouchModel, rate_hz: float) -> None:
-        self.model, self.rate_hz = model, rate_hz
-        self.x_m = places(model.beam.length_m, _SPACING_M)
-        finer = 4 * max(1, round(4000 / rate_hz))
-        steps = round((FINAL_S + _NOTICED_S[-1] + 0.01) * rate_hz * finer)
-        self.finest = contact_kernels(
-            model.beam,
-            model.damping,
-            self.x_m,
-            1 / (finer * rate_hz),
-            steps,
-            model.sensor_filter,
-        )
-        self.middle = self.finest.coarser(2, steps // 2)
-        self.coarse = self.finest.coarser(finer // 4, steps // (finer // 4))
-        half = self.finest.coarser(finer // 2, steps // (finer // 2))
-        self.blind = Blind(half, 2, round((FIRST_S + _NOTICED_S[-1]) * rate_hz) + 1)
-        self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
-        self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
-        self._starts: dict[int, Starts] = {}
-        self.starts(round(_NOTICED_S[0] * rate_hz) + round(_GRID_S * rate_hz))
-        nowhere = np.empty(0)
-        self.changed = [
-            FreeBeam(model.changed(name, std), nowhere, rate_hz, self.most)
-            for name, std in model.std.items()
-            if std > 0
-        ]
-        """The beam with each uncertain parameter one standard deviation off."""
-
-    def starts(self, samples: int) -> Starts:
-        """Grid of starts for so many samples."""
-        if samples not in self._starts:
-            self._starts[samples] = Starts(self.coarse, 2, self.rate_hz, samples)
-        return self._starts[samples]
-
-
 @dataclass(frozen=True, slots=True)
 class _Explanation:
     """The best that obstacles of one kind make of the record."""
@@ -224,7 +187,7 @@ class _Explanation:
 class _Estimation:
     """One record's."""
 
-    def __init__(self, tables: _Tables, record: TouchRecord, noticed_s: float) -> None:
+    def __init__(self, tables: Tables, record: TouchRecord, noticed_s: float) -> None:
         rate = tables.rate_hz
         self.tables, self.rate = tables, rate
         self.begin = max(0, record.detected - round(HISTORY_S * rate))
@@ -260,6 +223,7 @@ class _Estimation:
         starts, covered_s = self.starts, 0.0
         before: tuple[_Explanation, Window] | None = None
         later_doubtful = False
+        two: _Explanation | None = None
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         for seconds in (*stages, available_s):
@@ -269,10 +233,15 @@ class _Estimation:
                 starts = self._beside(_distinct(found))
             if covered_s < seconds:
                 covered_s = min(max(seconds, _COVERED_S), available_s)
-                self.deviations = self._deviations(starts[:1], covered_s)
+                whole = Window.of(self.motion, self.quiet, self.end(covered_s))
+                self.deviations = deviations(self.tables, self.record, starts[:1], whole)
             window = self.window(seconds)
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
             if before is not None and self._later_is_worse(rest, window, *before):
+                two = self._two(rest, window)
+                if two is not None and self._fits(two, window, _POOR):
+                    break
+                two = None
                 # Of still later bounces the search may miss the minimum: they speak of no kind.
                 later_doubtful = seconds <= _COVERED_S and self._changes(rest, window)
                 rest, window = before
@@ -284,8 +253,13 @@ class _Estimation:
                 break
             starts = np.vstack([rest.parameters, self._cloud(rest.posterior)])
         explanations = [rest]
-        if not self._fits(rest, window, _POOR) or self._changes(rest, window):
-            explanations += self._others(window)
+        if two is None:
+            if not self._fits(rest, window, _POOR) or self._changes(rest, window):
+                explanations += self._others(window)
+            if self._fits(rest, window):
+                two = self._two(rest, window)
+        if two is not None:
+            explanations.append(two)
         return self._answer(explanations, window, scan=scan, later_doubtful=later_doubtful)
 
     @cached_property
@@ -311,6 +285,8 @@ class _Estimation:
             high=np.array([self.edges[1], t[self.detected], STIFFEST, 3.0, 50.0])[:width],
             difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
             scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
+            smallest=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
+            loose=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
         )
 
     def predicting(self, rows: Real, *, coarser: bool = False) -> Prediction:
@@ -326,7 +302,7 @@ class _Estimation:
     def _first_starts(self) -> Real:
         """Return the likeliest candidates of the grid, after a second look."""
         tables = self.tables
-        window = self.window(_GRID_S)
+        window = self.window(GRID_S)
         grid = tables.starts(window.end - window.first)
         starts, chi2 = grid.marched(self.motion, window, self.detected)
         starts = starts[np.lexsort((chi2, starts[:, 0]))]
@@ -351,8 +327,8 @@ class _Estimation:
         rng = np.random.default_rng(1)
         chosen = posterior.samples[rng.choice(posterior.weights.size, 240, p=posterior.weights)]
         width = chosen.shape[1]
-        spread = np.array([max(posterior.std(i), _SMALLEST[i]) for i in range(width)])
         space = self.space(width)
+        spread = np.array([max(posterior.std(i), space.smallest[i]) for i in range(width)])
         return np.clip(
             chosen + 0.5 * spread * rng.standard_normal(chosen.shape), space.low, space.high
         )
@@ -367,17 +343,21 @@ class _Estimation:
         return self._sampled(kind, predict, window, found, space)
 
     def _sampled(
-        self, kind: str, predict: Prediction, window: Window, found: Descended, space: Space
+        self,
+        kind: str,
+        predict: Prediction,
+        window: Window,
+        found: Descended,
+        space: Space,
+        doubt: float = 1.0,
     ) -> _Explanation:
+        """Sample around minima; `doubt` is what differences of chi² are divided by."""
         width = found.parameters.shape[1]
         near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
-        smallest = _SMALLEST[:width]
         covariances = np.array(
             [
-                np.linalg.inv(
-                    found.jacobian[k].T @ found.jacobian[k] + np.diag(1 / _LOOSE[:width] ** 2)
-                )
-                + np.diag(smallest**2)
+                np.linalg.inv(found.jacobian[k].T @ found.jacobian[k] + np.diag(1 / space.loose**2))
+                + np.diag(space.smallest**2)
                 for k in near
             ]
         )
@@ -387,76 +367,14 @@ class _Estimation:
             found.parameters[near],
             covariances,
             (space.low, space.high),
-            scale=max(_LEAST_SCALE, found.chi2.min() / degrees),
+            scale=doubt * max(_LEAST_SCALE, found.chi2.min() / degrees),
             count=120,
             rounds=5,
             enough=150.0,
-            smallest=smallest,
+            smallest=space.smallest,
         )
         best = int(np.argmin(posterior.chi2))
         return _Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
-
-    # How well it is known
-
-    def _deviations(self, best: Real, seconds: float) -> Real:
-        """Effect on the innovations of what is uncertain, one standard deviation each.
-
-        The model's parameters, and the steps of the march.
-        """
-        tables, motion = self.tables, self.motion
-        whole = Window.of(motion, self.quiet, self.end(seconds))
-        fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
-        touching = Touching(tables.middle, tables.x_m, motion)
-        middle = touching.predicted(best, whole)[0][0]
-        columns = [
-            fine - middle,
-            *self._ringing(touching, best[0], whole),
-            *self._angle_noise(touching, best[0], whole),
-        ]
-        span = slice(whole.first, whole.end)
-        left = motion.innovations[:, span] - middle
-        x = float(best[0, 0])
-        near = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
-        for free in tables.changed:
-            changed = free.at(near).motion(self.record, self.quiet, self.quiet - 4)
-            kernels = contact_kernels(
-                free.model.beam,
-                free.model.damping,
-                np.array([x]),
-                tables.middle.step_s,
-                round((motion.t[-1] - best[0, 1]) / tables.middle.step_s) + 4,
-                free.model.sensor_filter,
-            )
-            effect, _ = Touching(kernels, near, changed).predicted(best, whole, kernels=kernels)
-            columns.append(changed.innovations[:, span] - effect[0] - left)
-        return np.stack(columns, axis=-1)
-
-    def _ringing(self, touching: Touching, best: Real, whole: Window) -> Real:
-        """Effects of what is unknown of the free motion, also by where it lets the beam touch."""
-        motion = self.motion
-        spread = motion.spread
-        count = motion.ringing.poles.size * 2
-        there = best[:1] / self.tables.model.beam.length_m
-        columns = motion.displacement_m.shape[1]
-        # Times from the record's beginning, as the amplitudes are meant.
-        t = motion.first_s + self.tables.model.angle_delay_s + motion.step_s * np.arange(columns)
-        moved = motion.ringing.at(there).displacement(t, spread[:count])[0]
-        direct = motion.design[:, whole.first : whole.end] @ spread
-        return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
-
-    def _angle_noise(self, touching: Touching, best: Real, whole: Window) -> Real:
-        """Effects of the encoder's steps, by where they let the beam touch."""
-        motion = self.motion
-        samples = np.arange(whole.first, whole.end)
-        place = int(np.argmin(np.abs(self.tables.x_m - best[0])))
-        one = self.tables.free.per_sample(place, samples.size + 8)
-        # Columns begin four samples before the window.
-        late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
-        index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]
-        moved = np.where(
-            (index >= 0) & (index < one.size), one[np.clip(index, 0, one.size - 1)], 0.0
-        )
-        return touching.passed_on(best, whole, motion.angle_noise_rad * moved)
 
     # Other kinds
 
@@ -504,7 +422,7 @@ class _Estimation:
             grid = np.meshgrid(likely, instants, np.log(_STIFFNESSES), extra, indexing="ij")
             starts = np.stack([each.ravel() for each in grid], axis=1)
             coarse = self._marching(kind, self.tables.coarse, side)
-            for span, count in ((_GRID_S, 80), (FIRST_S, 10)):
+            for span, count in ((GRID_S, 80), (FIRST_S, 10)):
                 chi2 = chi2_of(coarse, self.window(span), starts)
                 starts = starts[np.argsort(chi2)[:count]]
             march = self._marching(kind, self.tables.middle, side)
@@ -516,6 +434,31 @@ class _Estimation:
         space = knocking.space(self.edges, (rest.low[1], rest.high[1]))
         found.append(self.explained("knock", knocking.predicted, window, starts, space))
         return found
+
+    def _pairing(self) -> Pairing:
+        tables = self.tables
+        touching = Touching(tables.coarse, tables.x_m, self.motion)
+        return Pairing(touching, tables.coarse, tables.crossing)
+
+    def _two(self, rest: _Explanation, window: Window) -> _Explanation | None:
+        """Two obstacles, if they may explain more than one at rest does."""
+        pairing = self._pairing()
+        space = pairing.space(self.space(3))
+        # The first samples tell in less time whether more iterations are worth while.
+        early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
+        starts = pairing.starts(rest.parameters, early, space, 2)
+        found = descend(pairing.channels, early, starts, space, rounds=4)
+        one = rest.parameters[None]
+        if found.chi2.min() > chi2_of(self.predicting(one), early, one)[0] - _HOPEFUL:
+            return None
+        likely = found.parameters[np.argsort(found.chi2)[:3]]
+        starts = np.vstack([likely, pairing.exchanged(likely[:1])])
+        found = descend(pairing.channels, window, starts, space, rounds=8)
+        gain = rest.chi2 - found.chi2.min()
+        if gain < _POSSIBLE:
+            return None
+        doubt = _DOUBT_OF_TWO if gain > _CLEAR else 1.0
+        return self._sampled("two", pairing.channels, window, found, space, doubt)
 
     def _side(self) -> float:
         """Direction in which the beam presses: against the force, whatever that comes from."""
@@ -540,6 +483,8 @@ class _Estimation:
             ranges.high[columns],
             ranges.difference[columns],
             ranges.scale[columns],
+            ranges.smallest[columns],
+            ranges.loose[columns],
         )
 
     # The answer
@@ -561,6 +506,9 @@ class _Estimation:
         if rest.chi2 < best.chi2 + _CLEAR:
             best = rest
         rivals = [best, *(each for each in explanations if _rivals(best, each))]
+        clear = len(rivals) == 1 and best.kind != "two"
+        if best is rest:
+            rivals += [each for each in explanations if each.kind == "two"]
         offset = self.begin / self.rate
         x_m = time_s = force_n = stiffness = None
         history, instants = np.zeros(0), np.zeros(0)
@@ -568,7 +516,7 @@ class _Estimation:
         if self._fits(best, window):
             poor = not self._fits(best, window, _POOR)
             doubtful = later_doubtful if best is rest else poor
-            if len(rivals) == 1 and not doubtful:
+            if clear and not doubtful:
                 kind = best.kind
             x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
             if poor:
@@ -617,7 +565,7 @@ class _Estimation:
         """Point of touch, with what bounces leave unknown of it."""
         told = _known(rivals, 0)
         tip = told.value > _NEAR_TIP * self.tables.model.beam.length_m
-        least = _LEAST_STD_M[int(tip)]
+        least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
         low, high = (
             told.value + np.copysign(np.hypot(end - told.value, _TWO_SIDED_95 * least), sign)
             for end, sign in zip(told.interval_95, (-1.0, 1.0), strict=True)
@@ -640,6 +588,10 @@ class _Estimation:
             peaks = np.abs(rows[:, 3])
             phase = np.arange(0.0, np.exp(rows[0, 2]) + step_s, step_s) / np.exp(rows[0, 2])
             force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
+        elif best.kind == "two":
+            step_s = self.tables.coarse.step_s
+            force = np.abs(self._pairing().predicted(rows, window)[1])
+            peaks = force.max(axis=1)
         else:
             touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
             side = None if best.kind == "rigid" else self._side()
@@ -666,6 +618,8 @@ def _rivals(best: _Explanation, other: _Explanation) -> bool:
     """Whether another explanation is about as likely: a parameter more must be worth its while."""
     if best.kind == "rigid" and other.kind in ("moving", "yielding"):
         return other.chi2 < best.chi2 - _DOUBTFUL
+    if best.kind == "rigid" and other.kind == "two":
+        return False
     return other is not best and other.chi2 < best.chi2 + _CLEAR
 
 
@@ -673,12 +627,10 @@ def _known(rivals: list[_Explanation], column: int, shift: float = 0.0) -> Estim
     """Tell a parameter that all likely explanations share, with room for each."""
     ends = np.array([each.posterior.quantiles(column, (0.025, 0.975)) for each in rivals])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
-    posterior = rivals[0].posterior
-    return Estimated(
-        posterior.mean(column) + shift,
-        max(posterior.std(column), (high - low) / 4 if len(rivals) > 1 else 0.0),
-        (low + shift, high + shift),
-    )
+    mean, std = rivals[0].posterior.mean(column), rivals[0].posterior.std(column)
+    if len(rivals) > 1:
+        std = max(std, (mean - low) / _TWO_SIDED_95, (high - mean) / _TWO_SIDED_95)
+    return Estimated(mean + shift, std, (low + shift, high + shift))
 
 
 def _stiffness(posterior: Posterior) -> Estimated | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping, PointForceGrid
+from rigd.beam import Beam, Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 Real = NDArray[np.float64]
@@ -24,6 +24,9 @@ WRAPPED = 14.0
 
 _OVERSAMPLED = 2
 """Steps of the inversion in a step of the kernels: above half the step's rate a hat is small."""
+
+_MODES = 20
+"""Modes that pass a force on to another place."""
 
 _EDGE_M = 0.003
 """The places begin at this distance from the root; they end at the tip."""
@@ -82,6 +85,42 @@ class Line:
             transform[..., -1] = transform[..., -1].real
         samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._grown[:steps]
         return samples
+
+
+class Hat:
+    """From transforms of responses to those to a hat of force, in time.
+
+    Parameters
+    ----------
+    step_s
+        Half the width of the hat, and the time between two values of a kernel.
+    steps
+        Number of values.
+    """
+
+    __slots__ = ("_late", "_steps", "line")
+
+    def __init__(self, step_s: float, steps: int) -> None:
+        from scipy.fft import next_fast_len
+
+        self._steps = steps
+        fine = step_s / _OVERSAMPLED
+        self.line = Line(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
+        s = self.line.s
+        hat = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine
+        # Two steps later than it acts, so that the hat begins within the period.
+        self._late = hat * np.exp(-s * step_s)
+
+    def kernels(self, response: Complex) -> Real:
+        """Return the responses in time, shape (k, steps).
+
+        Parameters
+        ----------
+        response
+            To a force, at the frequencies of the line, shape (k, frequencies).
+        """
+        values = self.line.in_time(self._late * response, _OVERSAMPLED * (self._steps + 1))
+        return values[:, _OVERSAMPLED::_OVERSAMPLED][:, : self._steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,17 +204,11 @@ def contact_kernels(
     sensor_filter
         Filters through which torque and shear are seen.
     """
-    from scipy.fft import next_fast_len
-
-    fine = step_s / _OVERSAMPLED
-    n = next_fast_len(2 * _OVERSAMPLED * steps, real=True)
-    line = Line(n, fine)
-    # Two steps later than it acts, so that the hat begins within the period.
-    hat = (2 * (np.cosh(line.s * step_s) - 1) / (step_s * line.s) ** 2) * step_s / fine
-    late = hat * np.exp(-line.s * step_s)
-    grid = PointForceGrid(line.s, beam, damping)
-    seen = sensor_filter.response(line.s)
-    stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * line.s**damping.alpha)
+    hat = Hat(step_s, steps)
+    s = hat.line.s
+    grid = PointForceGrid(s, beam, damping)
+    seen = sensor_filter.response(s)
+    stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     tables = np.empty((3, x_m.size, steps))
     for i in range(0, x_m.size, _AT_ONCE):
         x = x_m[i : i + _AT_ONCE]
@@ -185,9 +218,49 @@ def contact_kernels(
             seen * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
         )
         for table, response in zip(tables, responses, strict=True):
-            values = line.in_time(late * response, _OVERSAMPLED * (steps + 1))
-            table[i : i + _AT_ONCE] = values[:, _OVERSAMPLED::_OVERSAMPLED][:, :steps]
+            table[i : i + _AT_ONCE] = hat.kernels(response)
     return ContactKernels(x_m, step_s, *tables)
+
+
+@dataclass(frozen=True, slots=True)
+class CrossKernels:
+    """Displacement at one place per hat of contact force at another, summed over the modes."""
+
+    x_m: Real
+    """Places of the shapes, shape (m,)."""
+    shapes: Real
+    """Shape (m, modes)."""
+    kernels: Real
+    """Response of each mode to a hat of force, by the square of its shape, (modes, n)."""
+
+    def between(self, x_m: Real, other_m: Real, steps: int) -> Real:
+        """Interpolate the kernels of pairs of places.
+
+        Parameters
+        ----------
+        x_m, other_m
+            Places, shape (k,).
+        steps
+            Length of what is returned.
+        """
+        one, other = (mixed(self.shapes, *lagrange(x, self.x_m)) for x in (x_m, other_m))
+        crossing: Real = (one * other) @ self.kernels[:, :steps]
+        return crossing
+
+
+def cross_kernels(
+    beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
+) -> CrossKernels:
+    """Kernels between places; the arguments are those of `contact_kernels`."""
+    hat = Hat(step_s, steps)
+    s = hat.line.s
+    inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
+    internal = 1 + damping.zeta * s**damping.alpha
+    wave = clamped_free_eigenvalues(_MODES) / beam.length_m
+    stiffness = beam.bending_stiffness_n_m2 * beam.length_m
+    per_force = 1 / (stiffness * (inertial + internal * wave[:, None] ** 4))
+    shapes = np.stack([mode_shape(i + 1, x_m / beam.length_m) for i in range(_MODES)], axis=1)
+    return CrossKernels(x_m, shapes, hat.kernels(per_force))
 
 
 _AT_ONCE = 8

@@ -109,4 +109,6 @@ class Knocking:
             high=np.array([x_m[1], instants[1], np.log(0.1), 100.0]),
             difference=np.array([2e-4, 2e-5, 1e-2, 1e-3]),
             scale=np.array([3e-3, 1e-3, 0.3, 0.5]),
+            smallest=np.array([1.5e-4, 1e-5, 2e-2, 5e-3]),
+            loose=np.array([0.02, 2e-3, 1.0, 0.3]),
         )

@@ -41,6 +41,10 @@ class Space:
     """By how much each is changed for a derivative."""
     scale: Real
     """A change that matters: the most an iteration changes is eight times it."""
+    smallest: Real
+    """Least standard deviation that samples are drawn with."""
+    loose: Real
+    """Greatest one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +148,9 @@ class Touching:
         motion = self._motion
         x, instant = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        steps = self._steps(instant, window)
+        steps = self.steps(instant, window)
         local = self._kernels.at(x, steps) if kernels is None else kernels
-        approach, sides = self._approach(x, instant, steps, side)
+        approach, sides = self.approach(x, instant, steps, side)
         extra = parameters[:, 3:].T
         pressing = march(
             np.broadcast_to(local.displacement[:, :steps], approach.shape),
@@ -174,9 +178,9 @@ class Touching:
             first on, shape (r, columns).
         """
         x, instant = parameters[:1], parameters[1:2]
-        steps = self._steps(instant, window)
+        steps = self.steps(instant, window)
         local = self._kernels.at(x, steps)
-        approach, side = self._approach(x, instant, steps, None)
+        approach, side = self.approach(x, instant, steps)
         instants = np.repeat(instant, len(moved_m))
         further = side * self._on_steps(moved_m, instants, steps)
         every = np.vstack([approach, approach + further - further[:, :1]])
@@ -185,8 +189,16 @@ class Touching:
         tables = (local.torque, local.shear)[: self._motion.innovations.shape[0]]
         return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
 
-    def _steps(self, instant: Real, window: Window) -> int:
-        """How many steps lead from the earliest instant to the end of the window."""
+    def steps(self, instant: Real, window: Window) -> int:
+        """How many steps lead from the earliest instant to the end of the window.
+
+        Parameters
+        ----------
+        instant
+            Instants of touch, shape (k,).
+        window
+            Which samples.
+        """
         step_s = self._kernels.step_s
         steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
         return min(max(steps, 4), self._kernels.steps)
@@ -199,7 +211,7 @@ class Touching:
         parameters
             One row of `PARAMETERS`, at least the first two.
         """
-        return float(self._approach(parameters[:1], parameters[1:2], 1, None)[1][0])
+        return float(self.approach(parameters[:1], parameters[1:2], 1)[1][0])
 
     def effects(self, tables: tuple[Real, ...], force: Real, instant: Real, window: Window) -> Real:
         """Effect of forces on the channels in the window, shape (k, c, samples).
@@ -224,10 +236,26 @@ class Touching:
         aligned = shifted(force, begin, (samples - 1) * every + 1)
         return responses(tables, aligned, every, samples)
 
-    def _approach(
-        self, x: Real, instant: Real, steps: int, given: float | None
+    def approach(
+        self, x: Real, instant: Real, steps: int, given: float | None = None
     ) -> tuple[Real, Real]:
-        """How far the free beam is beyond the point of touch, and to which side it goes."""
+        """How far the free beam is beyond where it was at an instant, and to which side it goes.
+
+        Parameters
+        ----------
+        x, instant
+            Places and instants, shape (k,).
+        steps
+            How many steps from the instants on.
+        given
+            The side, 1 or -1; None: the one to which it goes at the instant.
+
+        Returns
+        -------
+        beyond : ndarray, shape (k, steps)
+            In m.
+        side : ndarray, shape (k,)
+        """
         motion = self._motion
         first, weights = lagrange(x, self._x_m)
         moved = mixed(motion.displacement_m, first, weights)

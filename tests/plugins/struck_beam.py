@@ -29,6 +29,13 @@ MISTAKEN = {
 """Obstacles that could be taken for one at rest, or elsewhere, and how the antenna comes to them;
 of two, the first is met first."""
 
+ALIKE = {
+    "two": (Obstacle(0.062, 0.441, 466.0), Obstacle(0.195, 0.4345, 540.0)),
+    "one": Obstacle(0.11, 0.44, 580.0),
+}
+"""Two soft obstacles near the axis, met 6 ms after each other at 0.87 rad/s, and what they are
+like."""
+
 
 def cut(struck, after, *, shear=True, noticed=NOTICED):
     """Return the record around a touch, `after` samples from its detection."""

@@ -1,7 +1,7 @@
 """Records of touches, simulated once."""
 
 import pytest
-from struck_beam import MISTAKEN, OBSTACLES
+from struck_beam import ALIKE, MISTAKEN, OBSTACLES
 from touch_records import DAMPED, LINK, Slew, simulate
 
 from rigd.touch import TouchEstimator, TouchModel
@@ -27,6 +27,20 @@ def mistaken():
     obstacles, slews = zip(*MISTAKEN.values(), strict=True)
     records = simulate(obstacles, slews, duration_s=0.85, steps=40, modes=20, seed=4)
     return dict(zip(MISTAKEN, records, strict=True))
+
+
+@pytest.fixture(scope="session")
+def alike():
+    """Name → record of two obstacles and of one that is like them."""
+    records = simulate(
+        list(ALIKE.values()),
+        [Slew(0.87, 30.0)] * len(ALIKE),
+        duration_s=0.85,
+        steps=40,
+        modes=20,
+        seed=4,
+    )
+    return dict(zip(ALIKE, records, strict=True))
 
 
 @pytest.fixture(scope="session")

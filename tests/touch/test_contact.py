@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigd.touch._contact import march, responses, shifted
+from rigd.touch._contact import march, march_two, responses, shifted
 
 STEP_S = 1e-4
 
@@ -61,6 +61,30 @@ def test_a_march_is_the_same_step_by_step():
         assert told[row] == pytest.approx(force, abs=1e-12)
         assert np.any(force[1:] == 0)
         assert np.any(force > 0)
+
+
+def test_two_obstacles_press_as_springs_on_what_both_forces_bend():
+    """Over blocks of steps in which none, either and both are in contact."""
+    rng = np.random.default_rng(3)
+    k, n = 4, 83
+    lags = np.arange(n)
+    own = [size * np.exp(-lags / 40.0) * np.ones((k, 1)) for size in (1e-3, 4e-4)]
+    cross = 3e-4 * np.exp(-lags / 60.0) * np.array([[1.0], [-1.0], [0.0], [2.0]])
+    approach = [np.cumsum(rng.normal(0.0, 1e-3, (k, n)), axis=1) for _ in own]
+    for each in approach:
+        each[:, 0] = 0.0
+    stiffness = [np.geomspace(300.0, 30000.0, k), np.full(k, 800.0)]
+    told = march_two(tuple(own), cross, tuple(approach), tuple(stiffness))
+    pressing = np.array(told) > 0
+    assert all(np.any(np.all(pressing == [[[a]], [[b]]], axis=0)) for a in (0, 1) for b in (0, 1))
+    for i in range(2):
+        for row in range(k):
+            bent = np.convolve(own[i][row], told[i][row])[:n]
+            bent += np.convolve(cross[row], told[1 - i][row])[:n]
+            wanted = stiffness[i][row] * np.maximum(approach[i][row] - bent, 0.0)
+            assert told[i][row][1:] == pytest.approx(wanted[1:], abs=1e-9)
+    alone = march(own[0], approach[0], stiffness[0], STEP_S)
+    assert told[0][2] == pytest.approx(alone[2])
 
 
 def test_responses_are_convolutions():

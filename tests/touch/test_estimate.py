@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import further
-from struck_beam import MISTAKEN, OBSTACLES, begin_s, cut
+from struck_beam import ALIKE, MISTAKEN, OBSTACLES, begin_s, cut
 
 from rigd.touch import TouchRecord, estimate_touch
 
@@ -98,6 +98,29 @@ def test_of_two_obstacles_the_first_is_told_from_what_precedes_the_second(estima
     estimate = estimator.estimate(cut(mistaken["two"], 190), scan=False)
     assert estimate.samples == 50
     assert estimate.x_m.value == pytest.approx(MISTAKEN["two"][0][0].x_m, abs=0.01)
+    assert estimate.x_m.std < 5e-3
+
+
+def test_two_soft_obstacles_are_not_one_between_them(estimator, alike):
+    """One at 0.11 m leaves in the first 50 ms about what noise leaves."""
+    first, second = ALIKE["two"]
+    early = estimator.estimate(cut(alike["two"], 50), scan=False)
+    assert abs(early.x_m.value - first.x_m) < 4 * early.x_m.std
+    estimate = estimator.estimate(cut(alike["two"], 190), scan=False)
+    assert estimate.kind == "unknown"
+    assert estimate.chi2_per_degree < 1.3
+    low, high = estimate.x_m.interval_95
+    assert low < first.x_m < high < second.x_m
+    touch_s = estimate.time_s.value + begin_s(alike["two"])
+    assert touch_s == pytest.approx(alike["two"].touch_s, abs=2e-3)
+    assert 0 < estimate.force_n.value < 2 * alike["two"].peak_n
+
+
+@pytest.mark.parametrize("after", [50, 190])
+def test_one_that_is_like_two_is_one(estimator, alike, after):
+    estimate = estimator.estimate(cut(alike["one"], after), scan=False)
+    assert estimate.kind == "rigid"
+    assert abs(estimate.x_m.value - ALIKE["one"].x_m) < 4 * estimate.x_m.std
     assert estimate.x_m.std < 5e-3
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from touch_records import DAMPED, LINK
 
-from rigd.beam import Damping, clamped_free_eigenvalues, mode_shape
-from rigd.touch._kernels import Line, contact_kernels, lagrange, places
+from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
+from rigd.touch._kernels import Hat, Line, contact_kernels, cross_kernels, lagrange, places
 
 STEP_S = 1 / 8000
 
@@ -44,6 +44,16 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
         )
         total += shape[i] ** 2 / (LINK.density_kg_per_m * LINK.length_m) * hat / STEP_S
     assert np.abs(total - at_point.displacement[0]).max() < 3e-4 * np.abs(total).max()
+
+
+def test_kernels_between_places_are_those_of_the_exact_model():
+    x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
+    crossing = cross_kernels(LINK, DAMPED, places(LINK.length_m, 0.007), 2 * STEP_S, 400)
+    told = crossing.between(x, other, 300)
+    hat = Hat(2 * STEP_S, 400)
+    exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
+    assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
+    assert crossing.between(other, x, 300) == pytest.approx(told)
 
 
 def test_a_force_that_stays_is_carried_by_the_root_at_last():

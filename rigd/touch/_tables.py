@@ -1,0 +1,60 @@
+"""What estimates of touches need of the beam and the rate only, prepared once."""
+
+from typing import Final
+
+import numpy as np
+
+from rigd.touch._blind import Blind
+from rigd.touch._free_motion import FreeBeam
+from rigd.touch._kernels import contact_kernels, cross_kernels, places
+from rigd.touch._model import TouchModel
+from rigd.touch._physical import Starts
+from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
+
+NOTICED_S: Final = (0.013, 0.04, 0.12)
+"""A touch is noticed at most so long after it: the longer ones are tried if the shorter fail."""
+GRID_S: Final = 0.022
+"""After the detection: what the grid of starts is compared with."""
+_SPACING_M = 0.007
+
+
+class Tables:
+    """What depends on the model and the rate only."""
+
+    def __init__(self, model: TouchModel, rate_hz: float) -> None:
+        self.model, self.rate_hz = model, rate_hz
+        self.x_m = places(model.beam.length_m, _SPACING_M)
+        finer = 4 * max(1, round(4000 / rate_hz))
+        steps = round((FINAL_S + NOTICED_S[-1] + 0.01) * rate_hz * finer)
+        self.finest = contact_kernels(
+            model.beam,
+            model.damping,
+            self.x_m,
+            1 / (finer * rate_hz),
+            steps,
+            model.sensor_filter,
+        )
+        self.middle = self.finest.coarser(2, steps // 2)
+        self.coarse = self.finest.coarser(finer // 4, steps // (finer // 4))
+        half = self.finest.coarser(finer // 2, steps // (finer // 2))
+        self.crossing = cross_kernels(
+            model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
+        )
+        self.blind = Blind(half, 2, round((FIRST_S + NOTICED_S[-1]) * rate_hz) + 1)
+        self.most = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+        self.free = FreeBeam(model, self.x_m, rate_hz, self.most)
+        self._starts: dict[int, Starts] = {}
+        self.starts(round(NOTICED_S[0] * rate_hz) + round(GRID_S * rate_hz))
+        nowhere = np.empty(0)
+        self.changed = [
+            FreeBeam(model.changed(name, std), nowhere, rate_hz, self.most)
+            for name, std in model.std.items()
+            if std > 0
+        ]
+        """The beam with each uncertain parameter one standard deviation off."""
+
+    def starts(self, samples: int) -> Starts:
+        """Grid of starts for so many samples."""
+        if samples not in self._starts:
+            self._starts[samples] = Starts(self.coarse, 2, self.rate_hz, samples)
+        return self._starts[samples]

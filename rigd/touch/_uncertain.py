@@ -1,0 +1,84 @@
+"""What is uncertain, and what it does to the innovations of a touch.
+
+The model's parameters, the steps of the march, what is unknown of the free motion and the steps of
+the encoder, also by where each lets the beam touch.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.touch._free_motion import BEFORE, FINER, TouchRecord
+from rigd.touch._kernels import contact_kernels
+from rigd.touch._physical import Touching, Window
+from rigd.touch._tables import Tables
+
+Real = NDArray[np.float64]
+
+
+def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -> Real:
+    """Effects on the innovations of what is uncertain, one standard deviation each, (c, n, r).
+
+    Parameters
+    ----------
+    tables
+        What depends on the model and the rate.
+    record
+        The samples.
+    best
+        Place, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
+    whole
+        The samples wanted, whose first is certainly before the touch.
+    """
+    motion, quiet = whole.motion, whole.first
+    fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
+    touching = Touching(tables.middle, tables.x_m, motion)
+    middle = touching.predicted(best, whole)[0][0]
+    columns = [
+        fine - middle,
+        *_ringing(tables, touching, best[0], whole),
+        *_angle_noise(tables, touching, best[0], whole),
+    ]
+    span = slice(whole.first, whole.end)
+    left = motion.innovations[:, span] - middle
+    x = float(best[0, 0])
+    near = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
+    for free in tables.changed:
+        changed = free.at(near).motion(record, quiet, quiet - 4)
+        kernels = contact_kernels(
+            free.model.beam,
+            free.model.damping,
+            np.array([x]),
+            tables.middle.step_s,
+            round((motion.t[-1] - best[0, 1]) / tables.middle.step_s) + 4,
+            free.model.sensor_filter,
+        )
+        effect, _ = Touching(kernels, near, changed).predicted(best, whole, kernels=kernels)
+        columns.append(changed.innovations[:, span] - effect[0] - left)
+    return np.stack(columns, axis=-1)
+
+
+def _ringing(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
+    """Effects of what is unknown of the free motion, also by where it lets the beam touch."""
+    motion = whole.motion
+    spread = motion.spread
+    count = motion.ringing.poles.size * 2
+    there = best[:1] / tables.model.beam.length_m
+    columns = motion.displacement_m.shape[1]
+    # Times from the record's beginning, as the amplitudes are meant.
+    t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(columns)
+    moved = motion.ringing.at(there).displacement(t, spread[:count])[0]
+    direct = motion.design[:, whole.first : whole.end] @ spread
+    return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
+
+
+def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
+    """Effects of the encoder's steps, by where they let the beam touch."""
+    motion = whole.motion
+    samples = np.arange(whole.first, whole.end)
+    place = int(np.argmin(np.abs(tables.x_m - best[0])))
+    one = tables.free.per_sample(place, samples.size + 8)
+    # Columns begin four samples before the window.
+    late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
+    index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]
+    moved = np.where((index >= 0) & (index < one.size), one[np.clip(index, 0, one.size - 1)], 0.0)
+    return touching.passed_on(best, whole, motion.angle_noise_rad * moved)
