@@ -60,6 +60,10 @@ _GOING = ("move", "touch")
 """Excitations that go to an angle: they know where they start, and have no amplitude."""
 _SETTLED = 5.0
 """Time constants of the loop in which it follows up a reference."""
+_NO_FORCE = (
+    "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
+    "(--force-limit) ends nothing, and points are less precise."
+)
 
 
 class RefusedError(UserError):
@@ -319,10 +323,14 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
         lower = _remedy(profile, excitation, force=force)
         refusals = [f"{finding}; {lower}." for finding in firm]
         refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
-    clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
+    warnings = [unstable] if unstable else []
+    if not refusals:
+        warnings += [f"{finding}: it will be clipped and flagged." for finding in forcible]
+    if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
+        warnings.append(_NO_FORCE)
     return Plan(
         prediction,
-        warnings=tuple(([unstable] if unstable else []) + ([] if refusals else clipped)),
+        warnings=tuple(warnings),
         tip_in_words=_tip_in_words(prediction, profile.rig.beam, excitation.kind),
         refused="\n".join(refusals),
         ending=_ending(loop, stays=excitation.stays),

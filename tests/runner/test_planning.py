@@ -115,6 +115,16 @@ def test_what_goes_to_an_angle_is_told_of_no_amplitude(profile, kind, parameters
     assert "amplitude" not in plan.tip_in_words
 
 
+@pytest.mark.parametrize("projection", [(0.0,) * 6, None])
+def test_a_search_whose_contact_force_is_not_known_is_warned_of(profile, projection):
+    sensor = profile.rig.sensor
+    if projection is not None:
+        sensor = replace(sensor, shear_projection=projection)
+    rig = replace(profile, rig=replace(profile.rig, sensor=sensor))
+    plan = predict_session(rig, excitation_for(rig, "touch", {"angle_rad": 0.6}))
+    assert any("--force-limit" in each for each in plan.warnings) == (projection is not None)
+
+
 @pytest.mark.parametrize(
     ("start_hz", "said"),
     [(60.0, "sweeps down from 60 to 50 Hz"), (0.05, "sweeps from 0.05 to 50 Hz")],

@@ -320,7 +320,7 @@ class Cia402Drive:
             if unproven
             else ""
         )
-        errors = exchange.error_frames + pairing.lost
+        errors = exchange.error_frames + pairing.lost + self._inbox.malformed
         return LineHealth(exchange.bits, self._bit_rate_bit_s, errors, doubt=doubt)
 
     def disable(self) -> None:

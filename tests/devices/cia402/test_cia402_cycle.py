@@ -148,6 +148,13 @@ def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripte
     assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
 
 
+def test_a_reply_of_another_length_counts_as_an_error_of_the_bus(make_drive, rig):
+    drive = make_drive(rig)
+    drive.connect()
+    drive._inbox.take_tpdo(b"\x27\x16")
+    assert drive.health().errors == 1
+
+
 def test_after_a_lost_reply_one_sync_is_left_out_to_see_which_is_whose(make_drive, rig, scripted):
     slow = replace(rig, rate_hz=10.0, acquisition=Acquisition("same_tick", 5e4))
     drive = make_drive(slow)
