@@ -76,6 +76,16 @@ def other_kinds(count: int, kinds: list[str], rng: np.random.Generator) -> list[
         elif kind == "knock":
             peak = rng.choice([-1, 1]) * rng.uniform(0.5, 4.0)
             obstacle = replace(plain, knock_n=peak, knock_s=rng.uniform(0.002, 0.02))
+        elif kind == "soft":  # two near the axis, met at about the same time
+            first, second = (
+                Obstacle(
+                    rng.uniform(0.03, 0.6),
+                    plain.angle_rad + rng.uniform(-0.006, 0.006),
+                    float(np.exp(rng.uniform(np.log(200), np.log(3000)))),
+                )
+                for _ in range(2)
+            )
+            obstacle = (first, second)
         else:
             angle = plain.angle_rad + rng.uniform(-0.03, 0.03)
             obstacle = (plain, Obstacle(rng.uniform(0.05, 0.97), angle, stiffness()))
