@@ -237,7 +237,7 @@ class PageServer:
                     self._job["torque_delay_s"],
                 )
             )
-        self.pages.send(self._nominal)
+        self.pages.send(self._nominal)  # whereupon they forget the other responses
         specimen = str(series["notes"].get("specimen", ""))
         self._begin_finding(self._find_last(specimen, Path(path).stem))
 

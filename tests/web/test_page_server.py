@@ -337,6 +337,21 @@ def test_the_response_of_a_search_is_that_of_its_scan(served, begin, monkeypatch
     assert (begun[0].sweep, begun[0].ticks) == (excitation.segments["scan"], 60_000)
 
 
+def test_with_each_session_of_a_series_the_nominal_model_is_told_again(served, pages, begin):
+    excitation = KINDS["chirp"](rate_hz=1000, duration_s=10)
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            for path in ("out/1.mcap", "out/2.mcap"):
+                served.server._shown = {"type": "response"}
+                begin(path, excitation)
+                await until(socket, "nominal")
+                assert served.server._shown is None
+
+    pages.run(scenario)
+
+
 @contextlib.asynccontextmanager
 async def page_at(served, session):
     """Open a page; gives its socket, and the connection by which the server follows the daemon."""

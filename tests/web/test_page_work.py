@@ -315,10 +315,15 @@ def test_the_response_grows_over_model_and_last_session(server, page):
     page.hover("#response-plot", position={"x": 60, "y": 50})
     says(page, "#response-readout", "coherence")
     assert "Hz" in page.inner_text("#response-readout")
-    # Another session begins: of the one before there is nothing left.
-    begun = {"type": "state", "utc_ns": UTC_NS, "from": "ready", "to": "running", "reason": ""}
-    server.tell(begun)
+
+
+def test_of_the_session_before_nothing_is_shown_when_the_next_of_a_series_begins(server, page):
+    server.tell(status("running"), response("nominal"), response("last"), response())
+    says(page, "#response-keys", "measured")
+    server.tell(status("running"), response("nominal"))
     expect(page.locator("#response-keys")).to_have_text("nominal model")
+    server.tell(response(reached_hz=5.0))
+    says(page, "#response-keys", "measured")
 
 
 @pytest.mark.further
