@@ -146,7 +146,7 @@ def start_sessions(
                     )
                 return
             _tell_plan(told["plan"], err=as_json)
-            # A daemon of before an update makes none.
+            # A daemon of before an update makes none, or does not tell at which sessions.
             looks = daemon.get("quick_looks", False)
             series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
     if as_json:
@@ -231,7 +231,7 @@ def _follow(
                     if event["path"] is not None:
                         if not as_json:
                             typer.echo(event["path"])
-                        if looks:
+                        if event.get("look_follows", looks):
                             awaited.add(event["path"])
                         if "fit" in event:
                             fits[event["path"]] = event["fit"]

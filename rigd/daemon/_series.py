@@ -126,7 +126,7 @@ class SeriesTeller:
         for fit in progress.fits:
             self._tell_fit(fit)
 
-    def ended(self, result: SessionResult) -> None:
+    def ended(self, result: SessionResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
         fit = {}
@@ -148,7 +148,7 @@ class SeriesTeller:
         level = _LEVELS.get(result.outcome, "error")
         message = {"level": level, "text": line, "session": series.session}
         self._publish({"event": "message", **message})
-        document = result.as_dict() | fit
+        document = result.as_dict() | fit | {"look_follows": look_follows}
         self._publish({"event": "session", "number": series.session, **document})
 
     def _tell(self, level: str, text: str, *, notable: bool = False) -> None:

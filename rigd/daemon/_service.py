@@ -573,7 +573,7 @@ class Service:
                 looks=self._looks,
             )
         except SessionFailedError as error:
-            told.ended(error.result())
+            told.ended(error.result(), look_follows=False)
             raise
 
     def _listens(self) -> bool:

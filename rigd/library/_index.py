@@ -23,7 +23,7 @@ INDEX_NAME: Final = "library.sqlite"
 """Name of the index in its folder."""
 
 _APPLICATION: Final = 0x72696764  # "rigd"
-_VERSION: Final = 1
+_VERSION: Final = 2
 """Greater whenever the table, or what a row is made of, is another: older indexes are rebuilt."""
 _HEADER: Final = b"SQLite format 3\0"
 _APPLICATION_PLACE: Final = slice(68, 72)

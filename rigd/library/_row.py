@@ -86,7 +86,7 @@ class SessionRow:
         return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
 
 
-def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
+def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
     """Read what is known of a session; what cannot be read is told in the row.
 
     Parameters
@@ -98,12 +98,19 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
     report
         Folder of its last report, if there is one.
 
+    Returns
+    -------
+    SessionRow
+        What is known.
+    bool
+        Whether that holds until the files change: not if the system did not let the file be read.
+
     Raises
     ------
     FileNotFoundError
         If the file has gone meanwhile.
     """
-    from rigd.session import SessionError, added_metadata, read_summary
+    from rigd.session import SessionAccessError, SessionError, added_metadata, read_summary
 
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
@@ -114,9 +121,10 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
         summary = read_summary(path)
     except SessionError as error:
         path.stat()  # which may have gone
-        return SessionRow(
+        row = SessionRow(
             name, path, size, outcome="unreadable", problem=printable(str(error)), **results
         )
+        return row, not isinstance(error, SessionAccessError)
     metadata, outcome = summary.metadata, summary.outcome or {}
     ended = _text(outcome, "outcome") or "unknown"
     if summary.recording:
@@ -127,7 +135,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
     ticks = summary.samples if scheduled is None else scheduled
     rate_hz = _number(metadata, "rate_hz") or 0.0
     added = list(added_metadata(metadata).items())[:_MOST_META]
-    return SessionRow(
+    row = SessionRow(
         id=name,
         path=path,
         size_bytes=size,
@@ -151,6 +159,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
         problem=summary.problem,
         **results,
     )
+    return row, True
 
 
 def _cut(text: str) -> str:

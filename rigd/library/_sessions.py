@@ -164,11 +164,11 @@ def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[Ses
     for number, name in enumerate(unread, start=1):
         file = found[name]
         try:
-            row = read_row(file.path, file.look, file.report)
+            row, holds = read_row(file.path, file.look, file.report)
         except OSError:  # it has gone, or has got its final name
             continue
         rows.append(row)
-        if not name.endswith(TORN_SUFFIX):
+        if holds and not name.endswith(TORN_SUFFIX):
             fresh[name] = file.stamp, row
         if on_progress is not None:
             on_progress(number / len(unread))

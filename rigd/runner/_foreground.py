@@ -214,7 +214,7 @@ class _Operator:
             number=self._number,
         )
 
-    def ended(self, result: SessionResult) -> None:
+    def ended(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
         self._tell(result_line(result.as_dict()))
         if result.path is not None:

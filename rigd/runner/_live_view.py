@@ -15,7 +15,7 @@ from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runtime import StopRequest
-from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of
+from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of, sweep_of
 
 _PATIENCE_S = 10.0
 """It takes its time to start: a session waits so long for it."""
@@ -216,8 +216,7 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
         name=order.path.stem,
         rate_hz=rig.rate_hz,
         ticks=excitation.reference_rad.size,
-        # Pieces after a scan are no sweep through the band.
-        sweep=excitation.segments.get("scan", excitation.segments["sweep"]),
+        sweep=sweep_of(excitation.segments),
         beam=rig.beam,
         damping=rig.damping,
         tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,

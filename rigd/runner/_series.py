@@ -44,8 +44,8 @@ class SeriesWatcher(Protocol):
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
         """Take note of the progress and of what happened, some twenty times a second."""
 
-    def ended(self, result: SessionResult) -> None:
-        """Take note of how it ended."""
+    def ended(self, result: SessionResult, *, look_follows: bool) -> None:
+        """Take note of how it ended, and whether a quick look at it follows."""
 
 
 class Series:
@@ -185,10 +185,11 @@ class Series:
                     watcher.shown(rig.show(order, stop))
                 result = rig.run(order, stop, watcher.update, listens)
             self.results.append(result)
-            watcher.ended(result)
             # A move that leaves no vibration shows nothing of the modes.
-            if looks is not None and result.path is not None and self._excitation.shows_modes:
-                looks.begin(result.path)
+            seen = result.path if self._excitation.shows_modes else None
+            watcher.ended(result, look_follows=looks is not None and seen is not None)
+            if looks is not None and seen is not None:
+                looks.begin(seen)
             if not result.went_well:
                 return
 

@@ -7,6 +7,7 @@ from ._format import SAMPLE_WIRE_DTYPE as SAMPLE_WIRE_DTYPE
 from ._format import TIMING_SIZE as TIMING_SIZE
 from ._format import TOUCH_KINDS as TOUCH_KINDS
 from ._format import WRENCH_FIELDS as WRENCH_FIELDS
+from ._format import SessionAccessError as SessionAccessError
 from ._format import SessionError as SessionError
 from ._format import SessionExistsError as SessionExistsError
 from ._format import Status as Status

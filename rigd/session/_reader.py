@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session._format import SessionError, to_native
+from rigd.session._format import SessionAccessError, SessionError, to_native
 from rigd.session._mcap_limits import McapError, McapTooLargeError
 from rigd.session._mcap_reader import McapContents, Stretch, Taker, read_mcap
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
@@ -452,8 +452,8 @@ def _refuse_no_file(path: Path) -> None:
         raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
 
 
-def _unreadable(path: Path, error: OSError) -> SessionError:
-    return SessionError(
+def _unreadable(path: Path, error: OSError) -> SessionAccessError:
+    return SessionAccessError(
         f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
     )
 

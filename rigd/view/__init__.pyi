@@ -60,3 +60,4 @@ from ._session_info import Note as Note
 from ._session_info import Subject as Subject
 from ._session_info import band_of as band_of
 from ._session_info import outcome_note as outcome_note
+from ._session_info import sweep_of as sweep_of

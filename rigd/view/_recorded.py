@@ -16,7 +16,7 @@ from rigd.view._banner import ended
 from rigd.view._layout import blueprint
 from rigd.view._plots import AGES, FAULTY_TICKS, HEALTH, OF_REAL_TIME, TIMELINE
 from rigd.view._scene import Scene
-from rigd.view._session_info import Health, Note, Subject, band_of, outcome_note
+from rigd.view._session_info import Health, Note, Subject, band_of, outcome_note, sweep_of
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -77,7 +77,7 @@ def subject_of_session(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_within(session, "rate_hz", 1.0, 1e5),
         ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
-        sweep=session.segments.get("scan", session.segments.get("sweep", (first, end))),
+        sweep=sweep_of({"sweep": (first, end), **session.segments}),
         beam=Beam(
             _within(session, "beam_length_m", 1e-3, 1e3),
             _within(session, "beam_density_kg_per_m", 1e-6, 1e3),

@@ -102,6 +102,18 @@ class Subject:
         return start_hz + (stop_hz - start_hz) * (tick - first) / (end - first)
 
 
+def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
+    """Return the part of a record that its frequency response is estimated over.
+
+    Parameters
+    ----------
+    segments
+        First tick and end (exclusive) of each, with ``sweep`` among them.
+    """
+    # The pieces that a search runs after its scan are no sweep through the band.
+    return segments["scan" if "scan" in segments else "sweep"]
+
+
 def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
     """Return the frequencies at the ends of a linear sweep; None where the excitation is none.
 

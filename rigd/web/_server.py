@@ -23,7 +23,7 @@ from rigd.profile import specimen_files
 from rigd.runner import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
-from rigd.view import Subject
+from rigd.view import Subject, sweep_of
 from rigd.web._access import ICON, LIVE, Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
@@ -220,7 +220,7 @@ class PageServer:
         """Make ready for the response of a session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
         self._nominal = self._nominal_of(plan)
-        first, end = plan["segments"]["sweep"]
+        first, end = sweep_of(plan["segments"])
         self._shown = self._last = None
         self._response = None
         if series["excitation"] != "hold":
@@ -237,7 +237,7 @@ class PageServer:
                     self._job["torque_delay_s"],
                 )
             )
-        self.pages.send(self._nominal)
+        self.pages.send(self._nominal)  # whereupon they forget the other responses
         specimen = str(series["notes"].get("specimen", ""))
         self._begin_finding(self._find_last(specimen, Path(path).stem))
 

@@ -106,6 +106,13 @@ def test_the_last_quick_look_is_waited_for(follow):
     assert said.count("Quick look") == 1
 
 
+def test_a_quick_look_that_does_not_follow_is_not_waited_for(follow):
+    first, second = (session(k) | {"look_follows": k == 1} for k in (1, 2))
+    ended, done, _ = follow(first, look(1), second, series(1, 2))
+    assert [each["look"] for each in ended["sessions"]] == ["out/1.look.json", None]
+    assert not any("Ctrl-C skips it" in each[1] for each in done if each[0] == "say")
+
+
 @pytest.mark.parametrize("interrupts", [(), (1,)])  # the session was stopped by a first one
 def test_ctrl_c_skips_the_quick_look(follow, interrupts):
     ended, _, sent = follow(*interrupts, session(1), series(1), 1)

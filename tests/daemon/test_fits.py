@@ -59,8 +59,9 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     # The result has nothing that was for the moment only, and says how a search ended.
     final = online_fit(9.0, search=False) | {"search": {"reason": "Reached.", "pieces": []}}
     del final["text"]
-    teller.ended(result(fit=final))
+    teller.ended(result(fit=final), look_follows=True)
     assert events[-1]["fit"]["search"] == {"reason": "Reached."}
+    assert events[-1]["look_follows"]
     document = series.as_document()
     assert document["fit"]["text"] == fits[-1]["text"]
     assert document["fit"]["duration_s"] == 9.0
@@ -71,8 +72,9 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
 
 def test_a_session_without_fits_is_told_as_before(told):
     series, teller, events = told
-    teller.ended(result())
+    teller.ended(result(), look_follows=False)
     assert "fit" not in events[-1]
+    assert not events[-1]["look_follows"]
     assert series.as_document()["fit"] is None
 
 
@@ -81,7 +83,7 @@ def test_a_session_without_fits_is_told_as_before(told):
 )
 def test_how_a_session_ended_is_one_message_of_its_level(told, outcome, level):
     _, teller, events = told
-    teller.ended(result(outcome=outcome))
+    teller.ended(result(outcome=outcome), look_follows=False)
     message, session = events
     assert (message["level"], message["session"]) == (level, session["number"])
     assert message["text"].startswith(f"{outcome.capitalize()}: ")

@@ -1,10 +1,12 @@
 """The index beside the files: always equal to them, whatever happens to either."""
 
+import errno
 import json
 import multiprocessing
 import os
 import shutil
 import sqlite3
+from pathlib import Path
 
 import pytest
 from library_folders import mode
@@ -51,6 +53,28 @@ def test_only_what_is_new_or_has_changed_is_read(
         (tmp_path / INDEX_NAME).unlink()
         assert list_sessions(tmp_path) == brought_up
     assert [row.id for row in brought_up] == ["e", "d", "c"]
+
+
+def test_a_file_that_cannot_be_opened_for_a_moment_is_read_the_next_time(
+    record_briefly, tmp_path, monkeypatch, read_files
+):
+    record_briefly("good")
+    (tmp_path / "text.mcap").write_text("no session at all")
+    with monkeypatch.context() as moment:
+        moment.setattr(Path, "open", refuse)  # also to root, who may read everything
+        rows = list_sessions(tmp_path)
+    assert [row.outcome for row in rows] == ["unreadable", "unreadable"]
+    assert all("Permission denied" in row.problem for row in rows)
+    for expected in (["good.mcap", "text.mcap"], []):  # what is damaged is known by then
+        read_files.clear()
+        assert {row.id: row.outcome for row in list_sessions(tmp_path)} == {
+            "good": "complete", "text": "unreadable"
+        }  # fmt: skip
+        assert sorted(read_files) == expected
+
+
+def refuse(path, *_):
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
 
 
 def test_an_index_goes_with_its_folder(

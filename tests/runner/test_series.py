@@ -18,6 +18,7 @@ from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 
 WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
+UNSEEN = ("look_follows", False)
 
 
 class Rig:
@@ -40,7 +41,7 @@ class Watcher:
         self.told = []
 
     def __getattr__(self, name):
-        return lambda *what: self.told.append((name, *what))
+        return lambda *what, **said: self.told.append((name, *what, *said.items()))
 
 
 @pytest.fixture
@@ -67,8 +68,8 @@ def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series)
     first, second = (order.path for order in rig.orders)
     assert first.stem.endswith("-hold-01")
     assert watcher.told == [
-        ("begins", 1, first), ("shown", "Live view: there"), ("ended", WELL),
-        ("begins", 2, second), ("shown", "Live view: there"), ("ended", bad),
+        ("begins", 1, first), ("shown", "Live view: there"), ("ended", WELL, UNSEEN),
+        ("begins", 2, second), ("shown", "Live view: there"), ("ended", bad, UNSEEN),
     ]  # fmt: skip
 
 
@@ -147,12 +148,23 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
     pause = ["look", "watch", "watch", "watch"]
     told = [each if isinstance(each, str) else each[0] for each in watcher.told]
     assert told == ["begins", *session, *pause] * 2 + ["begins", *session]
+    ends = [each[-1] for each in watcher.told if each[0] == "ended"]
+    assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
 
     stop = StopRequest()
     stop.request()
     watcher.told.clear()
     _await_look(looks, Watched(), stop)
     assert watcher.told == []
+
+
+def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
+    profile, watcher = load_profile("sim"), Watcher()
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(watcher.told)
+    series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
+    series.run(Rig(recorded), StopRequest(), watcher, live=False, looks=looks)
+    assert watcher.told[-2:] == ["let go", ("ended", recorded, UNSEEN)]
 
 
 def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):

@@ -307,3 +307,24 @@ def test_a_report_and_a_campaign_are_queued_with_the_token(served, two, monkeypa
 
 
 BOTH = ["report", "campaign"]
+
+
+@pytest.mark.usefixtures("two")
+def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch):
+    making = "import os, sys; os.mkdir(sys.argv[-1])"  # at its end, and never over another
+    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", making))
+    told = []
+    monkeypatch.setattr(served.server._jobs, "_tell", told.append)
+    ids = json.dumps({"ids": ["first", "second"]}).encode()
+    served.daemon.status["state"] = "running"
+    try:
+        assert eventually(lambda: served.server._jobs.paused)
+        for _ in range(2):
+            assert served.ask("POST", "/api/campaign", ACTING, ids)[0] == 202
+    finally:
+        served.daemon.status["state"] = "ready"
+    over = ("done", "failed")
+    assert eventually(lambda: sum(job["state"] in over for job in told) == 2)
+    made = [(job["error"], job["address"]) for job in told if job["state"] in over]
+    folders = ("campaign.report", "campaign.report-2")
+    assert made == [("", f"/api/campaign/{folder}/") for folder in folders]

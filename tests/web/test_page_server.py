@@ -19,7 +19,7 @@ from processes import eventually
 from web_daemon import TOKEN
 
 from rigd.excitation import KINDS
-from rigd.web import _library, _live
+from rigd.web import _library, _live, _server
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -306,6 +306,50 @@ def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
             return refusal.value.status
 
     assert pages.run(scenario) == 503
+
+
+@pytest.fixture
+def begin(served):
+    """Have the daemon say that a session of an excitation has begun, in a file of that name."""
+
+    def session(name, excitation):
+        plan = {
+            "segments": {name: list(ends) for name, ends in excitation.segments.items()},
+            "record_s": excitation.reference_rad.size / excitation.rate_hz,
+            **{name: served._job[name] for name in ("beam", "damping")},
+        }
+        series = {"path": name, "running": True, "excitation": excitation.kind, "notes": {}}
+        served.daemon.status |= {"state": "running", "series": series | {"plan": plan}}
+        served.call(served.server._link.ask_for_status)
+
+    yield session
+    served.daemon.status |= {"state": "ready", "series": None}
+    served.call(served.server._link.ask_for_status)
+    assert eventually(lambda: served.server._session is None)
+
+
+def test_the_response_of_a_search_is_that_of_its_scan(served, begin, monkeypatch):
+    begun = []
+    monkeypatch.setattr(_server, "SessionResponse", begun.append)
+    excitation = KINDS["until"](rate_hz=1000, targets="damping 1%", at_most_s=60)
+    begin("out/1-until.mcap", excitation)
+    assert eventually(lambda: begun)
+    assert (begun[0].sweep, begun[0].ticks) == (excitation.segments["scan"], 60_000)
+
+
+def test_with_each_session_of_a_series_the_nominal_model_is_told_again(served, pages, begin):
+    excitation = KINDS["chirp"](rate_hz=1000, duration_s=10)
+
+    async def scenario(session):
+        async with session.ws_connect("/api/live") as socket:
+            await until(socket, "nominal")
+            for path in ("out/1.mcap", "out/2.mcap"):
+                served.server._shown = {"type": "response"}
+                begin(path, excitation)
+                await until(socket, "nominal")
+                assert served.server._shown is None
+
+    pages.run(scenario)
 
 
 @contextlib.asynccontextmanager

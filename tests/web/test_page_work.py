@@ -89,6 +89,22 @@ def test_a_start_sends_what_the_form_says(server, page):
     assert not page.is_checked("#force")  # it is asked for again
 
 
+def test_a_required_operator_is_asked_for_in_its_own_field(server, page):
+    server.tell(hello(required_meta=["operator", "temperature_c"]))
+    expect(page.locator("#operator")).to_have_attribute("placeholder", "required")
+    assert page.evaluate("document.getElementById('operator').required")
+    assert not page.evaluate("document.getElementById('specimen').required")
+    assert page.input_value("#metadata-rows .pair input >> nth=0") == "temperature_c"
+    assert page.locator("#metadata-rows .pair").count() == 1
+    page.fill("#operator", "R. Igge")
+    page.fill("#metadata-rows input:nth-child(2)", "21.4")
+    server.replies["start"] = {"series": 1, "plan": PLAN}
+    page.click("#start-button")
+    says(page, "#prediction", "Predicted peaks")
+    notes = {"operator": "R. Igge", "meta": {"temperature_c": 21.4}}
+    assert server.requests[0]["notes"] == notes
+
+
 @pytest.mark.further
 def test_each_excitation_has_its_own_parameters_with_units(page):
     assert "Amplitude" in page.inner_text("#parameters")
@@ -299,10 +315,15 @@ def test_the_response_grows_over_model_and_last_session(server, page):
     page.hover("#response-plot", position={"x": 60, "y": 50})
     says(page, "#response-readout", "coherence")
     assert "Hz" in page.inner_text("#response-readout")
-    # Another session begins: of the one before there is nothing left.
-    begun = {"type": "state", "utc_ns": UTC_NS, "from": "ready", "to": "running", "reason": ""}
-    server.tell(begun)
+
+
+def test_of_the_session_before_nothing_is_shown_when_the_next_of_a_series_begins(server, page):
+    server.tell(status("running"), response("nominal"), response("last"), response())
+    says(page, "#response-keys", "measured")
+    server.tell(status("running"), response("nominal"))
     expect(page.locator("#response-keys")).to_have_text("nominal model")
+    server.tell(response(reached_hz=5.0))
+    says(page, "#response-keys", "measured")
 
 
 @pytest.mark.further

@@ -242,14 +242,12 @@ export class LiveResponse {
 
   constructor(link) {
     link.on("response", (response) => this.#set(() => { this.#measured = response; }));
-    link.on("nominal", (response) => this.#set(() => { this.#nominal = response; }));
     link.on("last", (response) => this.#set(() => { this.#last = response; }));
-    link.on("state", ({ from, to }) => {
-      // The last one may have been of another specimen.
-      if (to === "running" && from === "ready") {
-        this.#set(() => { this.#measured = this.#last = null; });
-      }
-    });
+    // It comes first, and again with each session of a series: the others were of the one before.
+    link.on("nominal", (response) => this.#set(() => {
+      this.#nominal = response;
+      this.#measured = this.#last = null;
+    }));
   }
 
   #set(change) {

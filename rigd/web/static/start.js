@@ -5,6 +5,7 @@ import { unitOf, wordsOf } from "./format.js";
 import { Prediction } from "./prediction.js";
 
 const OPERATOR = "rigd-operator";
+const NOTES = ["operator", "specimen", "note"];  // metadata with a field of their own
 const PLACEHOLDERS = {
   path: "/absolute/path, read by the daemon",
   targets: "damping 1%; frequency 2:0.01%; alpha 0.01",
@@ -53,7 +54,11 @@ export class StartForm {
   #offer({ excitations = {}, specimens = [], required_meta: required = [] }) {
     byId("specimens").replaceChildren(...specimens.map((specimen) =>
       make("option", { value: specimen.name ?? specimen })));
-    for (const name of required) {
+    for (const name of NOTES) {
+      byId(name).required = required.includes(name);
+      byId(name).placeholder = required.includes(name) ? "required" : "";
+    }
+    for (const name of required.filter((each) => !NOTES.includes(each))) {
       if (!this.#pairs().some((pair) => pair.name.value === name)) this.#addValue(name);
     }
     // The same daemon again: what has been typed stays.
@@ -151,7 +156,7 @@ export class StartForm {
       return null;
     }
     const notes = {};
-    for (const name of ["operator", "specimen", "note"]) {
+    for (const name of NOTES) {
       const text = byId(name).value.trim();
       if (text) notes[name] = text;
     }
