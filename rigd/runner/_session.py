@@ -47,7 +47,8 @@ from rigd.runner._request import Order, another_path, file_header, part_of
 from rigd.runner._touch_search import TouchEstimates
 from rigd.runtime import StopRequest
 
-_POLL_S = 0.05
+_POLL_S = 0.02
+"""How late what another process tells may reach the operator."""
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
 """Time for enabling a drive and for switching it off, which may be slow."""
