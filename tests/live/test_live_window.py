@@ -101,13 +101,15 @@ def session(write_profile, start_rigd, tmp_path):
 
 
 @pytest.fixture
-def viewer(rerun_program, session, tmp_path):
-    """Rerun's viewer, connected to the session's server."""
+def viewer(rerun_program, session, session_s, tmp_path):
+    """Rerun's viewer, connected to the session's server when there is something to be seen."""
     from rerun.experimental import ViewerClient
 
     _, address = session
     (proxy,) = urllib.parse.parse_qs(urllib.parse.urlsplit(address).query)["url"]
     log = tmp_path / "viewer.log"
+    # It draws whether somebody looks or not.
+    assert eventually(lambda: session_s() > 0.75 * LOOK_AT_S)
     with log.open("w") as output:
         process = subprocess.Popen(
             [
