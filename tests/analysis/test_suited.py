@@ -144,9 +144,17 @@ def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_her
     assert modes[1]["frequency_hz"] == pytest.approx(16.0, rel=5e-3)
     # Warnings of the program, not of its libraries.
     assert all(line.startswith("Warning: slow.mcap:") for line in result.stderr.splitlines())
-    band = analyze_here(
-        "slow.mcap", "--method", "record", "--band", "1,20", "--json", "b.json", *brief[-2:]
-    )
+
+
+@pytest.mark.further  # as report/test_method_record.py, at another rate
+def test_a_band_of_a_record_of_100_hz_is_analysed(
+    write_session, slow_signals, analyze_here, tmp_path
+):
+    ticks = np.arange(len(slow_signals.angle_rad))
+    stated = {"rate_hz": "100.0", "duration_s": "20.0"}
+    path = tmp_path / "slow.mcap"
+    write_session(path, slow_signals, metadata=stated, t_ns=ticks * 10_000_000)
+    band = analyze_here("slow.mcap", "--method", "record", "--band", "1,20", "--json", "b.json")
     assert (band.returncode, band.stderr) == (0, "")
     assert json.loads((tmp_path / "b.json").read_text())["records"][0]["band_hz"] == [1.0, 20.0]
 

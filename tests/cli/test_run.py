@@ -137,6 +137,7 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
 
 
+@pytest.mark.further  # as identify/test_knock.py, of records without a motor that turns with it
 def test_a_loud_knock_is_named_though_the_motor_turns_with_it(rigd, tmp_path):
     """In mid-sweep, on the tip: the beam rings louder than the motor drives it, for half of it."""
     rigd(
