@@ -191,8 +191,7 @@ def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
     return int(np.count_nonzero(np.all(distance < 12.0, axis=-1)))
 
 
-# Curves and their colours are those of test_layouts.py, and samples those of test_live_publisher.py.
-@pytest.mark.further
+@pytest.mark.further  # layout and samples are checked by view/ and test_live_publisher.py
 def test_every_view_shows_its_curves_as_they_come(viewer, session_s):
     shown = partial(eventually, every_s=0.2)  # for each answer the viewer draws everything
 
