@@ -6,6 +6,7 @@ for `rigd start` gets them from the daemon.
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -13,6 +14,8 @@ from rigd.engine import Phase
 from rigd.printable import counts_text, progress_bar
 from rigd.session import touch_line
 
+_REDRAWN_S: Final = 0.05
+"""Shortest time after which progress alone has the line drawn anew: 2 ms of a processor."""
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
 
@@ -83,6 +86,7 @@ class ProgressLine:
         self._closed = False
         self._recorded = False
         self._changed = threading.Event()
+        self._due_s = 0.0
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -110,7 +114,10 @@ class ProgressLine:
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",
         }
-        self._changed.set()
+        now_s = time.monotonic()
+        if now_s >= self._due_s:
+            self._due_s = now_s + _REDRAWN_S
+            self._changed.set()
 
     def say(self, message: str) -> None:
         """Write a message above the line."""

@@ -42,7 +42,7 @@ class SeriesWatcher(Protocol):
         """Take note of where its live view is, or why there is none."""
 
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
-        """Take note of the progress and of what happened, some twenty times a second."""
+        """Take note of the progress and of what happened, some fifty times a second."""
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:
         """Take note of how it ended, and whether a quick look at it follows."""

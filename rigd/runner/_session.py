@@ -219,7 +219,7 @@ class Session:
     live
         The view to keep up, or None.
     watcher
-        Called some twenty times a second with the progress and the events since the last call.
+        Called some fifty times a second with the progress and the events since the last call.
     listens
         Whether a stop would be heard. Where it would not, the control process is to take this one
         for hung.
