@@ -93,7 +93,13 @@ class Jobs:
         self._folder = folder
         self._tell = tell
         self._waiting: asyncio.Queue[Job] = asyncio.Queue(MOST_JOBS)
+        self._underway: dict[int, Job] = {}
         self._count = 0
+
+    @property
+    def addresses(self) -> set[str]:
+        """Where results will be served of jobs that wait or run."""
+        return {job.address for job in self._underway.values()}
 
     def put(self, kind: str, arguments: Sequence[str], session: str = "", address: str = "") -> Job:
         """Queue a job.
@@ -114,6 +120,7 @@ class Jobs:
             self._waiting.put_nowait(job)
         except asyncio.QueueFull:
             raise JobError(f"{MOST_JOBS} jobs are waiting already; try again later.") from None
+        self._underway[job.number] = job
         self._say(job)
         return job
 
@@ -139,17 +146,17 @@ class Jobs:
             job = await self._waiting.get()
             while self.paused:
                 await asyncio.sleep(_LOOK_S)
-            if job.dropped:
-                continue
-            job.state = "running"
-            self._say(job)
-            try:
-                await self._perform(job)
-                job.state = "done"
-            except (JobError, OSError) as error:
-                job.state, job.error = "failed", str(error)
-            job.done.set()
-            self._say(job)
+            if not job.dropped:
+                job.state = "running"
+                self._say(job)
+                try:
+                    await self._perform(job)
+                    job.state = "done"
+                except (JobError, OSError) as error:
+                    job.state, job.error = "failed", str(error)
+                job.done.set()
+                self._say(job)
+            del self._underway[job.number]
 
     def _say(self, job: Job) -> None:
         """Tell how a job stands; who waits for an export is answered."""

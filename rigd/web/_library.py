@@ -17,7 +17,7 @@ from aiohttp import web
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session import LOOK_SUFFIX, last_look, read_look
 from rigd.web._access import REPORT_POLICY, Access, object_of, refused
-from rigd.web._jobs import Job, JobError, Jobs
+from rigd.web._jobs import JobError, Jobs
 
 Document = dict[str, Any]
 
@@ -48,8 +48,6 @@ class Library:
         self._folder = folder
         self._access = access
         self._jobs = jobs
-        self._campaigns: dict[Path, Job] = {}
-        """The last campaign for each folder, which is not there before it has been made."""
         self._exporting = asyncio.Lock()
         self._listing = asyncio.Lock()
         """Lists are made one at a time: they may be slow, and many may be asked for."""
@@ -196,10 +194,7 @@ class Library:
             return refused(403, "Making a report needs the token of the printed address.")
         path = self._session(request)
         address = f"/api/sessions/{path.stem}/report/"
-        try:
-            return _queued(self._jobs.put("report", [str(path)], path.stem, address))
-        except JobError as error:
-            return refused(409, str(error))
+        return self._queue("report", [str(path)], path.stem, address)
 
     async def _make_campaign(self, request: web.Request) -> web.Response:
         if not self._access.may_act(request):
@@ -215,18 +210,19 @@ class Library:
         paths = sorted({str(self._path(name)) for name in ids})  # as they were recorded
         folder = self._free("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
-        address = f"/api/campaign/{folder.name}/"
+        return self._queue("campaign", arguments, "", _served_at(folder))
+
+    def _queue(self, kind: str, arguments: list[str], name: str, address: str) -> web.Response:
         try:
-            job = self._campaigns[folder] = self._jobs.put("campaign", arguments, address=address)
+            job = self._jobs.put(kind, arguments, name, address)
         except JobError as error:
             return refused(409, str(error))
-        return _queued(job)
+        return web.json_response({"ok": True, "job": job.number}, status=202)
 
     def _free(self, name: str) -> Path:
         """Return a folder of that name that is not there yet, and that no campaign will make."""
-        underway = {path for path, job in self._campaigns.items() if not job.done.is_set()}
         number, path = 1, self._folder / name
-        while path in underway or path.exists():
+        while path.exists() or _served_at(path) in self._jobs.addresses:
             number += 1
             path = self._folder / f"{name}-{number}"
         return path
@@ -272,8 +268,9 @@ class Library:
         return None
 
 
-def _queued(job: Job) -> web.Response:
-    return web.json_response({"ok": True, "job": job.number}, status=202)
+def _served_at(folder: Path) -> str:
+    """Address of a campaign's report."""
+    return f"/api/campaign/{folder.name}/"
 
 
 def _download_headers(name: str) -> dict[str, str]:
