@@ -22,7 +22,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.runtime import begin_background, give_way, ignore
-from rigd.session import EstimateRequest, Session, SessionError, read_frames, read_start
+from rigd.session import (
+    EstimateRequest,
+    Session,
+    SessionError,
+    read_frames,
+    read_start,
+    segments_until,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -268,11 +275,7 @@ class OnlineFit:
             samples = samples[: np.searchsorted(samples["tick"], max(up_to_tick, 0))]
         end = int(samples["tick"][-1]) + 1 if len(samples) else 0
         # What is planned beyond was not cut short: it is still to come.
-        so_far = {
-            name: (first, min(last, end))
-            for name, (first, last) in self._segments.items()
-            if first < end
-        }
+        so_far = segments_until(self._segments, end)
         if not end or ("sweep" in self._segments and "sweep" not in so_far):
             raise RecordError("Nothing is excited yet.")
         return record_of(

@@ -30,7 +30,13 @@ from rigd.engine._topics import (
     attach_channels,
 )
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import SAMPLE_SIZE, SessionError, SessionExistsError, SessionWriter
+from rigd.session import (
+    SAMPLE_SIZE,
+    SessionError,
+    SessionExistsError,
+    SessionWriter,
+    segments_until,
+)
 
 _BLOCK = 250
 _IDLE_S = 0.005
@@ -189,7 +195,7 @@ class Recorder:
         outcome
             As of the loop.
         segments
-            Segments that were not known before the record.
+            Segments that were not known before the record; they may go on beyond it.
         """
         while self.transfer():
             pass
@@ -208,19 +214,12 @@ class Recorder:
                 "reason": "Samples were lost before the recorder.",
             }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        path = self._writer.close(counted, {**self._so_far(scheduled), **segments})
-        return Closed(path, counts, outcome["outcome"], outcome["reason"])
-
-    def _so_far(self, ticks: int) -> dict[str, tuple[int, int]]:
-        """Segments of a reference that grew: nothing was planned beyond the end of the record."""
         board = self._channels.board
-        if self.header is None or not (board[Word.PLANNED] or board[Word.LAST_PIECE]):
-            return {}
-        return {
-            name: (first, min(end, ticks))
-            for name, (first, end) in self.header.segments.items()
-            if first < ticks
-        }
+        if self.header is not None and (board[Word.PLANNED] or board[Word.LAST_PIECE]):
+            # Of a reference that grows, nothing was planned beyond the end of the record.
+            segments = segments_until({**self.header.segments, **segments}, scheduled)
+        path = self._writer.close(counted, segments)
+        return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""

@@ -61,6 +61,8 @@ class OnlineFit:
 
     Attributes
     ----------
+    segments
+        Those that were planned while the record ran, once the search has ended.
     shortcoming
         What is missing of the precision that was asked for, once the record is fitted; empty if
         nothing is.
@@ -85,7 +87,7 @@ class OnlineFit:
         self._ready = self._begun = False
         self._lost = ""
         self._pulse = Pulse()
-        self._segments: Mapping[str, tuple[int, int]] = {}
+        self.segments: Mapping[str, tuple[int, int]] = {}
         self.shortcoming = ""
         first = group.channels.samples.written
         job = FitJob(group.channels.specs, first, profile, reference, search, realtime)
@@ -167,20 +169,6 @@ class OnlineFit:
             }
         return document
 
-    def played(self, ticks: int) -> dict[str, tuple[int, int]]:
-        """Return the segments that were planned while the record ran, as far as it goes.
-
-        Parameters
-        ----------
-        ticks
-            Ticks that were scheduled.
-        """
-        return {
-            name: (first, min(end, ticks))
-            for name, (first, end) in self._segments.items()
-            if first < ticks
-        }
-
     @property
     def _reason(self) -> str:
         """Why a search for a precision ended, a sentence; empty if it was stopped."""
@@ -239,7 +227,7 @@ class OnlineFit:
                 self._pieces.append({"name": name, **document})
                 self._events.append(Event(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
-                self._ended, self._segments = message, segments
+                self._ended, self.segments = message, segments
                 self._board[Word.LAST_PIECE] = 1
                 self._events.append(Event(0, "info", reason, notable=True))
             case Failed(reason):

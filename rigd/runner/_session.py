@@ -519,10 +519,10 @@ class Session:
             outcome["touches"] = json.dumps(touches)
             self._report()
         fit: dict[str, Any] | None = None
-        segments: dict[str, tuple[int, int]] = {}
+        segments: Mapping[str, tuple[int, int]] = {}
         if self._fit is not None:
             fit = self._fit.finish(finished.counts["scheduled"], self._report)
-            segments = self._fit.played(finished.counts["scheduled"])
+            segments = self._fit.segments
             self._report()
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:

@@ -125,6 +125,21 @@ class Status(IntFlag):
     """The loop detected in this tick that the beam has met something."""
 
 
+def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[str, tuple[int, int]]:
+    """Cut segments off at a tick; those that begin there or later are left out.
+
+    Parameters
+    ----------
+    segments : mapping of str to (int, int)
+        Name → first tick and end (exclusive).
+    end : int
+        First tick that is left out.
+    """
+    return {
+        name: (first, min(last, end)) for name, (first, last) in segments.items() if first < end
+    }
+
+
 def field_tag(number: int, protobuf_type: str) -> int:
     """Return the tag byte of field `number` (1–15) of a fixed-layout message.
 

@@ -118,20 +118,21 @@ def test_a_short_sweep_is_told_with_what_would_fit(record_of):
         welch_analysis(record_of(), wrong, optional=True)
 
 
-@pytest.fixture(scope="module")
-def slow_signals(make_signals):
-    """A sweep of 20 s past two modes, as a data logger of 100 Hz has it."""
+@pytest.fixture
+def slow(write_session, make_signals, tmp_path):
+    """slow.mcap: a sweep of 20 s past two modes, as a data logger of 100 Hz has it."""
     signals = make_signals(rest_s=1.0, sweep_s=20.0, ring_down_s=2.0, noise_nm=1e-3)
     segments = {name: (a // 10, b // 10) for name, (a, b) in signals.segments.items()}
-    return replace(signals.part(slice(None, None, 10)), segments=segments)
-
-
-def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_here, tmp_path):
-    ticks = np.arange(len(slow_signals.angle_rad))
+    signals = replace(signals.part(slice(None, None, 10)), segments=segments)
+    ticks = np.arange(len(signals.angle_rad))
     write_session(
-        tmp_path / "slow.mcap", slow_signals, metadata={"rate_hz": "100.0", "duration_s": "20.0"},
+        tmp_path / "slow.mcap", signals, metadata={"rate_hz": "100.0", "duration_s": "20.0"},
         t_ns=ticks * 10_000_000,
     )  # fmt: skip
+
+
+@pytest.mark.usefixtures("slow")
+def test_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
     brief = ("--types", "I", "--weights", "const", "--figures", "png")
     result = analyze_here("slow.mcap", "--json", "slow.json", "--report", "r", *brief)
     assert result.returncode == 0, result.stderr
@@ -147,13 +148,8 @@ def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_her
 
 
 @pytest.mark.further  # as report/test_method_record.py, at another rate
-def test_a_band_of_a_record_of_100_hz_is_analysed(
-    write_session, slow_signals, analyze_here, tmp_path
-):
-    ticks = np.arange(len(slow_signals.angle_rad))
-    stated = {"rate_hz": "100.0", "duration_s": "20.0"}
-    path = tmp_path / "slow.mcap"
-    write_session(path, slow_signals, metadata=stated, t_ns=ticks * 10_000_000)
+@pytest.mark.usefixtures("slow")
+def test_a_band_of_a_record_of_100_hz_is_analysed(analyze_here, tmp_path):
     band = analyze_here("slow.mcap", "--method", "record", "--band", "1,20", "--json", "b.json")
     assert (band.returncode, band.stderr) == (0, "")
     assert json.loads((tmp_path / "b.json").read_text())["records"][0]["band_hz"] == [1.0, 20.0]

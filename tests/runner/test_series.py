@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from rigd.engine import Phase
 from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner._console import ProgressLine, plan_lines, result_line
@@ -202,6 +203,21 @@ def test_what_was_said_last_is_written(capsys):
         line.say(f"last {number}")
         line.close()
         assert capsys.readouterr().err == f"[first]\nlast {number}\n"
+
+
+def test_progress_alone_has_the_line_drawn_anew_some_times_a_second(monkeypatch):
+    """However often it is told: drawing costs more than a supervisor's other work."""
+    line, drawn, now_s = ProgressLine(), [], 0.0
+    with monkeypatch.context() as patched:
+        patched.setattr("rigd.runner._console.time.monotonic", lambda: now_s)
+        patched.setattr(line._changed, "set", lambda: drawn.append(now_s))
+        for tick in range(1000):
+            now_s = tick / 1000
+            line.update(Phase.RUNNING, tick, 1000, missed=0, late=0)
+        assert 15 <= len(drawn) <= 21
+        line.say("at once")
+        assert drawn[-1] == now_s
+    line.close()
 
 
 def test_metadata_that_the_profile_requires_is_asked_for(tmp_path):
