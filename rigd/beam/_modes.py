@@ -11,6 +11,7 @@ are the zeros of ``Q k_i⁴ + P`` on the principal sheet of the powers.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +60,11 @@ def clamped_free_eigenvalues(n: int) -> Real:
     >>> print(clamped_free_eigenvalues(3).round(6))
     [1.875104 4.694091 7.854757]
     """
+    return _eigenvalues(n).copy()
+
+
+@cache
+def _eigenvalues(n: int) -> Real:
     i = np.arange(1, n + 1)
     middle = (i - 0.5) * np.pi
     sign = np.where(i % 2 == 1, 1.0, -1.0)

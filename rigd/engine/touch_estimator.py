@@ -2,11 +2,12 @@
 
 It watches the ring of samples as the live publisher does, so that it can neither delay the loop nor
 take a sample from the recorder, and looks for the bit by which the loop marks a detection. It
-answers as soon as there are 50 ms of data after it, and again when there is more.
+begins with the samples that are there 25 ms after it, answers from 50 ms, and again from 200 ms.
 """
 
 import time
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,10 @@ from rigd.touch import (
     FINAL_S,
     FIRST_S,
     HISTORY_S,
+    LOOK_S,
+    GrowingEstimate,
     TouchEstimator,
+    TouchRecord,
     around_touch,
     touch_record,
 )
@@ -61,6 +65,19 @@ def main() -> None:
             return
 
 
+@dataclass(slots=True)
+class _Waiting:
+    """A touch whose last estimate is to come."""
+
+    number: int
+    tick: int
+    free_from: int
+    """Tick from which the beam was free before."""
+    estimate: GrowingEstimate
+    looked: bool = False
+    told: bool = False
+
+
 class TouchFollower:
     """Follows the samples of a record, and estimates each touch as soon as there is enough of it.
 
@@ -75,15 +92,13 @@ class TouchFollower:
     def __init__(self, estimator: TouchEstimator, job: TouchJob) -> None:
         self._estimator = estimator
         self._job = job
-        self._history = round(HISTORY_S * job.rate_hz)
-        self._first, self._final = (round(s * job.rate_hz) for s in (FIRST_S, FINAL_S))
+        self._history, self._look, self._first, self._final, self._contact = (
+            round(seconds * job.rate_hz)
+            for seconds in (HISTORY_S, LOOK_S, FIRST_S, FINAL_S, CONTACT_S)
+        )
         self._samples: NDArray[np.void] | None = None
-        self._waiting: deque[tuple[int, int, int]] = deque()
-        """Number and tick of the touches whose last estimate is to come, and the tick from which
-        the beam was free before."""
-        self._contact = round(CONTACT_S * job.rate_hz)
+        self._waiting: deque[_Waiting] = deque()
         self._free_from = 0
-        self._told_of = 0
         self._count = 0
         self._over = False
 
@@ -93,7 +108,8 @@ class TouchFollower:
         self._samples = samples if kept is None else np.concatenate([kept, samples])
         for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
-            self._waiting.append((self._count, tick, self._free_from))
+            estimate = self._estimator.follow()
+            self._waiting.append(_Waiting(self._count, tick, self._free_from, estimate))
             self._free_from = tick + self._contact
         self._over |= bool(samples["status"][-1] & Status.TORQUE_OFF)
         if not self._waiting:
@@ -103,25 +119,38 @@ class TouchFollower:
         """Return the estimates that can be made by now."""
         if self._samples is None or not self._waiting:
             return []
-        number, tick, free_from = self._waiting[0]
-        there = int(self._samples["tick"][-1]) - tick
+        touch = self._waiting[0]
+        there = int(self._samples["tick"][-1]) - touch.tick
         final = self._over or there >= self._final
+        # In real time somebody waits for the first one, even if the record is whole after a look.
+        first = self._job.realtime is not None or not final
+        if there >= self._first and first and not touch.told:
+            touch.told = True
+            return [self._told(touch, self._first, final=False)]
         if final:
             self._waiting.popleft()
-        elif self._told_of >= number or there < self._first:
-            return []
-        self._told_of = number
-        return [self._estimated(number, tick, free_from, final=final)]
+            return [self._told(touch, self._final, final=True)]
+        if there >= self._look and not touch.looked:
+            touch.looked = True
+            record, _ = self._record(touch, self._look)
+            touch.estimate.look(record)
+        return []
 
-    def _estimated(self, number: int, tick: int, free_from: int, *, final: bool) -> TouchTold:
+    def _told(self, touch: _Waiting, after: int, *, final: bool) -> TouchTold:
+        began_s = time.monotonic()
+        record, start_s = self._record(touch, after)
+        found = touch.estimate.told(record, scan=False, first=not final)
+        document = found.as_dict(start_s)
+        return TouchTold(touch.number, touch.tick, final, document, time.monotonic() - began_s)
+
+    def _record(self, touch: _Waiting, after: int) -> tuple[TouchRecord, float]:
+        """Return the record until so many ticks after the detection, and when it begins."""
         assert self._samples is not None
         job = self._job
-        part = around_touch(self._samples, tick, job.rate_hz, free_from)
-        record = touch_record(part, tick, job.rate_hz, job.shear_projection)
-        began_s = time.monotonic()
-        told = self._estimator.estimate(record, scan=False)
-        document = told.as_dict(int(part["tick"][0]) / job.rate_hz)
-        return TouchTold(number, tick, final, document, time.monotonic() - began_s)
+        part = around_touch(self._samples, touch.tick, job.rate_hz, touch.free_from)
+        part = part[part["tick"] <= touch.tick + after]
+        record = touch_record(part, touch.tick, job.rate_hz, job.shear_projection)
+        return record, int(part["tick"][0]) / job.rate_hz
 
 
 if __name__ == "__main__":

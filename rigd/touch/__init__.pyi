@@ -1,5 +1,6 @@
 from ._detector import DetectorSettings as DetectorSettings
 from ._detector import TouchDetector as TouchDetector
+from ._estimate import GrowingEstimate as GrowingEstimate
 from ._estimate import TouchEstimator as TouchEstimator
 from ._estimate import estimate_touch as estimate_touch
 from ._free_motion import FreeBeam as FreeBeam
@@ -15,6 +16,7 @@ from ._samples import CONTACT_S as CONTACT_S
 from ._samples import FINAL_S as FINAL_S
 from ._samples import FIRST_S as FIRST_S
 from ._samples import HISTORY_S as HISTORY_S
+from ._samples import LOOK_S as LOOK_S
 from ._samples import around_touch as around_touch
 from ._samples import base_shear_n as base_shear_n
 from ._samples import touch_record as touch_record

@@ -203,8 +203,19 @@ def shifted(table: Real, begin: Real, count: int) -> Real:
     """
     whole = np.floor(begin).astype(np.intp)
     u = (begin - whole)[:, None]
-    index = np.clip(whole[:, None] + np.arange(count + 3), 0, table.shape[1])
-    near = np.take_along_axis(np.pad(table, ((0, 0), (1, 0))), index, axis=1)
+    rows, columns = table.shape
+    whole = np.clip(whole, -count - 2, columns + 1)  # farther off it is the same
+    before = max(0, 1 - int(whole.min()))
+    behind = max(0, int(whole.max()) + count + 2 - columns)
+    held = np.empty((rows, before + columns + behind))
+    held[:, :before], held[:, before : before + columns] = 0.0, table
+    held[:, before + columns :] = table[:, -1:]
+    # Row k of what is taken: held[k, begin : begin + count + 3], copied in one piece.
+    step, row = held.strides[1], held.strides[0]
+    pieces = np.ndarray(
+        (rows, held.shape[1] - count - 2, count + 3), buffer=held, strides=(row, step, step)
+    )
+    near = pieces[np.arange(rows), whole - 1 + before]
     value = near[:, :count] * (-u * (u - 1) * (u - 2) / 6)
     value += near[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
     value += near[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)

@@ -1,95 +1,21 @@
-"""Where, when and how hard the antenna has touched something.
+"""Where, when and how hard the antenna has touched something: from a record to the answer.
 
-Innovations of torque and base shear are explained by a springy obstacle at rest, marched through
-its bounces; beside it stand two obstacles, those that move or give way, a knock, and any force at
-all. The answer tells what the data tell: values with standard deviations and intervals that take in
-the noise, the model's uncertainty and every place that is about as likely.
+The touch began some time before it was noticed. The shortest time that may hold it is tried first:
+the samples before it tell how the free beam moves.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
-from numpy.typing import NDArray
 
-from rigd.touch._blind import BlindScan
+from rigd.touch._explanations import Explainer
 from rigd.touch._free_motion import TouchRecord
-from rigd.touch._kernels import ContactKernels
-from rigd.touch._knock import Knocking
 from rigd.touch._model import TouchModel
-from rigd.touch._pair import Pairing
-from rigd.touch._physical import (
-    SOFTEST,
-    STIFFEST,
-    Descended,
-    Prediction,
-    Space,
-    Touching,
-    Window,
-    chi2_of,
-    descend,
-)
-from rigd.touch._posterior import Posterior, sampled
-from rigd.touch._results import Estimated, TouchEstimate
-from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
-from rigd.touch._tables import GRID_S, NOTICED_S, Tables
-from rigd.touch._uncertain import deviations
+from rigd.touch._results import TouchEstimate
+from rigd.touch._tables import NOTICED_S, Tables
 
-Real = NDArray[np.float64]
-
-_TWO_SIDED_95 = 1.959964
-_STAGES_S = (FIRST_S, 0.1, FINAL_S)
-"""After the detection: what is explained, the longest only if the point is not well known yet."""
-_COVERED_S = 0.1
-"""After the detection: so far the effects of what is uncertain are taken along at once."""
-_WORTH = 1.2
-"""So many times the samples are worth another stage."""
-_WELL_KNOWN_M = 2e-3
-_NEAR_TIP = 0.8
-"""Share of the length beyond which contacts are shorter, and steps finer."""
-_BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
-_AT_TIP = 0.95
-"""Beyond this share a longer record tells no more: its many short contacts fit anywhere."""
-
-_LEAST_SCALE = 1.2
-"""Variance of the residuals at least assumed: the noise itself is known from few samples."""
-_LEAST_STD_M = (3e-4, 5e-4)
-"""What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
-tip: in 130 simulated touches the errors agree with the intervals if this is added."""
-_DOUBT_OF_TWO = 4.0
-"""The sum of squared residuals of two obstacles that clearly explain more than one counts so many
-times less: which of their several minima is the lowest, the errors of the model decide."""
-_LEAST_OF_TWO_M = 2e-3
-"""What bounces leave unknown of the first of two, which are marched in longer steps."""
-_EARLY_S = (0.006, 0.01, 0.022)
-"""After the detection: what a touch that nothing explains is compared with as well. Later a second
-point may be touched."""
-_WIDE = 8.0
-"""Fall of the log-likelihood at the ends of an interval for a touch that nothing explains."""
 _LEAST_QUIET = 100
 """Samples before a touch without which nothing can be told."""
-_CLEAR = 16.0
-"""Difference in the sum of squared residuals that decides between two kinds."""
-_DOUBTFUL = 9.0
-"""By so much less, that of an obstacle that moves or gives way leaves open whether it is at rest:
-one that is at rest gains that much by chance in one of a hundred touches."""
-_POSSIBLE = 5.0
-"""By so much less, that of two obstacles leaves open where the point is."""
-_HOPEFUL = 0.8
-"""By so much less, after a few iterations, two obstacles are worth more of them."""
-_WORSE = 3.5
-"""By so many standard deviations may the sum of squared residuals exceed its expectation."""
-_POOR = 2.0
-"""Beyond so many the explanation may be the wrong one: other kinds are tried, and the point gets
-the interval that any force leaves it."""
-_WORSE_LATER = 2.5
-"""The same for what a longer record adds. Bounces make much of small errors of the model: where the
-later ones are explained less well, what the first told is nearer to the truth."""
-
-_RATES_M_PER_S = np.array([-1.5, -0.7, -0.3, -0.1, 0.1, 0.25, 0.5])
-_MOBILITIES = np.array([0.01, 0.04, 0.15, 0.6])
-_STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
-"""Starts of obstacles that move (m/s) or give way (m/s per N), and their stiffnesses."""
+_HOPELESS = 3.0
+"""Beyond so much per sample that an obstacle at rest leaves, the touch may have begun earlier."""
 
 
 def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
@@ -116,10 +42,10 @@ class TouchEstimator:
         Samples a second.
     """
 
-    __slots__ = ("_rate_hz", "_tables", "model")
+    __slots__ = ("_tables", "model")
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
-        self.model, self._rate_hz = model, rate_hz
+        self.model = model
         self._tables = Tables(model, rate_hz)
 
     def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
@@ -133,23 +59,103 @@ class TouchEstimator:
         scan
             Whether the likelihood of all places is wanted; without it, it is empty.
         """
+        return self.follow().told(record, scan=scan)
+
+    def follow(self) -> "GrowingEstimate":
+        """Return what estimates one touch while its record grows."""
+        return GrowingEstimate(self._tables)
+
+
+class GrowingEstimate:
+    """Estimates of one touch, each of which goes on from the one before.
+
+    All records that it is given begin with the same sample.
+
+    Parameters
+    ----------
+    tables
+        What depends on the model and the rate.
+    """
+
+    __slots__ = ("_earlier", "_explained_by", "_tables")
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._earlier: dict[float, Explainer] = {}
+        self._explained_by: float | None = None
+
+    def look(self, record: TouchRecord) -> None:
+        """Look where the touch may be: that much of the first estimate is done then.
+
+        Parameters
+        ----------
+        record
+            Samples until `LOOK_S` after the detection, or some more.
+        """
+        for noticed_s in NOTICED_S[:-1]:  # the last one takes long, and is hardly ever needed
+            if not self._reaches(record, noticed_s):
+                return
+            if not self._explainer(record, noticed_s).begins_too_late:
+                return
+
+    def told(self, record: TouchRecord, *, scan: bool = True, first: bool = False) -> TouchEstimate:
+        """Estimate the touch from what of the record is there.
+
+        Parameters
+        ----------
+        record
+            Samples from 0.3 s or more before the touch.
+        scan
+            Whether the likelihood of all places is wanted; without it, it is empty.
+        first
+            Whether a first answer is wanted: what no obstacle at rest explains is of unknown kind
+            in it, since to try others takes a second.
+        """
         told = None
         searched = record.angle_rad.size
-        for noticed in NOTICED_S:
-            if record.detected - round(noticed * self._rate_hz) < _LEAST_QUIET:
-                break
-            here = _Estimation(self._tables, record, noticed)
-            last = noticed == NOTICED_S[-1]
-            # After one in which nothing explains the touch, only if it may have been before that.
-            if (here.begins_too_late and not last) or here.seems_to_begin >= searched:
+        # What has explained the beginning comes first.
+        for noticed_s in sorted(NOTICED_S, key=lambda each: each != self._explained_by):
+            if not self._reaches(record, noticed_s):
                 continue
-            found = here.told(scan=scan)
+            here = self._explainer(record, noticed_s)
+            if noticed_s != self._explained_by and (
+                # After one in which nothing explains the touch, only if it may have been before.
+                here.seems_to_begin >= searched or self._began_earlier(record, noticed_s)
+            ):
+                continue
+            found = here.told(scan=scan, first=first)
             if told is None or found.explained:
                 told = found
             if found.explained:
+                self._explained_by = noticed_s
+            if found.explained or first:
                 break
-            searched = here.begin + here.quiet
+            searched = here.first
         return told or self._untold(record)
+
+    def _reaches(self, record: TouchRecord, noticed_s: float) -> bool:
+        """Whether there are enough samples of the free beam."""
+        return record.detected - round(noticed_s * self._tables.rate_hz) >= _LEAST_QUIET
+
+    def _explainer(self, record: TouchRecord, noticed_s: float) -> Explainer:
+        """Return the one for a record, which goes on from that for the record before."""
+        earlier = self._earlier.get(noticed_s)
+        if earlier is None or earlier.given is not record:
+            self._earlier[noticed_s] = Explainer(self._tables, record, noticed_s, earlier)
+        return self._earlier[noticed_s]
+
+    def _began_earlier(self, record: TouchRecord, noticed_s: float) -> bool:
+        """Whether the touch seems to be before the samples that may hold it."""
+        if noticed_s == NOTICED_S[-1]:
+            return False
+        here = self._explainer(record, noticed_s)
+        if here.begins_too_late:
+            return True
+        longer_s = NOTICED_S[NOTICED_S.index(noticed_s) + 1]
+        if here.misfit < _HOPELESS or not self._reaches(record, longer_s):
+            return False
+        longer = self._explainer(record, longer_s)
+        return longer.seems_to_begin < here.first and longer.misfit < 0.5 * here.misfit
 
     def _untold(self, record: TouchRecord) -> TouchEstimate:
         """Too few samples before the touch."""
@@ -161,7 +167,7 @@ class TouchEstimator:
             force_n=None,
             stiffness_n_per_m=None,
             kind="unknown",
-            model=self.model.source,
+            model=self._tables.model.source,
             channels=channels,
             samples=record.angle_rad.size - record.detected,
             chi2_per_degree=np.nan,
@@ -172,471 +178,3 @@ class TouchEstimator:
             force_history_n=nothing,
             force_times_s=nothing,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Explanation:
-    """The best that obstacles of one kind make of the record."""
-
-    kind: str
-    posterior: Posterior
-    parameters: Real
-    chi2: float
-
-
-class _Estimation:
-    """One record's."""
-
-    def __init__(self, tables: Tables, record: TouchRecord, noticed_s: float) -> None:
-        rate = tables.rate_hz
-        self.tables, self.rate = tables, rate
-        self.begin = max(0, record.detected - round(HISTORY_S * rate))
-        end = min(record.angle_rad.size, record.detected + round(FINAL_S * rate))
-        self.record = TouchRecord(
-            rate,
-            record.angle_rad[self.begin : end],
-            record.torque_nm[self.begin : end],
-            None if record.shear_n is None else record.shear_n[self.begin : end],
-            record.detected - self.begin,
-        )
-        self.detected = self.record.detected
-        self.quiet = self.detected - round(noticed_s * rate)
-        self.motion = tables.free.motion(self.record, self.quiet, self.quiet - 4)
-        self.available = self.record.angle_rad.size - self.detected
-        self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
-        self.deviations: Real | None = None
-        self.starts = self._first_starts()
-
-    @property
-    def begins_too_late(self) -> bool:
-        """Whether the touch seems to be before the samples that may hold it."""
-        return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
-
-    @property
-    def seems_to_begin(self) -> int:
-        """Sample of the record before which the likeliest touch of the first look begins."""
-        after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
-        return self.begin + self.quiet + round(after_s * self.rate)
-
-    def told(self, *, scan: bool) -> TouchEstimate:
-        """Return what the touch was."""
-        starts, covered_s = self.starts, 0.0
-        before: tuple[_Explanation, Window] | None = None
-        later_doubtful = False
-        two: _Explanation | None = None
-        available_s = self.available / self.rate
-        stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
-        for seconds in (*stages, available_s):
-            if covered_s == 0.0:
-                predict = self.predicting(starts, coarser=True)
-                found = descend(predict, self.window(seconds), starts, self.space(3), rounds=7)
-                starts = self._beside(_distinct(found))
-            if covered_s < seconds:
-                covered_s = min(max(seconds, _COVERED_S), available_s)
-                whole = Window.of(self.motion, self.quiet, self.end(covered_s))
-                self.deviations = deviations(self.tables, self.record, starts[:1], whole)
-            window = self.window(seconds)
-            rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
-            if before is not None and self._later_is_worse(rest, window, *before):
-                two = self._two(rest, window)
-                if two is not None and self._fits(two, window, _POOR):
-                    break
-                two = None
-                # Of still later bounces the search may miss the minimum: they speak of no kind.
-                later_doubtful = seconds <= _COVERED_S and self._changes(rest, window)
-                rest, window = before
-                break
-            before = rest, window
-            place = rest.posterior.mean(0)
-            known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
-            if seconds > FIRST_S and known:
-                break
-            starts = np.vstack([rest.parameters, self._cloud(rest.posterior)])
-        explanations = [rest]
-        if two is None:
-            if not self._fits(rest, window, _POOR) or self._changes(rest, window):
-                explanations += self._others(window)
-            if self._fits(rest, window):
-                two = self._two(rest, window)
-        if two is not None:
-            explanations.append(two)
-        return self._answer(explanations, window, scan=scan, later_doubtful=later_doubtful)
-
-    @cached_property
-    def blind(self) -> BlindScan:
-        """Any force in the first samples: it takes as long as the rest of an estimate from them."""
-        return self.tables.blind.scan(self.window(FIRST_S))
-
-    # What candidates are compared with
-
-    def window(self, seconds: float) -> Window:
-        """Return the samples from before the touch to so long after the detection."""
-        return Window.of(self.motion, self.quiet, self.end(seconds), self.deviations)
-
-    def end(self, seconds: float) -> int:
-        """Return the sample so long after the detection, or the end of the record."""
-        return self.detected + min(self.available, round(seconds * self.rate))
-
-    def space(self, width: int) -> Space:
-        """Ranges of `PARAMETERS`."""
-        t = self.motion.t
-        return Space(
-            low=np.array([self.edges[0], t[self.quiet + 1], SOFTEST, -3.0, 0.0])[:width],
-            high=np.array([self.edges[1], t[self.detected], STIFFEST, 3.0, 50.0])[:width],
-            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
-            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
-            smallest=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
-            loose=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
-        )
-
-    def predicting(self, rows: Real, *, coarser: bool = False) -> Prediction:
-        """March with steps as fine as the contacts near the tip ask for, or longer elsewhere."""
-        tables = self.tables
-        tip = np.median(rows[:, 0]) > _NEAR_TIP * tables.model.beam.length_m
-        kernels = tables.finest if tip else tables.coarse if coarser else tables.middle
-        touching = Touching(kernels, tables.x_m, self.motion)
-        return lambda candidates, window: touching.predicted(candidates, window)[0]
-
-    # Springy obstacle at rest
-
-    def _first_starts(self) -> Real:
-        """Return the likeliest candidates of the grid, after a second look."""
-        tables = self.tables
-        window = self.window(GRID_S)
-        grid = tables.starts(window.end - window.first)
-        starts, chi2 = grid.marched(self.motion, window, self.detected)
-        starts = starts[np.lexsort((chi2, starts[:, 0]))]
-        count = starts.shape[0] // np.unique(starts[:, 0]).size
-        best = starts.reshape(-1, count, 3)[:, :4].reshape(-1, 3)
-        coarse = Touching(tables.coarse, tables.x_m, self.motion)
-        again = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0], self.window(FIRST_S), best
-        )
-        return best[np.argsort(again)[:12]]
-
-    def _beside(self, starts: Real) -> Real:
-        """Add starts beside the best ones near the tip, where the minima stand close together."""
-        if np.median(starts[:, 0]) <= _NEAR_TIP * self.tables.model.beam.length_m:
-            return starts
-        beside = np.repeat(starts[None, :2], _BESIDE_M.size, axis=0)
-        beside[:, :, 0] = np.clip(beside[:, :, 0] + _BESIDE_M[:, None], *self.edges)
-        return np.vstack([starts, beside.reshape(-1, starts.shape[1])])
-
-    def _cloud(self, posterior: Posterior) -> Real:
-        """Candidates of a longer window, from what a shorter one leaves likely."""
-        rng = np.random.default_rng(1)
-        chosen = posterior.samples[rng.choice(posterior.weights.size, 240, p=posterior.weights)]
-        width = chosen.shape[1]
-        space = self.space(width)
-        spread = np.array([max(posterior.std(i), space.smallest[i]) for i in range(width)])
-        return np.clip(
-            chosen + 0.5 * spread * rng.standard_normal(chosen.shape), space.low, space.high
-        )
-
-    def explained(
-        self, kind: str, predict: Prediction, window: Window, starts: Real, space: Space
-    ) -> _Explanation:
-        """Descend from starts, and sample around the minima."""
-        if starts.shape[0] > 12:
-            starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
-        found = descend(predict, window, starts, space, rounds=9)
-        return self._sampled(kind, predict, window, found, space)
-
-    def _sampled(
-        self,
-        kind: str,
-        predict: Prediction,
-        window: Window,
-        found: Descended,
-        space: Space,
-        doubt: float = 1.0,
-    ) -> _Explanation:
-        """Sample around minima; `doubt` is what differences of chi² are divided by."""
-        width = found.parameters.shape[1]
-        near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
-        covariances = np.array(
-            [
-                np.linalg.inv(found.jacobian[k].T @ found.jacobian[k] + np.diag(1 / space.loose**2))
-                + np.diag(space.smallest**2)
-                for k in near
-            ]
-        )
-        degrees = max(window.data.size - width, 1)
-        posterior = sampled(
-            lambda rows: chi2_of(predict, window, rows),
-            found.parameters[near],
-            covariances,
-            (space.low, space.high),
-            scale=doubt * max(_LEAST_SCALE, found.chi2.min() / degrees),
-            count=120,
-            rounds=5,
-            enough=150.0,
-            smallest=space.smallest,
-        )
-        best = int(np.argmin(posterior.chi2))
-        return _Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
-
-    # Other kinds
-
-    def _fits(self, explanation: _Explanation, window: Window, worse: float = _WORSE) -> bool:
-        """Whether no more is left than noise leaves, which is itself known from few samples."""
-        return bool(explanation.chi2 < self._most(window.data.size, worse))
-
-    def _most(self, degrees: int, worse: float = _WORSE) -> float:
-        """Greatest sum of squared residuals that noise explains."""
-        of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
-        return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
-
-    def _later_is_worse(
-        self, longer: _Explanation, over: Window, shorter: _Explanation, until: Window
-    ) -> bool:
-        """Whether the shorter of two windows is explained, and not what the longer one adds."""
-        added = over.data.size - until.data.size
-        more = longer.chi2 - shorter.chi2
-        return self._fits(shorter, until) and more > self._most(added, _WORSE_LATER)
-
-    def _changes(self, rest: _Explanation, window: Window) -> bool:
-        """Whether the obstacle at rest becomes likelier if it may move or give way."""
-        extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
-        starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
-        free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
-        touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-        side = touching.side(rest.parameters)
-        found = descend(
-            lambda candidates, window: touching.predicted(candidates, window, side)[0],
-            window,
-            starts,
-            self.space(5),
-            rounds=5,
-            free=free,
-        )
-        return bool(found.chi2.min() < rest.chi2 - _DOUBTFUL)
-
-    def _others(self, window: Window) -> list[_Explanation]:
-        """Obstacles that move or give way, and a knock."""
-        blind, side = self.blind, self._side()
-        likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
-        instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
-        found = []
-        for kind, extra in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
-            grid = np.meshgrid(likely, instants, np.log(_STIFFNESSES), extra, indexing="ij")
-            starts = np.stack([each.ravel() for each in grid], axis=1)
-            coarse = self._marching(kind, self.tables.coarse, side)
-            for span, count in ((GRID_S, 80), (FIRST_S, 10)):
-                chi2 = chi2_of(coarse, self.window(span), starts)
-                starts = starts[np.argsort(chi2)[:count]]
-            march = self._marching(kind, self.tables.middle, side)
-            found.append(self.explained(kind, march, window, starts, self._moving_space(kind)))
-        touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-        knocking = Knocking(touching, self.tables.middle, 2)
-        starts = knocking.starts(self.window(FIRST_S), self.detected, 10)
-        rest = self.space(3)
-        space = knocking.space(self.edges, (rest.low[1], rest.high[1]))
-        found.append(self.explained("knock", knocking.predicted, window, starts, space))
-        return found
-
-    def _pairing(self) -> Pairing:
-        tables = self.tables
-        touching = Touching(tables.coarse, tables.x_m, self.motion)
-        return Pairing(touching, tables.coarse, tables.crossing)
-
-    def _two(self, rest: _Explanation, window: Window) -> _Explanation | None:
-        """Two obstacles, if they may explain more than one at rest does."""
-        pairing = self._pairing()
-        space = pairing.space(self.space(3))
-        # The first samples tell in less time whether more iterations are worth while.
-        early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
-        starts = pairing.starts(rest.parameters, early, space, 2)
-        found = descend(pairing.channels, early, starts, space, rounds=4)
-        one = rest.parameters[None]
-        if found.chi2.min() > chi2_of(self.predicting(one), early, one)[0] - _HOPEFUL:
-            return None
-        likely = found.parameters[np.argsort(found.chi2)[:3]]
-        starts = np.vstack([likely, pairing.exchanged(likely[:1])])
-        found = descend(pairing.channels, window, starts, space, rounds=8)
-        gain = rest.chi2 - found.chi2.min()
-        if gain < _POSSIBLE:
-            return None
-        doubt = _DOUBT_OF_TWO if gain > _CLEAR else 1.0
-        return self._sampled("two", pairing.channels, window, found, space, doubt)
-
-    def _side(self) -> float:
-        """Direction in which the beam presses: against the force, whatever that comes from."""
-        return -1.0 if self.blind.force_n.sum() > 0 else 1.0
-
-    def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
-        """March obstacles whose fourth parameter is their rate or their mobility."""
-        touching = Touching(kernels, self.tables.x_m, self.motion)
-
-        def predicted(candidates: Real, window: Window) -> Real:
-            if kind == "yielding":
-                candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return touching.predicted(candidates, window, side)[0]
-
-        return predicted
-
-    def _moving_space(self, kind: str) -> Space:
-        ranges = self.space(5)
-        columns = [0, 1, 2, 3 if kind == "moving" else 4]
-        return Space(
-            ranges.low[columns],
-            ranges.high[columns],
-            ranges.difference[columns],
-            ranges.scale[columns],
-            ranges.smallest[columns],
-            ranges.loose[columns],
-        )
-
-    # The answer
-
-    def _answer(
-        self,
-        explanations: list[_Explanation],
-        window: Window,
-        *,
-        scan: bool,
-        later_doubtful: bool,
-    ) -> TouchEstimate:
-        """Say what the likeliest explanation tells, and of what kind the touch is.
-
-        `later_doubtful`: later samples, which are left out, speak against an obstacle at rest.
-        """
-        rest = explanations[0]
-        best = min(explanations, key=lambda each: each.chi2)
-        if rest.chi2 < best.chi2 + _CLEAR:
-            best = rest
-        rivals = [best, *(each for each in explanations if _rivals(best, each))]
-        clear = len(rivals) == 1 and best.kind != "two"
-        if best is rest:
-            rivals += [each for each in explanations if each.kind == "two"]
-        offset = self.begin / self.rate
-        x_m = time_s = force_n = stiffness = None
-        history, instants = np.zeros(0), np.zeros(0)
-        kind = "unknown"
-        if self._fits(best, window):
-            poor = not self._fits(best, window, _POOR)
-            doubtful = later_doubtful if best is rest else poor
-            if clear and not doubtful:
-                kind = best.kind
-            x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
-            if poor:
-                x_m = self._widened(x_m)
-            history, instants, force_n = self._forces(best, window)
-            if kind == "rigid":
-                stiffness = _stiffness(rest.posterior)
-        elif self.blind.chi2 < self._most(self.blind.degrees) and not self.begins_too_late:
-            x_m = self._roughly()
-        return TouchEstimate(
-            x_m=x_m,
-            time_s=time_s,
-            force_n=force_n,
-            stiffness_n_per_m=stiffness,
-            kind=kind,
-            model=self.tables.model.source,
-            channels=self.motion.noise.size,
-            samples=window.end - self.detected,
-            chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-            places_m=self.blind.x_m if scan else np.zeros(0),
-            log_likelihood=self.blind.log_likelihood if scan else np.zeros(0),
-            innovations=self.motion.innovations / self.motion.noise[:, None],
-            innovation_times_s=self.motion.t + offset,
-            force_history_n=history,
-            force_times_s=instants + offset,
-        )
-
-    def _roughly(self) -> Estimated:
-        """Point of a touch that nothing explains: where any force could do it, early and later.
-
-        More than one point may be touched by then, so what the first samples tell alone counts
-        too, and all with wide intervals.
-        """
-        early = [self.tables.blind.scan(self.window(seconds)) for seconds in _EARLY_S]
-        ends = np.array([scan.interval(_WIDE)[2:] for scan in (self.blind, *early)])
-        low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
-        return Estimated(self.blind.interval(_WIDE)[0], (high - low) / 4, (low, high))
-
-    def _widened(self, told: Estimated) -> Estimated:
-        """Widen the interval of a point to all where any force could be."""
-        *_, low, high = self.blind.interval()
-        low, high = min(low, told.interval_95[0]), max(high, told.interval_95[1])
-        return Estimated(told.value, max(told.std, (high - low) / 4), (low, high))
-
-    def _place(self, rivals: list[_Explanation]) -> Estimated:
-        """Point of touch, with what bounces leave unknown of it."""
-        told = _known(rivals, 0)
-        tip = told.value > _NEAR_TIP * self.tables.model.beam.length_m
-        least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
-        low, high = (
-            told.value + np.copysign(np.hypot(end - told.value, _TWO_SIDED_95 * least), sign)
-            for end, sign in zip(told.interval_95, (-1.0, 1.0), strict=True)
-        )
-        length = self.tables.model.beam.length_m
-        return Estimated(
-            told.value,
-            float(np.hypot(told.std, least)),
-            (max(float(low), 0.0), min(float(high), length)),
-        )
-
-    def _forces(self, best: _Explanation, window: Window) -> tuple[Real, Real, Estimated]:
-        """Force in time and its peak, over what is likely."""
-        rng = np.random.default_rng(2)
-        posterior = best.posterior
-        some = rng.choice(posterior.weights.size, 48, p=posterior.weights)
-        rows = np.vstack([best.parameters, posterior.samples[some]])
-        step_s = self.tables.middle.step_s
-        if best.kind == "knock":
-            peaks = np.abs(rows[:, 3])
-            phase = np.arange(0.0, np.exp(rows[0, 2]) + step_s, step_s) / np.exp(rows[0, 2])
-            force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
-        elif best.kind == "two":
-            step_s = self.tables.coarse.step_s
-            force = np.abs(self._pairing().predicted(rows, window)[1])
-            peaks = force.max(axis=1)
-        else:
-            touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-            side = None if best.kind == "rigid" else self._side()
-            if best.kind == "yielding":
-                rows = np.insert(rows, 3, 0.0, axis=1)
-            force = np.abs(touching.predicted(rows, window, side)[1])
-            peaks = force.max(axis=1)
-        low, high = np.quantile(peaks[1:], (0.025, 0.975))
-        told = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
-        return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), told
-
-
-def _distinct(found: Descended) -> Real:
-    """Minima that are not worth the same as a better one beside them, the best first."""
-    order = np.argsort(found.chi2)
-    kept: list[Real] = []
-    for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:
-        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
-            kept.append(row)
-    return np.array(kept)
-
-
-def _rivals(best: _Explanation, other: _Explanation) -> bool:
-    """Whether another explanation is about as likely: a parameter more must be worth its while."""
-    if best.kind == "rigid" and other.kind in ("moving", "yielding"):
-        return other.chi2 < best.chi2 - _DOUBTFUL
-    if best.kind == "rigid" and other.kind == "two":
-        return False
-    return other is not best and other.chi2 < best.chi2 + _CLEAR
-
-
-def _known(rivals: list[_Explanation], column: int, shift: float = 0.0) -> Estimated:
-    """Tell a parameter that all likely explanations share, with room for each."""
-    ends = np.array([each.posterior.quantiles(column, (0.025, 0.975)) for each in rivals])
-    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
-    mean, std = rivals[0].posterior.mean(column), rivals[0].posterior.std(column)
-    if len(rivals) > 1:
-        std = max(std, (mean - low) / _TWO_SIDED_95, (high - mean) / _TWO_SIDED_95)
-    return Estimated(mean + shift, std, (low + shift, high + shift))
-
-
-def _stiffness(posterior: Posterior) -> Estimated | None:
-    """Stiffness if the data bound it on both sides; the mean is that of its logarithm."""
-    low, middle, high = posterior.quantiles(2, (0.025, 0.5, 0.975))
-    if high > STIFFEST - 0.7 or low < SOFTEST + 0.3 or high - low > np.log(100):
-        return None
-    value = float(np.exp(middle))
-    return Estimated(value, value * posterior.std(2), (float(np.exp(low)), float(np.exp(high))))

@@ -18,7 +18,7 @@ from rigd.beam import (
     poles,
     root_shear_ratio,
 )
-from rigd.touch._kernels import Line
+from rigd.touch._kernels import Line, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
@@ -33,6 +33,8 @@ _SETTLE_S = 0.03
 """Beyond the record's end the angle comes to rest in this time: no jump to ring before it."""
 _SPEED_S = 0.02
 """Over this time the speed at the record's beginning is measured."""
+_NODES = 36
+"""Places from which the displacement at all others is interpolated."""
 BEFORE = 24
 """Samples over which what a spline makes of one sample fades."""
 
@@ -82,6 +84,7 @@ class FreeBeam:
     """
 
     __slots__ = (
+        "_between",
         "_displacement",
         "_grid",
         "_sample",
@@ -107,8 +110,8 @@ class FreeBeam:
         inertia = model.tool_inertia_kg_m2 * s * s
         self._torque: Complex = late * (grid.torque_per_angle() + inertia)
         self._shear: Complex = late * grid.shear_per_angle()
-        self._displacement: Complex = grid.per_angle(x_m).T
-        self.modes = Ringing.of(model, x_m)
+        self.modes = Ringing.of(model, np.empty(0))
+        self._place(x_m)
         unit = np.zeros(3 * BEFORE)
         unit[BEFORE] = 1.0
         self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
@@ -122,10 +125,17 @@ class FreeBeam:
             Places where the displacement is wanted, shape (m,).
         """
         other = copy(self)
-        other.x_m = x_m
-        other._displacement = self._grid.per_angle(x_m).T
-        other.modes = self.modes.at(x_m / self.model.beam.length_m)
+        other._place(x_m)
         return other
+
+    def _place(self, x_m: Real) -> None:
+        """Take places; many are interpolated from few, to rounding for waves of up to 1 kHz."""
+        self.x_m = x_m
+        nodes_m, self._between = x_m, np.eye(x_m.size)
+        if x_m.size > _NODES:
+            nodes_m, self._between = chebyshev_nodes(x_m, _NODES)
+        self._displacement: Complex = self._grid.per_angle(nodes_m).T
+        self.modes = self.modes.at(x_m / self.model.beam.length_m)
 
     def per_sample(self, place: int, samples: int) -> Real:
         """Displacement that one sample of the angle makes, in m/rad.
@@ -142,10 +152,12 @@ class FreeBeam:
         ndarray, shape (FINER · (BEFORE + samples),)
             On the fine steps, from `BEFORE` samples before it on: the spline looks ahead.
         """
-        response = self._displacement[place] * self._sample
+        response = (self._between[place] @ self._displacement) * self._sample
         return self.line.in_time(response, FINER * (BEFORE + samples))
 
-    def motion(self, record: TouchRecord, quiet: int, first: int) -> "FreeMotion":
+    def motion(
+        self, record: TouchRecord, quiet: int, first: int, turned: "Turned | None" = None
+    ) -> "FreeMotion":
         """Free motion of one record.
 
         Parameters
@@ -156,11 +168,13 @@ class FreeBeam:
             Number of samples that are certainly before the touch.
         first
             Sample from which the displacement is wanted.
+        turned
+            The record's angle as another beam has transformed it; None: it is transformed.
         """
         n = record.angle_rad.size
         rate = self.rate_hz
-        angle, start, speed = _finer(record.angle_rad, rate, self.line)
-        spectrum = self.line.transformed(angle)
+        turned = turned or Turned.of(record.angle_rad, rate, self.line)
+        spectrum, start, speed = turned.spectrum, turned.start_rad, turned.speed_rad_s
         channels = [(record.torque_nm, self._torque)]
         if record.shear_n is not None:
             channels.append((record.shear_n, self._shear))
@@ -177,7 +191,8 @@ class FreeBeam:
             designs.append(np.hstack([columns[i], drift]))
         fitted = _Fitted.to(innovations, designs, quiet)
         steps = FINER * n
-        moved = self.line.in_time(self._displacement * spectrum, steps)[:, FINER * first :]
+        at_nodes = self.line.in_time(self._displacement * spectrum, steps)
+        moved = self._between @ at_nodes[:, FINER * first :]
         fine = np.arange(FINER * first, steps) / (FINER * rate)
         moved += self.x_m[:, None] * (start + speed * fine)
         amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
@@ -188,6 +203,7 @@ class FreeBeam:
             noise=np.array(fitted.noise),
             design=np.array(designs),
             spread=np.linalg.cholesky(fitted.covariance).astype(np.float64),
+            turned=turned,
             ringing=self.modes,
             angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
             displacement_m=moved,
@@ -210,6 +226,8 @@ class FreeMotion:
     """Columns of what was fitted before the touch, shape (c, n, q)."""
     spread: Real
     """Cholesky factor of the covariance of its q amplitudes."""
+    turned: "Turned"
+    """The angle that drives it."""
     ringing: "Ringing"
     """The free vibrations among them."""
     angle_noise_rad: float
@@ -225,6 +243,22 @@ class FreeMotion:
 def _angle_noise(angle: Real) -> float:
     """Scatter of the samples, encoder steps included: fourth differences show no motion."""
     return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
+
+
+@dataclass(frozen=True, slots=True)
+class Turned:
+    """Angle of a record, transformed: the straight motion it begins with, and the rest."""
+
+    spectrum: Complex
+    """Rest, at the frequencies of a line."""
+    start_rad: float
+    speed_rad_s: float
+
+    @classmethod
+    def of(cls, angle_rad: Real, rate_hz: float, line: Line) -> "Turned":
+        """Transform the samples of an angle."""
+        rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
+        return cls(line.transformed(rest), start_rad, speed_rad_s)
 
 
 def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]:

@@ -281,6 +281,31 @@ def places(length_m: float, spacing_m: float) -> Real:
     return np.linspace(_EDGE_M, length_m, n)
 
 
+def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
+    """Nodes that tell a smooth function between the first and the last of the places.
+
+    Parameters
+    ----------
+    x_m
+        Increasing places, shape (m,).
+    count
+        How many nodes.
+
+    Returns
+    -------
+    nodes_m : ndarray, shape (count,)
+    between : ndarray, shape (m, count)
+        Takes values at the nodes to those at the places.
+    """
+    from numpy.polynomial import chebyshev
+
+    nodes = chebyshev.chebpts1(count)
+    share = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
+    at_nodes, at_places = (chebyshev.chebvander(each, count - 1) for each in (nodes, share))
+    between: Real = at_places @ np.linalg.inv(at_nodes)
+    return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
+
+
 def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     """Cubic interpolation on an equally spaced grid: first of four points, and their weights.
 

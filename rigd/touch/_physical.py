@@ -9,6 +9,7 @@ are there for that.
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import log
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,16 +89,20 @@ class Window:
         raw = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
         return cls(motion, first, end, whitening, whitening @ raw)
 
-    def residuals(self, predicted: Real) -> Real:
-        """Whitened residuals.
+    def residuals(self, predicted: NDArray[np.floating[Any]]) -> Real:
+        """Whitened residuals, in the precision of what is predicted.
 
         Parameters
         ----------
         predicted
             Effect of a touch on the channels, shape (k, c, samples).
         """
-        scaled = (predicted / self.motion.noise[:, None]).reshape(predicted.shape[0], -1)
-        difference: Real = self.data - scaled @ self.whitening.T
+        noise, whitening, data = (
+            each.astype(predicted.dtype, copy=False)
+            for each in (self.motion.noise, self.whitening, self.data)
+        )
+        scaled = (predicted / noise[:, None]).reshape(predicted.shape[0], -1)
+        difference: Real = data - scaled @ whitening.T
         return difference
 
 
@@ -334,6 +339,8 @@ def descend(
         move = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
         move = np.clip(move, -8 * space.scale, 8 * space.scale)
         trial = np.clip(at[rows] + move, space.low, space.high)
+        linear = r + np.einsum("knp,kp->kn", j, trial - at[rows])
+        promised = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
         new_residual, new_jacobian = _linearised(predict, window, trial, space)
         new = np.einsum("kn,kn->k", new_residual, new_residual)
         gain = chi2[rows] - new
@@ -342,10 +349,15 @@ def descend(
         at[taken], chi2[taken] = trial[better], new[better]
         residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
         damping[rows] = np.where(better, damping[rows] / 6, damping[rows] * 8)
-        active[rows[(better & (gain < 0.02)) | (damping[rows] > 1e6)]] = False
+        # Where contacts begin and end the residuals have bends: short steps may promise and fail.
+        active[rows[np.where(better, gain, promised) < _SETTLED]] = False
         if not active.any():
             break
     return Descended(at, chi2, jacobian)
+
+
+_SETTLED = 0.1
+"""A step that saves less, or fails although it promises no more, is the last one."""
 
 
 def _linearised(predict: Prediction, window: Window, at: Real, space: Space) -> tuple[Real, Real]:
@@ -428,7 +440,8 @@ class Starts:
         )
         force = -np.repeat(side, kinds, axis=1) * pressing
         predicted = np.zeros(
-            (places, samples.size, kinds, motion.noise.size, window.end - window.first)
+            (places, samples.size, kinds, motion.noise.size, window.end - window.first),
+            dtype=np.float32,
         )
         for channel in range(motion.noise.size):
             effect = force @ self._channels[channel][:, :steps, :length]

@@ -13,6 +13,8 @@ HISTORY_S: Final = 1.5
 """Record before a detection that an estimate rests on."""
 CONTACT_S: Final = 0.8
 """For so long after a detection the beam of a search may still touch what it has met."""
+LOOK_S: Final = 0.025
+"""Record after a detection that tells where to look."""
 FIRST_S: Final = 0.05
 """Record after a detection that the first estimate rests on."""
 FINAL_S: Final = 0.2

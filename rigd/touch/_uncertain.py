@@ -43,7 +43,7 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -
     x = float(best[0, 0])
     near = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for free in tables.changed:
-        changed = free.at(near).motion(record, quiet, quiet - 4)
+        changed = free.at(near).motion(record, quiet, quiet - 4, motion.turned)
         kernels = contact_kernels(
             free.model.beam,
             free.model.damping,
