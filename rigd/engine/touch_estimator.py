@@ -34,7 +34,8 @@ from rigd.touch import (
 )
 
 _BLOCK = 250
-_IDLE_S = 0.005
+_IDLE_S, _WAITING_S = 0.005, 0.001
+"""Pause where nothing has come: while nothing has been touched, and while somebody waits."""
 
 
 def main() -> None:
@@ -55,7 +56,7 @@ def main() -> None:
         if block:
             touches.take(decode_samples(block))
         else:
-            time.sleep(_IDLE_S)
+            time.sleep(_IDLE_S if touches.idle else _WAITING_S)
         for told in touches.told():
             parent.send(told)
         try:
@@ -101,6 +102,11 @@ class TouchFollower:
         self._free_from = 0
         self._count = 0
         self._over = False
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is no touch to estimate."""
+        return not self._waiting
 
     def take(self, samples: NDArray[np.void]) -> None:
         """Take the next samples of the record, shape (n,)."""

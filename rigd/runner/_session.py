@@ -370,8 +370,10 @@ class Session:
         """Wait for the control process's next message, watching everybody meanwhile."""
         deadline, phase = 0.0, -1
         while True:
+            # Of the two, an estimate of a touch is what somebody waits for.
+            waited = self._touches is not None and self._touches.listen(_POLL_S)
             try:
-                answer = self._group.control.poll(_POLL_S)
+                answer = self._group.control.poll(0.0 if waited else _POLL_S)
             except ChildError as error:
                 return self._control_died(str(error))
             self._report()

@@ -167,6 +167,11 @@ class TouchEstimates:
         if late:
             self._lose(f"The touch process was {late}.")
 
+    def listen(self, patience_s: float) -> bool:
+        """Wait for an estimate at most so long; say whether there is somebody to wait for."""
+        self._listen(patience_s)
+        return not self._lost
+
     def attend(self) -> list[Event]:
         """Take what has come, and return what the operator is to be told."""
         self._listen(0.0)

@@ -129,7 +129,7 @@ class FreeBeam:
         return other
 
     def _place(self, x_m: Real) -> None:
-        """Take places; many are interpolated from few, to rounding for waves of up to 1 kHz."""
+        """Take places; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
         if x_m.size > _NODES:

@@ -106,3 +106,7 @@ def test_shifted_values_lie_on_the_curve():
     assert told[1, :2] == pytest.approx([0.0, 0.0])
     assert told[1, 5:] == pytest.approx((np.arange(5, 20) - 3.5) ** 2)
     assert shifted(table, np.array([37.5, 50.0]), 9)[1] == pytest.approx(39.0**2)
+    # However far off it is asked for.
+    assert shifted(table, np.array([1e7, -1e7]), 9) == pytest.approx(
+        np.outer([39.0**3, 0.0], [1.0] * 9)
+    )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import further
-from struck_beam import ALIKE, MISTAKEN, OBSTACLES, begin_s, cut
+from struck_beam import ALIKE, MISTAKEN, NOTICED, OBSTACLES, begin_s, cut
 
 from rigd.touch import TouchRecord, estimate_touch
 
@@ -122,6 +122,55 @@ def test_one_that_is_like_two_is_one(estimator, alike, after):
     assert estimate.kind == "rigid"
     assert abs(estimate.x_m.value - ALIKE["one"].x_m) < 4 * estimate.x_m.std
     assert estimate.x_m.std < 5e-3
+
+
+# While the record grows
+
+
+def grown(estimator, struck, *, noticed=NOTICED):
+    """First and last answer, as the touch process asks for them."""
+    growing = estimator.follow()
+    growing.look(cut(struck, 25, noticed=noticed))
+    first = growing.told(cut(struck, 50, noticed=noticed), scan=False, first=True)
+    return first, growing.told(cut(struck, 190, noticed=noticed), scan=False)
+
+
+@pytest.mark.parametrize("name", [*AT_REST, "fleeing", further("knock")])
+def test_what_goes_on_from_the_first_answer_tells_the_same(estimator, struck, name):
+    at_once = estimator.estimate(cut(struck[name], 190), scan=False)
+    _, last = grown(estimator, struck[name])
+    assert (last.kind, last.samples) == (at_once.kind, at_once.samples)
+    assert abs(last.x_m.value - at_once.x_m.value) < 0.5 * at_once.x_m.std
+    assert last.x_m.std == pytest.approx(at_once.x_m.std, rel=0.5)
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_the_first_answer_is_that_of_its_samples(estimator, struck, name):
+    first, _ = grown(estimator, struck[name])
+    alone = estimator.estimate(cut(struck[name], 50), scan=False)
+    assert first.kind == alone.kind == "rigid"
+    assert first.x_m.value == pytest.approx(alone.x_m.value, abs=0.1 * alone.x_m.std)
+
+
+@pytest.mark.parametrize("name", ["fleeing", "knock"])
+def test_the_first_answer_leaves_open_what_an_obstacle_at_rest_does_not_explain(
+    estimator, struck, name
+):
+    first, last = grown(estimator, struck[name])
+    assert first.kind == "unknown"
+    low, high = first.x_m.interval_95
+    assert low < OBSTACLES[name].x_m < high
+    assert last.x_m.std < first.x_m.std
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_a_touch_that_is_noticed_late_is_looked_for_in_what_precedes(estimator, struck, name):
+    first, last = grown(estimator, struck[name], noticed=24)
+    for told in (first, last):
+        assert told.kind == "rigid"
+        assert abs(told.x_m.value - OBSTACLES[name].x_m) < 4 * told.x_m.std
+        touch_s = told.time_s.value + begin_s(struck[name], 24)
+        assert touch_s == pytest.approx(struck[name].touch_s, abs=5e-4)
 
 
 def test_the_same_record_gives_the_same_answer(estimator, told, struck):

@@ -5,7 +5,15 @@ import pytest
 from touch_records import DAMPED, LINK
 
 from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
-from rigd.touch._kernels import Hat, Line, contact_kernels, cross_kernels, lagrange, places
+from rigd.touch._kernels import (
+    Hat,
+    Line,
+    chebyshev_nodes,
+    contact_kernels,
+    cross_kernels,
+    lagrange,
+    places,
+)
 
 STEP_S = 1 / 8000
 
@@ -94,3 +102,12 @@ def test_cubic_interpolation_is_exact_for_cubics():
     first, weights = lagrange(at, grid)
     values = sum(weights[:, i] * (grid[first + i] ** 3 - grid[first + i]) for i in range(4))
     assert values == pytest.approx(at**3 - at)
+
+
+def test_few_nodes_tell_a_wave_at_all_places():
+    """The shortest wave of 1 kHz on this beam is six to its length."""
+    x_m = places(LINK.length_m, 0.007)
+    nodes, between = chebyshev_nodes(x_m, 36)
+    at_places, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
+    assert np.abs(between @ at_nodes - at_places).max() < 1e-7
+    assert x_m[0] < nodes.min() < nodes.max() < x_m[-1]

@@ -1,0 +1,86 @@
+"""How soon after a touch its place is told, in real time on this machine.
+
+Runs ``rigd run touch`` into obstacles at 0.05 to 0.97 m, of 100 to 100 000 N/m, at 0.3 to 2 rad/s,
+as an operator types it, with all processes of a session beside each other: loop, recorder, touch
+process, supervisor. The time from the touch (as the last answer tells it) to the line that the
+operator reads is printed for each, then how many come in time. Run it with nothing else going on.
+
+    python benchmarks/bench_touch_answers.py --touches 40
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_touch_sessions import BIN, Meeting, draw_meeting
+
+from rigd.session import read_session
+
+WANTED_S = {"first": 0.3, "last": 1.0}
+RIG = 9000
+"""Number under which the obstacles are drawn."""
+
+
+def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
+    """Run one session; return when its first touch was told, or None if there was none."""
+    obstacle = f"x={meeting.x_m},angle={meeting.angle_rad},stiffness={meeting.stiffness_n_per_m}"
+    command = [
+        str(BIN / "rigd"), "run", "touch", str(round(meeting.angle_rad + 0.4, 4)),
+        "--speed", str(meeting.speed_rad_s), "--json", "--no-look",
+        "--obstacle", obstacle, "--output", "touches",
+    ]  # fmt: skip
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+    told_s: dict[str, float] = {}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        cwd=folder,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None and process.stdout is not None
+        for line in process.stderr:
+            if line.startswith("Touch 1"):
+                told_s["first" if "first estimate" in line else "last"] = time.time()
+        [session] = json.loads(process.stdout.read())["sessions"]
+    touches = session["touches"]
+    if not touches or touches[0].get("time_s") is None:
+        return None
+    began_s = read_session(folder / session["path"]).start_utc_ns * 1e-9
+    touch_s = began_s + touches[0]["time_s"]["value"]
+    return {name: at - touch_s for name, at in told_s.items()} | {"kind": touches[0]["kind"]}
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--touches", type=int, default=20)
+    given = parser.parse_args()
+    seconds: dict[str, list[float]] = {name: [] for name in WANTED_S}
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(given.touches):
+            meeting = draw_meeting(RIG, number)
+            told = answers(meeting, Path(folder))
+            print(
+                f"{meeting.x_m:.3f} m, {meeting.stiffness_n_per_m:.0f} N/m, "
+                f"{meeting.speed_rad_s:.2f} rad/s:",
+                "not told" if told is None else told,
+                flush=True,
+            )
+            for name in WANTED_S:
+                if told and name in told:
+                    seconds[name].append(told[name])
+    for name, wanted_s in WANTED_S.items():
+        found = np.array(seconds[name])
+        print(
+            f"{name}: {len(found)} of {given.touches}, median {np.median(found):.3f} s, 90 % "
+            f"{np.quantile(found, 0.9):.3f}, longest {found.max():.3f}; within {wanted_s} s "
+            f"{np.mean(found <= wanted_s):.0%}"
+        )
+
+
+if __name__ == "__main__":
+    main()
