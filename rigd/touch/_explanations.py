@@ -44,8 +44,6 @@ _COVERED_S = 0.1
 _WORTH = 1.2
 """So many times the samples are worth another stage."""
 _WELL_KNOWN_M = 2e-3
-_ROUGHLY = 1.0
-"""Saved by a step that does not matter where only much less would say something."""
 _CLOUD = 96
 """Starts for a longer part of the record, from what a shorter one leaves likely."""
 _NEAR_TIP = 0.8
@@ -402,7 +400,6 @@ class Explainer:
             self.space(5),
             rounds=5,
             free=free,
-            settled=_ROUGHLY,
         )
         return bool(found.chi2.min() < rest.chi2 - _DOUBTFUL)
 

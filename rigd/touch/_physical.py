@@ -296,6 +296,10 @@ class Descended:
     """Derivatives of the residuals, shape (k, n, p)."""
 
 
+_SETTLED = 0.1
+"""A step that saves less, or fails although it promises no more, is the last one."""
+
+
 def descend(
     predict: Prediction,
     window: Window,
@@ -303,7 +307,6 @@ def descend(
     space: Space,
     rounds: int = 12,
     free: NDArray[np.bool_] | None = None,
-    settled: float = 0.1,
 ) -> Descended:
     """Minimise the residuals from each start.
 
@@ -321,8 +324,6 @@ def descend(
         Most iterations.
     free
         Which parameters of each start are to be changed, shape (k, p); None: all.
-    settled
-        A step that saves less, or fails although it promises no more, is the last one.
     """
     at = np.clip(starts, space.low, space.high)
     damping = np.full(len(at), 1e-2)
@@ -353,7 +354,7 @@ def descend(
         residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
         damping[rows] = np.where(better, damping[rows] / 6, damping[rows] * 8)
         # Where contacts begin and end the residuals have bends: short steps may promise and fail.
-        active[rows[np.where(better, gain, promised) < settled]] = False
+        active[rows[np.where(better, gain, promised) < _SETTLED]] = False
         if not active.any():
             break
     return Descended(at, chi2, jacobian)
