@@ -6,6 +6,7 @@ the samples before it tell how the free beam moves.
 
 import numpy as np
 
+from rigd.touch._answer import answer
 from rigd.touch._explanations import Explainer
 from rigd.touch._free_motion import TouchRecord
 from rigd.touch._model import TouchModel
@@ -123,7 +124,7 @@ class GrowingEstimate:
                 here.seems_to_begin >= searched or self._began_earlier(record, noticed_s)
             ):
                 continue
-            found = here.told(scan=scan, first=first)
+            found = answer(here, here.explain(first=first), scan=scan)
             if told is None or found.explained:
                 told = found
             if found.explained:

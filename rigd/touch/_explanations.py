@@ -2,8 +2,7 @@
 
 Innovations of torque and base shear are explained by a springy obstacle at rest, marched through
 its bounces; beside it stand two obstacles, those that move or give way, a knock, and any force at
-all. The answer tells what the data tell: values with standard deviations and intervals that take in
-the noise, the model's uncertainty and every place that is about as likely.
+all. What of them is told is decided elsewhere (`_answer`).
 """
 
 from dataclasses import dataclass, replace
@@ -29,14 +28,12 @@ from rigd.touch._physical import (
     descend,
 )
 from rigd.touch._posterior import Posterior, sampled
-from rigd.touch._results import Estimated, TouchEstimate
 from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
 from rigd.touch._tables import GRID_S, Tables
 from rigd.touch._uncertain import deviations
 
 Real = NDArray[np.float64]
 
-_TWO_SIDED_95 = 1.959964
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
 """After the detection: what is explained, the longest only if the point is not well known yet."""
 _COVERED_S = 0.1
@@ -46,7 +43,7 @@ _WORTH = 1.2
 _WELL_KNOWN_M = 2e-3
 _CLOUD = 96
 """Starts for a longer part of the record, from what a shorter one leaves likely."""
-_NEAR_TIP = 0.8
+NEAR_TIP = 0.8
 """Share of the length beyond which contacts are shorter, and steps finer."""
 _BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
 _AT_TIP = 0.95
@@ -54,22 +51,12 @@ _AT_TIP = 0.95
 
 _LEAST_SCALE = 1.2
 """Variance of the residuals at least assumed: the noise itself is known from few samples."""
-_LEAST_STD_M = (3e-4, 5e-4)
-"""What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
-tip: in 130 simulated touches the errors agree with the intervals if this is added."""
 _DOUBT_OF_TWO = 4.0
 """The sum of squared residuals of two obstacles that clearly explain more than one counts so many
 times less: which of their several minima is the lowest, the errors of the model decide."""
-_LEAST_OF_TWO_M = 2e-3
-"""What bounces leave unknown of the first of two, which are marched in longer steps."""
-_EARLY_S = (0.006, 0.01, 0.022)
-"""After the detection: what a touch that nothing explains is compared with as well. Later a second
-point may be touched."""
-_WIDE = 8.0
-"""Fall of the log-likelihood at the ends of an interval for a touch that nothing explains."""
-_CLEAR = 16.0
+CLEAR = 16.0
 """Difference in the sum of squared residuals that decides between two kinds."""
-_DOUBTFUL = 9.0
+DOUBTFUL = 9.0
 """By so much less, that of an obstacle that moves or gives way leaves open whether it is at rest:
 one that is at rest gains that much by chance in one of a hundred touches."""
 _POSSIBLE = 5.0
@@ -78,7 +65,7 @@ _HOPEFUL = 0.8
 """By so much less, after a few iterations, two obstacles are worth more of them."""
 _WORSE = 3.5
 """By so many standard deviations may the sum of squared residuals exceed its expectation."""
-_POOR = 2.0
+POOR = 2.0
 """Beyond so many the explanation may be the wrong one: other kinds are tried, and the point gets
 the interval that any force leaves it."""
 _WORSE_LATER = 2.5
@@ -92,13 +79,27 @@ _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
 
 
 @dataclass(frozen=True, slots=True)
-class _Explanation:
+class Explanation:
     """The best that obstacles of one kind make of the record."""
 
     kind: str
     posterior: Posterior
     parameters: Real
     chi2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """What may explain a record, and how far."""
+
+    explanations: list[Explanation]
+    """An obstacle at rest comes first."""
+    window: Window
+    """The part of the record that they explain."""
+    later_doubtful: bool
+    """Later samples, which are left out, speak against an obstacle at rest."""
+    untried: bool
+    """Another kind may be likelier, but none was tried."""
 
 
 class Explainer:
@@ -142,7 +143,7 @@ class Explainer:
         self.deviations: Real | None = None
         self._covered_s = 0.0
         self._gridded: Real = self._best_of_grid() if earlier is None else earlier._gridded
-        self._at_rest: tuple[_Explanation, float] | None
+        self._at_rest: tuple[Explanation, float] | None
         self._at_rest = None if earlier is None else earlier._at_rest
 
     @property
@@ -166,26 +167,24 @@ class Explainer:
         """What an obstacle at rest leaves of the first samples, by what noise would leave."""
         return float(self._descended.chi2.min() / self.window(FIRST_S).data.size)
 
-    def told(self, *, scan: bool, first: bool) -> TouchEstimate:
-        """Return what the touch was, or what it was if the obstacle was at rest (`first`)."""
+    def explain(self, *, first: bool) -> Explained:
+        """Explain the record by obstacles at rest and, unless it is the `first` time, by others."""
         rest, window, two, later_doubtful = self._over_stages()
         explanations = [rest]
         untried = False
         if two is None:
-            other = not self._fits(rest, window, _POOR) or self._changes(rest, window)
+            other = not self.fits(rest, window, POOR) or self._changes(rest, window)
             if other and first:
                 untried = True
             elif other:
                 explanations += self._others(window)
-            if self._fits(rest, window):
+            if self.fits(rest, window):
                 two = self._two(rest, window)
         if two is not None:
             explanations.append(two)
-        return self._answer(
-            explanations, window, scan=scan, later_doubtful=later_doubtful, untried=untried
-        )
+        return Explained(explanations, window, later_doubtful=later_doubtful, untried=untried)
 
-    def _over_stages(self) -> tuple[_Explanation, Window, _Explanation | None, bool]:
+    def _over_stages(self) -> tuple[Explanation, Window, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
         Returns what the longest one tells that is explained, and that part; two obstacles, if they
@@ -194,7 +193,7 @@ class Explainer:
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         stages.append(available_s)
-        before: tuple[_Explanation, Window] | None = None
+        before: tuple[Explanation, Window] | None = None
         if self._at_rest is None:
             starts = self._beside(_distinct(self._descended))
         else:
@@ -211,7 +210,7 @@ class Explainer:
             rest = self.explained("rigid", self.predicting(starts), window, starts, self.space(3))
             if before is not None and self._later_is_worse(rest, window, *before):
                 two = self._two(rest, window)
-                if two is not None and self._fits(two, window, _POOR):
+                if two is not None and self.fits(two, window, POOR):
                     return rest, window, two, False
                 # Of still later bounces the search may miss the minimum: they speak of no kind.
                 doubtful = seconds <= _COVERED_S and self._changes(rest, window)
@@ -220,7 +219,7 @@ class Explainer:
             self._at_rest = rest, seconds
             place = rest.posterior.mean(0)
             known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
-            if seconds > FIRST_S and (known or not self._fits(rest, window)):
+            if seconds > FIRST_S and (known or not self.fits(rest, window)):
                 break
             starts = self._further(rest)
         assert before is not None  # there is one stage at least, or one of before
@@ -233,7 +232,7 @@ class Explainer:
             whole = Window.of(self.motion, self.quiet, self.end(self._covered_s))
             self.deviations = deviations(self.tables, self.record, likeliest[:1], whole)
 
-    def _further(self, rest: _Explanation) -> Real:
+    def _further(self, rest: Explanation) -> Real:
         """Return starts for a longer part of the record."""
         return np.vstack([rest.parameters, self._cloud(rest.posterior)])
 
@@ -270,7 +269,7 @@ class Explainer:
         `first`: twice as long steps to begin with.
         """
         tables = self.tables
-        tip = bool(np.median(rows[:, 0]) > _NEAR_TIP * tables.model.beam.length_m)
+        tip = bool(np.median(rows[:, 0]) > NEAR_TIP * tables.model.beam.length_m)
         kernels = (tables.coarse, tables.middle, tables.finest)[1 - first + tip]
         touching = Touching(kernels, tables.x_m, self.motion)
         return lambda candidates, window: touching.predicted(candidates, window)[0]
@@ -307,7 +306,7 @@ class Explainer:
 
     def _beside(self, starts: Real) -> Real:
         """Add starts beside the best ones near the tip, where the minima stand close together."""
-        if np.median(starts[:, 0]) <= _NEAR_TIP * self.tables.model.beam.length_m:
+        if np.median(starts[:, 0]) <= NEAR_TIP * self.tables.model.beam.length_m:
             return starts
         beside = np.repeat(starts[None, :2], _BESIDE_M.size, axis=0)
         beside[:, :, 0] = np.clip(beside[:, :, 0] + _BESIDE_M[:, None], *self.edges)
@@ -326,7 +325,7 @@ class Explainer:
 
     def explained(
         self, kind: str, predict: Prediction, window: Window, starts: Real, space: Space
-    ) -> _Explanation:
+    ) -> Explanation:
         """Descend from starts, and sample around the minima."""
         if starts.shape[0] > 12:
             starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
@@ -341,7 +340,7 @@ class Explainer:
         found: Descended,
         space: Space,
         doubt: float = 1.0,
-    ) -> _Explanation:
+    ) -> Explanation:
         """Sample around minima; `doubt` is what differences of chi² are divided by."""
         width = found.parameters.shape[1]
         near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
@@ -365,28 +364,28 @@ class Explainer:
             smallest=space.smallest,
         )
         best = int(np.argmin(posterior.chi2))
-        return _Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
+        return Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
 
     # Other kinds
 
-    def _fits(self, explanation: _Explanation, window: Window, worse: float = _WORSE) -> bool:
+    def fits(self, explanation: Explanation, window: Window, worse: float = _WORSE) -> bool:
         """Whether no more is left than noise leaves, which is itself known from few samples."""
-        return bool(explanation.chi2 < self._most(window.data.size, worse))
+        return bool(explanation.chi2 < self.most(window.data.size, worse))
 
-    def _most(self, degrees: int, worse: float = _WORSE) -> float:
+    def most(self, degrees: int, worse: float = _WORSE) -> float:
         """Greatest sum of squared residuals that noise explains."""
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
         return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
 
     def _later_is_worse(
-        self, longer: _Explanation, over: Window, shorter: _Explanation, until: Window
+        self, longer: Explanation, over: Window, shorter: Explanation, until: Window
     ) -> bool:
         """Whether the shorter of two windows is explained, and not what the longer one adds."""
         added = over.data.size - until.data.size
         more = longer.chi2 - shorter.chi2
-        return self._fits(shorter, until) and more > self._most(added, _WORSE_LATER)
+        return self.fits(shorter, until) and more > self.most(added, _WORSE_LATER)
 
-    def _changes(self, rest: _Explanation, window: Window) -> bool:
+    def _changes(self, rest: Explanation, window: Window) -> bool:
         """Whether the obstacle at rest becomes likelier if it may move or give way."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
@@ -401,11 +400,11 @@ class Explainer:
             rounds=5,
             free=free,
         )
-        return bool(found.chi2.min() < rest.chi2 - _DOUBTFUL)
+        return bool(found.chi2.min() < rest.chi2 - DOUBTFUL)
 
-    def _others(self, window: Window) -> list[_Explanation]:
+    def _others(self, window: Window) -> list[Explanation]:
         """Obstacles that move or give way, and a knock."""
-        blind, side = self.blind, self._side()
+        blind, side = self.blind, self.side()
         likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
         found = []
@@ -429,14 +428,14 @@ class Explainer:
         found.append(self.explained("knock", knocking.predicted, window, starts, space))
         return found
 
-    def _pairing(self) -> Pairing:
+    def pairing(self) -> Pairing:
         tables = self.tables
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
 
-    def _two(self, rest: _Explanation, window: Window) -> _Explanation | None:
+    def _two(self, rest: Explanation, window: Window) -> Explanation | None:
         """Two obstacles, if they may explain more than one at rest does."""
-        pairing = self._pairing()
+        pairing = self.pairing()
         space = pairing.space(self.space(3))
         # The first samples tell in less time whether more iterations are worth while.
         early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
@@ -451,10 +450,10 @@ class Explainer:
         gain = rest.chi2 - found.chi2.min()
         if gain < _POSSIBLE:
             return None
-        doubt = _DOUBT_OF_TWO if gain > _CLEAR else 1.0
+        doubt = _DOUBT_OF_TWO if gain > CLEAR else 1.0
         return self._sampled("two", pairing.channels, window, found, space, doubt)
 
-    def _side(self) -> float:
+    def side(self) -> float:
         """Direction in which the beam presses: against the force, whatever that comes from."""
         return -1.0 if self.blind.force_n.sum() > 0 else 1.0
 
@@ -481,124 +480,6 @@ class Explainer:
             ranges.loose[columns],
         )
 
-    # The answer
-
-    def _answer(
-        self,
-        explanations: list[_Explanation],
-        window: Window,
-        *,
-        scan: bool,
-        later_doubtful: bool,
-        untried: bool,
-    ) -> TouchEstimate:
-        """Say what the likeliest explanation tells, and of what kind the touch is.
-
-        `later_doubtful`: later samples, which are left out, speak against an obstacle at rest.
-        `untried`: another kind may be likelier, but none was tried.
-        """
-        rest = explanations[0]
-        best = min(explanations, key=lambda each: each.chi2)
-        if rest.chi2 < best.chi2 + _CLEAR:
-            best = rest
-        rivals = [best, *(each for each in explanations if _rivals(best, each))]
-        clear = len(rivals) == 1 and best.kind != "two"
-        if best is rest:
-            rivals += [each for each in explanations if each.kind == "two"]
-        offset = self.begin / self.rate
-        x_m = time_s = force_n = stiffness = None
-        history, instants = np.zeros(0), np.zeros(0)
-        kind = "unknown"
-        if self._fits(best, window):
-            poor = not self._fits(best, window, _POOR)
-            doubtful = later_doubtful or untried if best is rest else poor
-            if clear and not doubtful:
-                kind = best.kind
-            x_m, time_s = self._place(rivals), _known(rivals, 1, offset)
-            if poor or untried:
-                x_m = self._widened(x_m)
-            history, instants, force_n = self._forces(best, window)
-            if kind == "rigid":
-                stiffness = _stiffness(rest.posterior)
-        elif self.blind.chi2 < self._most(self.blind.degrees) and not self.begins_too_late:
-            x_m = self._roughly()
-        return TouchEstimate(
-            x_m=x_m,
-            time_s=time_s,
-            force_n=force_n,
-            stiffness_n_per_m=stiffness,
-            kind=kind,
-            model=self.tables.model.source,
-            channels=self.motion.noise.size,
-            samples=window.end - self.detected,
-            chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-            places_m=self.blind.x_m if scan else np.zeros(0),
-            log_likelihood=self.blind.log_likelihood if scan else np.zeros(0),
-            innovations=self.motion.innovations / self.motion.noise[:, None],
-            innovation_times_s=self.motion.t + offset,
-            force_history_n=history,
-            force_times_s=instants + offset,
-        )
-
-    def _roughly(self) -> Estimated:
-        """Point of a touch that nothing explains: where any force could do it, early and later.
-
-        More than one point may be touched by then, so what the first samples tell alone counts
-        too, and all with wide intervals.
-        """
-        early = [self.tables.blind.scan(self.window(seconds)) for seconds in _EARLY_S]
-        ends = np.array([scan.interval(_WIDE)[2:] for scan in (self.blind, *early)])
-        low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
-        return Estimated(self.blind.interval(_WIDE)[0], (high - low) / 4, (low, high))
-
-    def _widened(self, told: Estimated) -> Estimated:
-        """Widen the interval of a point to all where any force could be."""
-        *_, low, high = self.blind.interval()
-        low, high = min(low, told.interval_95[0]), max(high, told.interval_95[1])
-        return Estimated(told.value, max(told.std, (high - low) / 4), (low, high))
-
-    def _place(self, rivals: list[_Explanation]) -> Estimated:
-        """Point of touch, with what bounces leave unknown of it."""
-        told = _known(rivals, 0)
-        tip = told.value > _NEAR_TIP * self.tables.model.beam.length_m
-        least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
-        low, high = (
-            told.value + np.copysign(np.hypot(end - told.value, _TWO_SIDED_95 * least), sign)
-            for end, sign in zip(told.interval_95, (-1.0, 1.0), strict=True)
-        )
-        length = self.tables.model.beam.length_m
-        return Estimated(
-            told.value,
-            float(np.hypot(told.std, least)),
-            (max(float(low), 0.0), min(float(high), length)),
-        )
-
-    def _forces(self, best: _Explanation, window: Window) -> tuple[Real, Real, Estimated]:
-        """Force in time and its peak, over what is likely."""
-        rng = np.random.default_rng(2)
-        posterior = best.posterior
-        some = rng.choice(posterior.weights.size, 48, p=posterior.weights)
-        rows = np.vstack([best.parameters, posterior.samples[some]])
-        step_s = self.tables.middle.step_s
-        if best.kind == "knock":
-            peaks = np.abs(rows[:, 3])
-            phase = np.arange(0.0, np.exp(rows[0, 2]) + step_s, step_s) / np.exp(rows[0, 2])
-            force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
-        elif best.kind == "two":
-            step_s = self.tables.coarse.step_s
-            force = np.abs(self._pairing().predicted(rows, window)[1])
-            peaks = force.max(axis=1)
-        else:
-            touching = Touching(self.tables.middle, self.tables.x_m, self.motion)
-            side = None if best.kind == "rigid" else self._side()
-            if best.kind == "yielding":
-                rows = np.insert(rows, 3, 0.0, axis=1)
-            force = np.abs(touching.predicted(rows, window, side)[1])
-            peaks = force.max(axis=1)
-        low, high = np.quantile(peaks[1:], (0.025, 0.975))
-        told = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
-        return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), told
-
 
 def _distinct(found: Descended) -> Real:
     """Minima that are not worth the same as a better one beside them, the best first."""
@@ -608,31 +489,3 @@ def _distinct(found: Descended) -> Real:
         if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
             kept.append(row)
     return np.array(kept)
-
-
-def _rivals(best: _Explanation, other: _Explanation) -> bool:
-    """Whether another explanation is about as likely: a parameter more must be worth its while."""
-    if best.kind == "rigid" and other.kind in ("moving", "yielding"):
-        return other.chi2 < best.chi2 - _DOUBTFUL
-    if best.kind == "rigid" and other.kind == "two":
-        return False
-    return other is not best and other.chi2 < best.chi2 + _CLEAR
-
-
-def _known(rivals: list[_Explanation], column: int, shift: float = 0.0) -> Estimated:
-    """Tell a parameter that all likely explanations share, with room for each."""
-    ends = np.array([each.posterior.quantiles(column, (0.025, 0.975)) for each in rivals])
-    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
-    mean, std = rivals[0].posterior.mean(column), rivals[0].posterior.std(column)
-    if len(rivals) > 1:
-        std = max(std, (mean - low) / _TWO_SIDED_95, (high - mean) / _TWO_SIDED_95)
-    return Estimated(mean + shift, std, (low + shift, high + shift))
-
-
-def _stiffness(posterior: Posterior) -> Estimated | None:
-    """Stiffness if the data bound it on both sides; the mean is that of its logarithm."""
-    low, middle, high = posterior.quantiles(2, (0.025, 0.5, 0.975))
-    if high > STIFFEST - 0.7 or low < SOFTEST + 0.3 or high - low > np.log(100):
-        return None
-    value = float(np.exp(middle))
-    return Estimated(value, value * posterior.std(2), (float(np.exp(low)), float(np.exp(high))))
