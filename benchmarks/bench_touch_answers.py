@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from bench_touch_sessions import BIN, Meeting, draw_meeting
 
-from rigd.session import read_session
+from rigd.session import Status, read_session
 
 WANTED_S = {"first": 0.3, "last": 1.0}
 RIG = 9000
@@ -46,12 +46,15 @@ def answers(meeting: Meeting, folder: Path) -> dict[str, Any] | None:
             if line.startswith("Touch 1"):
                 told_s["first" if "first estimate" in line else "last"] = time.time()
         [session] = json.loads(process.stdout.read())["sessions"]
-    touches = session["touches"]
-    if not touches or touches[0].get("time_s") is None:
+    if not session["touches"] or not told_s:
         return None
-    began_s = read_session(folder / session["path"]).start_utc_ns * 1e-9
-    touch_s = began_s + touches[0]["time_s"]["value"]
-    return {name: at - touch_s for name, at in told_s.items()} | {"kind": touches[0]["kind"]}
+    touch = session["touches"][0]
+    read = read_session(folder / session["path"])
+    noticed = int(np.argmax((read.samples["status"] & Status.TOUCHED) != 0))
+    # Where the last answer does not tell the instant, it counts from when the touch was noticed.
+    after_s = touch["time_s"]["value"] if touch["time_s"] else noticed / read.rate_hz
+    touch_s = read.start_utc_ns * 1e-9 + after_s
+    return {name: at - touch_s for name, at in told_s.items()} | {"kind": touch["kind"]}
 
 
 def main() -> None:

@@ -291,8 +291,6 @@ class TouchTold:
     """No better one will come."""
     document: Mapping[str, Any]
     """Point, instant, force, stiffness and kind, as in JSON documents."""
-    took_s: float
-    """Time of the calculation."""
 
 
 # Fit

@@ -126,7 +126,7 @@ class TouchFollower:
         if self._samples is None or not self._waiting:
             return []
         touch = self._waiting[0]
-        there = int(self._samples["tick"][-1]) - touch.tick
+        there = int(self._samples["tick"][-1]) - touch.tick + 1
         final = self._over or there >= self._final
         # In real time somebody waits for the first one, even if the record is whole after a look.
         first = self._job.realtime is not None or not final
@@ -143,18 +143,19 @@ class TouchFollower:
         return []
 
     def _told(self, touch: _Waiting, after: int, *, final: bool) -> TouchTold:
-        began_s = time.monotonic()
         record, start_s = self._record(touch, after)
         found = touch.estimate.told(record, scan=False, first=not final)
         document = found.as_dict(start_s)
-        return TouchTold(touch.number, touch.tick, final, document, time.monotonic() - began_s)
+        return TouchTold(touch.number, touch.tick, final, document)
 
     def _record(self, touch: _Waiting, after: int) -> tuple[TouchRecord, float]:
-        """Return the record until so many ticks after the detection, and when it begins."""
+        """Return the record with so many ticks from the detection on, and when it begins."""
         assert self._samples is not None
         job = self._job
-        part = around_touch(self._samples, touch.tick, job.rate_hz, touch.free_from)
-        part = part[part["tick"] <= touch.tick + after]
+        # Soon after another touch nothing before this one may be free: then it is told as unknown.
+        free_from = min(touch.free_from, touch.tick)
+        part = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
+        part = part[part["tick"] < touch.tick + after]
         record = touch_record(part, touch.tick, job.rate_hz, job.shear_projection)
         return record, int(part["tick"][0]) / job.rate_hz
 

@@ -109,8 +109,8 @@ class GrowingEstimate:
         scan
             Whether the likelihood of all places is wanted; without it, it is empty.
         first
-            Whether a first answer is wanted: what no obstacle at rest explains is of unknown kind
-            in it, since to try others takes a second.
+            Whether a first answer is wanted: what one or two obstacles at rest do not explain is of
+            unknown kind in it, since to try others takes a second.
         """
         told = None
         searched = record.angle_rad.size

@@ -35,7 +35,8 @@ from rigd.touch._uncertain import deviations
 Real = NDArray[np.float64]
 
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
-"""After the detection: what is explained, the longest only if the point is not well known yet."""
+"""After the detection: what is explained, the longest only if an obstacle at rest explains the
+shorter ones and the point is not well known yet."""
 _COVERED_S = 0.1
 """After the detection: so far the effects of what is uncertain are taken along at once."""
 _WORTH = 1.2
@@ -142,7 +143,8 @@ class Explainer:
         self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
         self.deviations: Real | None = None
         self._covered_s = 0.0
-        self._gridded: Real = self._best_of_grid() if earlier is None else earlier._gridded
+        whole_grid = earlier is not None and earlier.available >= round(GRID_S * rate)
+        self._gridded: Real = earlier._gridded if earlier and whole_grid else self._best_of_grid()
         self._at_rest: tuple[Explanation, float] | None
         self._at_rest = None if earlier is None else earlier._at_rest
 
@@ -187,8 +189,9 @@ class Explainer:
     def _over_stages(self) -> tuple[Explanation, Window, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
-        Returns what the longest one tells that is explained, and that part; two obstacles, if they
-        explain one that a single one does not; and whether what follows speaks against it.
+        Returns what the longest one tells that is explained, or else the first one that is not, and
+        that part; two obstacles, if they explain one that a single one does not; and whether what
+        follows speaks against it.
         """
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
@@ -200,10 +203,12 @@ class Explainer:
             rest, told_s = self._at_rest
             stages = [seconds for seconds in stages if seconds > told_s]
             starts = self._further(rest)
-            self._take_along(starts, max(told_s, *stages[:1]))
+            self._take_along(starts, max([told_s, *stages[:1]]))
             window = self.window(told_s)
             [chi2] = chi2_of(self.predicting(starts[:1]), window, starts[:1])
             before = replace(rest, chi2=float(chi2)), window
+            if self._enough(*before, told_s):
+                stages = []
         for seconds in stages:
             self._take_along(starts, seconds)
             window = self.window(seconds)
@@ -217,13 +222,17 @@ class Explainer:
                 return *before, None, doubtful
             before = rest, window
             self._at_rest = rest, seconds
-            place = rest.posterior.mean(0)
-            known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
-            if seconds > FIRST_S and (known or not self.fits(rest, window)):
+            if self._enough(rest, window, seconds):
                 break
             starts = self._further(rest)
         assert before is not None  # there is one stage at least, or one of before
         return *before, None, False
+
+    def _enough(self, rest: Explanation, window: Window, seconds: float) -> bool:
+        """Whether a longer part of the record would tell no more."""
+        place = rest.posterior.mean(0)
+        known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
+        return seconds > FIRST_S and bool(known or not self.fits(rest, window))
 
     def _take_along(self, likeliest: Real, seconds: float) -> None:
         """Know what is uncertain of so long a part of the record."""
@@ -266,11 +275,11 @@ class Explainer:
     def predicting(self, rows: Real, *, first: bool = False) -> Prediction:
         """March with short steps, near the tip with half as long ones: contacts are shorter there.
 
-        `first`: twice as long steps to begin with.
+        `first`: elsewhere twice as long ones to begin with.
         """
         tables = self.tables
         tip = bool(np.median(rows[:, 0]) > NEAR_TIP * tables.model.beam.length_m)
-        kernels = (tables.coarse, tables.middle, tables.finest)[1 - first + tip]
+        kernels = tables.finest if tip else tables.coarse if first else tables.middle
         touching = Touching(kernels, tables.x_m, self.motion)
         return lambda candidates, window: touching.predicted(candidates, window)[0]
 
@@ -290,10 +299,9 @@ class Explainer:
     def starts(self) -> Real:
         """The likeliest candidates of the grid, after a second look."""
         coarse = Touching(self.tables.coarse, self.tables.x_m, self.motion)
+        window = Window.of(self.motion, self.quiet, self.end(FIRST_S))
         again = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0],
-            self.window(FIRST_S),
-            self._gridded,
+            lambda rows, window: coarse.predicted(rows, window)[0], window, self._gridded
         )
         return self._gridded[np.argsort(again)[:12]]
 

@@ -89,7 +89,7 @@ class Window:
         raw = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
         return cls(motion, first, end, whitening, whitening @ raw)
 
-    def residuals(self, predicted: NDArray[np.floating[Any]]) -> Real:
+    def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Whitened residuals, in the precision of what is predicted.
 
         Parameters
@@ -102,8 +102,7 @@ class Window:
             for each in (self.motion.noise, self.whitening, self.data)
         )
         scaled = (predicted / noise[:, None]).reshape(predicted.shape[0], -1)
-        difference: Real = data - scaled @ whitening.T
-        return difference
+        return data - scaled @ whitening.T
 
 
 class Touching:

@@ -20,11 +20,11 @@ class Growing:
         self.asked = asked
 
     def look(self, record):
-        self.asked.append(("look", record.angle_rad.size - 1 - record.detected))
+        self.asked.append(("look", record.angle_rad.size - record.detected))
 
     def told(self, record, *, scan, first):
         assert not scan
-        after = record.angle_rad.size - 1 - record.detected
+        after = record.angle_rad.size - record.detected
         self.asked.append(("first" if first else "last", after))
         return SimpleNamespace(as_dict=lambda start_s: {"start_s": start_s})
 
@@ -79,7 +79,7 @@ def test_where_nobody_waits_only_the_last_answer_is_made(followed):
 
 @pytest.mark.parametrize(
     ("end", "asked"),
-    [(2031, [("last", 30)]), (2081, [("first", 50), ("last", 80)])],
+    [(2031, [("last", 31)]), (2050, [("first", 50), ("last", 50)])],
 )
 def test_a_record_that_ends_is_estimated_as_far_as_it_goes(followed, end, asked):
     assert followed([1000, end], TOUCH, off=True)[0] == asked
@@ -91,3 +91,9 @@ def test_the_beam_is_not_free_for_some_time_after_a_touch(followed):
         (1, False), (1, True), (2, False), (2, True),
     ]  # fmt: skip
     assert told[-1].document["start_s"] == (TOUCH + 800) / RATE_HZ
+
+
+def test_of_a_touch_soon_after_another_nothing_is_known_before_it(followed):
+    asked, told = followed(range(25, 3000, 25), TOUCH, TOUCH + 300)
+    assert asked[3:] == [("look", 25), ("first", 50), ("last", 200)]
+    assert told[-1].document["start_s"] == (TOUCH + 300) / RATE_HZ

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cases import further
 from struck_beam import ALIKE, MISTAKEN, NOTICED, OBSTACLES, begin_s, cut
+from touch_records import Obstacle, Slew, simulate
 
 from rigd.touch import TouchRecord, estimate_touch
 
@@ -161,6 +162,23 @@ def test_the_first_answer_leaves_open_what_an_obstacle_at_rest_does_not_explain(
     low, high = first.x_m.interval_95
     assert low < OBSTACLES[name].x_m < high
     assert last.x_m.std < first.x_m.std
+
+
+def test_a_record_that_does_not_grow_is_told_again(estimator, struck):
+    growing = estimator.follow()
+    told = [growing.told(cut(struck["middle"], after), scan=False) for after in (50, 50, 200, 250)]
+    assert [each.samples for each in told] == [50, 50, 100, 100]
+    assert {each.kind for each in told} == {"rigid"}
+
+
+def test_a_stiff_obstacle_near_the_tip_is_told_at_once(estimator):
+    """Its contacts are the shortest; in steps of 0.1 ms their minimum is missed."""
+    obstacle = Obstacle(x_m=0.93, stiffness_n_per_m=1e5)
+    [record] = simulate([obstacle], [Slew(1.0)], duration_s=0.8, steps=40, modes=20, seed=4)
+    first, last = grown(estimator, record)
+    for told in (first, last):
+        assert told.kind == "rigid"
+        assert abs(told.x_m.value - obstacle.x_m) < 4 * told.x_m.std
 
 
 @pytest.mark.parametrize("name", AT_REST)
