@@ -155,9 +155,8 @@ class TouchFollower:
         # Soon after another touch nothing before this one may be free: then it is told as unknown.
         free_from = min(touch.free_from, touch.tick)
         part = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
-        part = part[part["tick"] < touch.tick + after]
         record = touch_record(part, touch.tick, job.rate_hz, job.shear_projection)
-        return record, int(part["tick"][0]) / job.rate_hz
+        return record.until(record.detected + after), int(part["tick"][0]) / job.rate_hz
 
 
 if __name__ == "__main__":

@@ -167,7 +167,7 @@ class Explainer:
     @property
     def misfit(self) -> float:
         """What an obstacle at rest leaves of the first samples, by what noise would leave."""
-        return float(self._descended.chi2.min() / self.window(FIRST_S).data.size)
+        return float(self._descended.chi2.min() / self._first_samples.data.size)
 
     def explain(self, *, first: bool) -> Explained:
         """Explain the record by obstacles at rest and, unless it is the `first` time, by others."""
@@ -296,21 +296,26 @@ class Explainer:
         return best
 
     @cached_property
+    def _first_samples(self) -> Window:
+        """What candidates of the grid are compared with: nothing uncertain is known of by then."""
+        return Window.of(self.motion, self.quiet, self.end(FIRST_S))
+
+    @cached_property
     def starts(self) -> Real:
         """The likeliest candidates of the grid, after a second look."""
         coarse = Touching(self.tables.coarse, self.tables.x_m, self.motion)
-        window = Window.of(self.motion, self.quiet, self.end(FIRST_S))
         again = chi2_of(
-            lambda rows, window: coarse.predicted(rows, window)[0], window, self._gridded
+            lambda rows, window: coarse.predicted(rows, window)[0],
+            self._first_samples,
+            self._gridded,
         )
         return self._gridded[np.argsort(again)[:12]]
 
     @cached_property
     def _descended(self) -> Descended:
-        """Where they lead in coarse steps."""
+        """Where they lead, in longer steps."""
         predict = self.predicting(self.starts, first=True)
-        window = Window.of(self.motion, self.quiet, self.end(FIRST_S))
-        return descend(predict, window, self.starts, self.space(3), rounds=7)
+        return descend(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
     def _beside(self, starts: Real) -> Real:
         """Add starts beside the best ones near the tip, where the minima stand close together."""
@@ -437,6 +442,7 @@ class Explainer:
         return found
 
     def pairing(self) -> Pairing:
+        """Return what marches two obstacles on this record."""
         tables = self.tables
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
