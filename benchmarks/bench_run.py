@@ -15,7 +15,7 @@ from timing import least_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
-from rigd.engine import Cycle, TickScheduler, VirtualClock, make_watch
+from rigd.engine import Cycle, TickScheduler, VirtualClock, make_observers, make_watch
 from rigd.profile import load_profile
 
 RIGD = Path(sys.executable).with_name("rigd")
@@ -43,7 +43,9 @@ def cycle() -> Callable[[], None]:
     devices = open_devices(rig)
     devices.drive.enable()
     watch = make_watch(profile)
-    tick = Cycle(devices, rig.sensor.projection, controller, watch)
+    tick = Cycle(
+        devices, rig.sensor.projection, controller, watch, make_observers(profile, devices)
+    )
     metronome = TickScheduler(VirtualClock(), rig.rate_hz)
 
     def ticks() -> None:

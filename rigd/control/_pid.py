@@ -174,7 +174,6 @@ class PidController:
         "_half_ki_t",
         "_inverse_v0",
         "_kp",
-        "_limit_nm",
         "_lowpass_decay",
         "_lowpass_gain",
         "_pole_rad_s",
@@ -188,6 +187,7 @@ class PidController:
         "integral_nm",
         "proportional_nm",
         "saturated",
+        "torque_limit_nm",
         "unlimited_torque_nm",
     )
 
@@ -195,7 +195,7 @@ class PidController:
         self, gains: PidGains, settings: ControlSettings, rate_hz: float, torque_limit_nm: float
     ) -> None:
         period_s = 1.0 / rate_hz
-        self._limit_nm = torque_limit_nm
+        self.torque_limit_nm = torque_limit_nm
         self._kp = gains.kp_nm_per_rad
         self._b_p = gains.setpoint_weight_p
         self._b_d = gains.setpoint_weight_d
@@ -254,10 +254,10 @@ class PidController:
 
         unlimited = proportional + integral + derivative + feedforward + friction
         torque = unlimited
-        if unlimited > self._limit_nm:
-            torque = self._limit_nm
-        elif unlimited < -self._limit_nm:
-            torque = -self._limit_nm
+        if unlimited > self.torque_limit_nm:
+            torque = self.torque_limit_nm
+        elif unlimited < -self.torque_limit_nm:
+            torque = -self.torque_limit_nm
 
         self._error = error
         self._weighted_error = weighted_error

@@ -30,6 +30,7 @@ from ._simulator import unreachable_simulators as unreachable_simulators
 from ._wired_rig import reset_drive as reset_drive
 from .contracts import DeviceError as DeviceError
 from .contracts import Devices as Devices
+from .contracts import GaugeSensor as GaugeSensor
 from .contracts import LineHealth as LineHealth
 from .contracts import StatedDrive as StatedDrive
 from .contracts import Wrench as Wrench

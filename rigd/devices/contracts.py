@@ -171,6 +171,14 @@ class WrenchSensor(Protocol):
         """Release the line."""
 
 
+@runtime_checkable
+class GaugeSensor(Protocol):
+    """A sensor that shows its raw channels, so that a single one that fails is detected."""
+
+    gauges: tuple[int, ...]
+    """Raw counts of each gauge, as of the last wrench read."""
+
+
 @dataclass(frozen=True, slots=True)
 class Devices:
     """The devices of one rig."""

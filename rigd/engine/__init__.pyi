@@ -1,4 +1,5 @@
 from ._cycle import Cycle as Cycle
+from ._cycle import make_observers as make_observers
 from ._cycle import make_watch as make_watch
 from ._ipc import CONTROL as CONTROL
 from ._ipc import FIT as FIT

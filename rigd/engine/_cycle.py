@@ -9,7 +9,7 @@ may turn the motor, but nothing makes it jump.
 import json
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import exp, inf, isfinite
@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.control import PidController
-from rigd.devices import DeviceError, Devices, Wrench
+from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import runtime_folder
-from rigd.safety import LimitWatch, Violation
+from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, SensorWatch, Violation
 from rigd.session import WRENCH_FIELDS, Status
 
 REMEDY = (
@@ -143,6 +143,8 @@ class Cycle:
         Coupling torque about the motor's axis = projection · wrench.
     controller, watch
         Ready to step; the watch sees every reading before the controller does.
+    observers
+        Checks of the readings against physics and noise.
 
     Attributes
     ----------
@@ -165,6 +167,7 @@ class Cycle:
         projection: Wrench,
         controller: PidController,
         watch: LimitWatch,
+        observers: "Observers",
     ) -> None:
         self.devices = devices
         self._drive = devices.drive
@@ -172,6 +175,9 @@ class Cycle:
         self._projection = projection
         self.controller = controller
         self.watch = watch
+        self.encoder_watch = observers.encoder
+        self.sensor_watch = observers.sensor
+        self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None
         self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.zero_rad = 0.0
         self.angle_rad = 0.0
@@ -227,7 +233,14 @@ class Cycle:
             self.raw_wrench,
             angle_stale=bool(flags & _ANGLE_STALE),
         )
-        violation = violation or self.check_stale()
+        violation = violation or self.check_stale() or self.check_sensor()
+        encoder = self.encoder_watch
+        violation = violation or encoder.step(
+            self.angle_rad,
+            self.coupling_torque_nm,
+            self.torque_command_nm,
+            fresh=not flags & _UNUSABLE,
+        )
         if violation is not None:
             self._recent.append((self.angle_rad, 0.0, 0.0))
             self.torque_off()
@@ -244,6 +257,9 @@ class Cycle:
                 self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
                 return violation
             flags |= _TORQUE_SATURATED | _LIMIT_WARNING
+        if encoder.test_nm:
+            limit_nm = controller.torque_limit_nm
+            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder.test_nm))
         self._commanding = True
         sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
         self._torque_squares_nm2 += sent_nm * sent_nm
@@ -251,9 +267,24 @@ class Cycle:
         self.flags = flags
         return None
 
-    def forget_recent(self) -> None:
-        """Reset what `turns_against_torque` judges by."""
+    def start(self, noise_nm: float) -> None:
+        """Begin to control from rest at the angle last read.
+
+        Parameters
+        ----------
+        noise_nm
+            Standard deviation of the coupling torque at rest.
+        """
+        self.controller.reset(self.angle_rad)
+        self.watch.reset(self.angle_rad)
+        self.encoder_watch.reset(self.angle_rad, noise_nm)
         self._recent.clear()
+
+    def skip(self, missed: int) -> None:
+        """Go on after ticks that were missed, with the torque held."""
+        if missed:
+            self.watch.skip(missed)
+            self.encoder_watch.skip(missed, self.angle_rad)
 
     def turns_against_torque(
         self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
@@ -320,6 +351,13 @@ class Cycle:
         """
         if not self.flags & _ANGLE_STALE:
             standstill.check(self.angle_rad + self.zero_rad, due_ns)
+
+    def check_sensor(self) -> Violation | None:
+        """Check whether the sensor repeats its readings, after a tick's reading."""
+        if self.flags & _UNUSABLE & ~_ANGLE_STALE:
+            return None
+        gauges = self._gauges
+        return self.sensor_watch.step(self.raw_wrench if gauges is None else gauges.gauges)
 
     def check_stale(self) -> Violation | None:
         """Say whether a device has given nothing usable for too long, after a tick's reading."""
@@ -487,6 +525,47 @@ def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
     )
     watch.heat_nm2 = heat_nm2
     return watch
+
+
+@dataclass(frozen=True, slots=True)
+class Observers:
+    """Checks of the readings against physics and noise, for one profile and its devices."""
+
+    encoder: EncoderWatch
+    """Compares the encoder with the torques on the shaft."""
+    sensor: SensorWatch
+    """Compares each reading of the sensor with the one before."""
+
+
+def make_observers(profile: Profile, devices: Devices) -> Observers:
+    """Return the observers of a profile's rig.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    devices
+        Devices that are read.
+    """
+    rig = profile.rig
+    prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
+    encoder = EncoderWatch(
+        prediction,
+        rig.rate_hz,
+        resolution_rad=rig.encoder.resolution_rad,
+        inertia_kg_m2=rig.motor.inertia_kg_m2,
+        breakaway_nm=profile.standstill_torque_nm,
+        delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
+    )
+    simulation = rig.simulation
+    noisy = [True] * 6
+    if simulation is not None:
+        noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
+    channels: Sequence[str] = WRENCH_FIELDS
+    if isinstance(devices.sensor, GaugeSensor):
+        # Each gauge shows the noise of all axes.
+        channels, noisy = [f"gauge {number}" for number in range(6)], [all(noisy)] * 6
+    return Observers(encoder, SensorWatch(channels, noisy, rig.rate_hz))
 
 
 def remember_heat(profile: Profile, heat_nm2: float) -> None:

@@ -43,10 +43,17 @@ _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
 """Counts the time that this process has run: a stalled computer is not the supervisor's fault."""
 _OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
+_OF_ENCODER = tuple(
+    BY_NAME[name].channel
+    for name in ("encoder jump", "frozen encoder", "stopped encoder", "repeated angle")
+)
 _AGAINST_TORQUE = (
     "The shaft accelerates against the torque: angle and torque have opposite signs. "
     "Check the drive's polarity (object 607E), cia402.direction and the wiring of motor and "
     "encoder; a lower amplitude does not help."
+)
+_ENCODER_TESTED = (
+    "The beam pulled at a shaft that stood still, so the encoder was tested: it works."
 )
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
@@ -158,6 +165,7 @@ class SessionSequence:
         self._start_angle_rad = 0.0
         self._rest_spread_nm = 0.0
         self._recording = False
+        self._encoder_tests = 0
         self.counts = self._log.counts
         self.results: dict[str, str] = {}
         """Results for the record's outcome, in addition to the counts."""
@@ -195,6 +203,10 @@ class SessionSequence:
                 "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
                 "amplitude.",
             )
+        failed = self._cycle.sensor_watch.judge()
+        self._say_what_is_near()
+        if failed is not None:
+            raise SessionEnd("fault", str(failed))
         self._rest_spread_nm = rest.torque_spread_nm
         self._compare_with_tare_before(float(rest.torques_nm.mean()))
         self._cycle.tare = rest.mean
@@ -217,6 +229,7 @@ class SessionSequence:
         self._board[Word.PHASE] = Phase.TARING
         patience_s = settings.rest_timeout_s
         while True:
+            self._cycle.sensor_watch.learn()
             rest = self._rest(settings.tare_s)
             moving = self._what_moves(rest)
             if not moving:
@@ -253,9 +266,7 @@ class SessionSequence:
         self._standstill.forget()
         # The angle of the last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
-        self._cycle.controller.reset(self._start_angle_rad)
-        self._cycle.forget_recent()
-        self._cycle.watch.reset(self._start_angle_rad)
+        self._cycle.start(self._rest_spread_nm)
         for number in range(round(_SETTLE_S * self._rate_hz)):
             # Enabling, right before the first, takes its time.
             self._tick(self._start_angle_rad, excused=number == 0)
@@ -439,7 +450,7 @@ class SessionSequence:
     def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
         """Run one tick outside the record; missed ticks are not counted there, but limited."""
         missed = self._metronome.wait()
-        self._cycle.watch.skip(missed)
+        self._cycle.skip(missed)
         if missed > self._profile.limits.missed_ticks_in_a_row and not excused:
             raise SessionEnd(
                 "fault",
@@ -466,8 +477,8 @@ class SessionSequence:
         if violation.channel in _OF_MOTION and self._turns_against_torque():
             violation = replace(violation, remedy=_AGAINST_TORQUE)
         # The zero is void then, and with it the limits of every further session.
-        slipped = violation.channel == BY_NAME["encoder jump"].channel
-        return SessionEnd("fault", str(violation), device_failed=slipped)
+        failed = violation.channel in _OF_ENCODER
+        return SessionEnd("fault", str(violation), device_failed=failed)
 
     def _turns_against_torque(self) -> bool:
         rig = self._profile.rig
@@ -497,13 +508,14 @@ class SessionSequence:
     def _check_reading(self) -> None:
         self._switch_off_if_stopped()
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
-        silent = self._cycle.check_stale()
-        if silent is not None:
-            raise SessionEnd("fault", str(silent))
+        failed = self._cycle.check_stale() or self._cycle.check_sensor()
+        if failed is not None:
+            raise SessionEnd("fault", str(failed))
 
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
             return None
+        self._cycle.encoder_watch.skip(missed, self._cycle.angle_rad)
         reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
         return None if reason is None else SessionEnd("fault", str(reason))
 
@@ -596,8 +608,15 @@ class SessionSequence:
                 self._say("warning", doubt)
 
     def _say_what_is_near(self) -> None:
-        for notice in self._cycle.watch.take_notices():
+        cycle = self._cycle
+        for notice in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
             self._say("warning", notice)
+        tests = cycle.encoder_watch.tests
+        if tests > self._encoder_tests:
+            self.results["encoder_tests"] = str(tests)
+            if not self._encoder_tests:
+                self._say("info", _ENCODER_TESTED)
+            self._encoder_tests = tests
 
     def _say(self, level: Level, message: str) -> None:
         # What comes before tick 0 has no time in the file yet.

@@ -16,6 +16,7 @@ from rigd.engine._cycle import (
     Cycle,
     Rest,
     Standstill,
+    make_observers,
     make_watch,
     observe_rest,
     recalled_heat_nm2,
@@ -345,7 +346,11 @@ class _ControlServer:
 
     def _tare(self) -> dict[str, object]:
         """Average the sensor; each session does so for itself, this is for the operator's eyes."""
+        self._cycle.sensor_watch.learn()
         rest = self._rest(self._profile.session.tare_s)
+        failed = self._cycle.sensor_watch.judge()
+        if failed is not None:
+            raise SessionEnd("fault", str(failed))
         self._cycle.tare = rest.mean
         self._watch.tared_nm = float(rest.torques_nm.mean())
         return {
@@ -397,9 +402,9 @@ class _ControlServer:
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
-        silent = self._cycle.check_stale()
-        if silent is not None:
-            raise SessionEnd("fault", str(silent))
+        failed = self._cycle.check_stale() or self._cycle.check_sensor()
+        if failed is not None:
+            raise SessionEnd("fault", str(failed))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         rig = profile.rig
@@ -408,6 +413,7 @@ class _ControlServer:
             rig.sensor.projection,
             _controller(profile),
             self._watch,
+            make_observers(profile, self._devices),
         )
         cycle.zero_rad = self._zero_rad
         return cycle

@@ -209,6 +209,12 @@ class Specimen:
     """Whatever else is to be known of it."""
 
 
+_BREAKAWAY = 5.0
+"""Breakaway torque over the Coulomb friction stated: a cold gear has several times its friction."""
+_LEAST_BREAKAWAY = 0.05
+"""The least of it, as a fraction of the peak torque."""
+
+
 @dataclass(frozen=True, slots=True)
 class Profile:
     """One rig, as its profile describes it."""
@@ -243,6 +249,14 @@ class Profile:
     """Specimen that is mounted, where a file describes it: the rig's beam is its own then."""
     specimen_in_words: str = ""
     """The same for the operator, with what is otherwise than the profile has it."""
+
+    @property
+    def standstill_torque_nm(self) -> float:
+        """Net torque that no friction of the shaft withstands."""
+        motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
+        return stated_nm or max(
+            _BREAKAWAY * motor.coulomb_nm, _LEAST_BREAKAWAY * motor.peak_torque_nm
+        )
 
     @property
     def control_motor(self) -> Motor:

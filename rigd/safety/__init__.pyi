@@ -1,3 +1,5 @@
+from ._beam_prediction import BeamPrediction as BeamPrediction
+from ._encoder_watch import EncoderWatch as EncoderWatch
 from ._limits import BUFFERED_S as BUFFERED_S
 from ._limits import BY_NAME as BY_NAME
 from ._limits import INTERLOCKS as INTERLOCKS
@@ -9,3 +11,4 @@ from ._limits import Limits as Limits
 from ._limits import Violation as Violation
 from ._monitor import LOOK_EVERY as LOOK_EVERY
 from ._monitor import LimitWatch as LimitWatch
+from ._sensor_watch import SensorWatch as SensorWatch

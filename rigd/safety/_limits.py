@@ -57,6 +57,9 @@ class Limits:
     """Time by which the recorder may be behind the loop, less than shared memory holds."""
     disk_free_mb: Positive
     """Free space of the disk that the session goes to, below which it ends; 1 MB is 10⁶ bytes."""
+    standstill_torque_nm: Annotated[float, Ge(0)] = field(default=0.0, metadata={"optional": True})
+    """Net torque on the shaft, motor less coupling torque, that friction never withstands: an
+    encoder that stands still has failed. 0: five times ``motor.coulomb_nm``."""
     stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
     """Share of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as for
     `missed_percent`. ``analyze`` takes no record with more than 1 %."""
@@ -174,6 +177,15 @@ class Interlock:
 OVERLOADED: Final = "The computer is overloaded: close other programs."
 """Said of whatever came of a computer that was too busy."""
 
+_ENCODER_FAILED: Final = (
+    "The encoder does not follow the shaft: check the encoder, its cable and its coupling to the "
+    "shaft, then reset the rig and set the zero again."
+)
+
+_SENSOR_FAILED: Final = (
+    "Readings of a working sensor differ by their noise: check the sensor, its cable and its box."
+)
+
 INTERLOCKS: Final = (
     Interlock(
         "angle",
@@ -218,6 +230,36 @@ INTERLOCKS: Final = (
         Action.FAULT,
         "Implausible motion: check the encoder, its cable and shield, and set the zero again.",
         follows_missed_ticks=True,
+    ),
+    Interlock(
+        "frozen encoder",
+        "net torque while the encoder stands still",
+        "N·m",
+        "limits.standstill_torque_nm",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _ENCODER_FAILED,
+    ),
+    Interlock(
+        "stopped encoder",
+        "torque that the sudden stop of the encoder would have taken",
+        "N·m",
+        "limits.standstill_torque_nm",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _ENCODER_FAILED,
+    ),
+    Interlock(
+        "repeated angle",
+        "number of encoder readings that repeat the one before while the shaft moves",
+        "in 32 ticks",
+        "",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _ENCODER_FAILED,
     ),
     Interlock(
         "torque command",
@@ -270,6 +312,36 @@ INTERLOCKS: Final = (
         Checked.REST,
         Action.FAULT,
         "Check that nothing leans on the beam and let the sensor warm up.",
+    ),
+    Interlock(
+        "frozen sensor",
+        "run of identical readings of all sensor channels",
+        "ticks",
+        "",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _SENSOR_FAILED,
+    ),
+    Interlock(
+        "frozen channel",
+        "run of identical readings of the sensor's {channel}",
+        "ticks",
+        "",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _SENSOR_FAILED,
+    ),
+    Interlock(
+        "repeated wrench",
+        "percentage of readings of the sensor's {channel} that repeat the one before",
+        "%",
+        "",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        _SENSOR_FAILED,
     ),
     Interlock(
         "stale angle",

@@ -12,7 +12,7 @@ from cases import further
 from rigd.control import PidController, design_pid
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine._cycle import Cycle, make_watch
+from rigd.engine._cycle import Cycle, make_observers, make_watch
 from rigd.identification._estimate import Timing, Window, estimate_motor
 from rigd.identification._experiments import (
     TOP_HZ,
@@ -81,11 +81,13 @@ def record(profile, true_rig, scale, excitation):
     devices = open_devices(true_rig)
     rig, motor = profile.rig, profile.control_motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
+    scaled = Devices(ScaledDrive(devices.drive, scale), devices.sensor, simulated=True)
     cycle = Cycle(
-        Devices(ScaledDrive(devices.drive, scale), devices.sensor, simulated=True),
+        scaled,
         rig.sensor.projection,
         PidController(gains, profile.control, rig.rate_hz, motor.peak_torque_nm),
         make_watch(profile),
+        make_observers(profile, scaled),
     )
     due = range(0, 10**12, round(1e9 / rig.rate_hz)).__iter__()
     wrenches = []
@@ -94,7 +96,7 @@ def record(profile, true_rig, scale, excitation):
         wrenches.append(cycle.raw_wrench)
     cycle.tare = tuple(np.mean(wrenches, axis=0))
     devices.drive.enable()
-    cycle.controller.reset(cycle.angle_rad)
+    cycle.start(5e-3)
     rows = []
     for reference_rad in (cycle.angle_rad + excitation.reference_rad).tolist():
         violation = cycle.step(next(due), reference_rad)

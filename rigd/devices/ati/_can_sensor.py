@@ -99,6 +99,7 @@ class AtiCanSensor:
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
+        self.gauges: tuple[int, ...] = (0,) * 6
         self.wrench_time_ns = 0
         self.late_replies = 0
         self.bus_errors = 0
@@ -285,6 +286,7 @@ class AtiCanSensor:
         self.wrench_saturated = (
             max(g0, g2, g4, g1, g3, g5) >= limit or min(g0, g2, g4, g1, g3, g5) <= -limit
         )
+        self.gauges = g0, g1, g2, g3, g4, g5
         self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
         return wrench
 

@@ -102,6 +102,7 @@ class AtiSerialSensor:
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
+        self.gauges: tuple[int, ...] = (0,) * 6
         self.wrench_time_ns = 0
 
     def connect(self) -> None:
@@ -191,6 +192,7 @@ class AtiSerialSensor:
         if self.wrench_stale:
             return self._wrench
         gauges = self._unpack(new)
+        self.gauges = gauges[-6:]
         self.wrench_saturated = max(gauges) >= self._limit or min(gauges) <= -self._limit
         return self._filter()
 

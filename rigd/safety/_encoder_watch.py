@@ -1,0 +1,344 @@
+"""Encoder watch: detects an encoder that has failed while its messages stay fresh.
+
+A frozen encoder shows the angle of a shaft that stands still, and a controller that believes it
+turns the motor without limit. Three observations distinguish the two:
+
+* *Momentum.* A moving shaft does not stop within two ticks: torques and friction would have to
+  supply an impulse of ``J v``.
+* *Net torque.* Motor torque less coupling torque, ``n = u - Γ``, turns the shaft as soon as it
+  exceeds the breakaway torque. It needs no model of the beam, but friction limits it.
+* *Coupling torque.* A beam that pulls at a shaft which seems to stand still, beyond what it does by
+  its own vibration, is driven by a shaft that moves, or is touched. This needs no knowledge of the
+  friction, but does not tell the two apart. So it only asks for a *test of the encoder*: the torque
+  of the motor is ramped until the encoder moves by two steps and so answers, or until the net
+  torque exceeds the breakaway torque, which is a fault.
+
+An encoder that repeats readings, every second one for example, shows single ticks without movement
+in a steady motion.
+"""
+
+from collections import deque
+from math import copysign, inf, sqrt
+
+from rigd.safety._beam_prediction import BeamPrediction
+from rigd.safety._limits import BY_NAME, Violation
+
+_WINDOWS_S = 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
+"""Durations over which torques are averaged: short ones within half a period of whatever the
+excitation contains, long ones in which noise averages out."""
+_STANDSTILL_S = 0.016
+"""Time without an encoder step after which the coupling torque is compared."""
+_SIGNIFICANT = 5.0
+"""Standard deviations of the mean of the noise above which the beam pulls."""
+_MODEL_ERROR = 0.5
+"""Part of the coupling torque's rms that the prediction may miss, for beams differ from their
+model. It vibrates: of a mean over more than half a period of the first mode, less is allowed."""
+_VIBRATION_S = 0.25
+"""Time constant of that rms."""
+_RAMP_S = 0.02
+"""Time in which the torque of a test grows by the breakaway torque."""
+_RAMP_LIMIT = 4.0
+"""Torque at which a test ends, in breakaway torques."""
+_ANSWER_STEPS = 1.5
+"""Encoder steps above which a movement answers a test."""
+_PAUSE_S = 0.5
+"""Time after an answer in which no other test is made."""
+_TORQUE_ERROR = 0.25
+"""Relative error of the motor's torque that is no fault."""
+_MOMENTUM = 0.5
+"""Part of the shaft's momentum that has to be accounted for: inertias are known to a quarter."""
+_STOP_TICKS = 2
+_SPEED_TICKS = 4
+_STOP_STEPS = 4.0
+"""Speed, in encoder steps a tick over `_SPEED_TICKS`, from which on a stop is examined."""
+_MOST_REPEATS = 6
+_REPEAT_TICKS = 32
+_REPEAT_STEPS = 3.5
+"""Encoder steps that a reading moves at least before and after one that it repeats."""
+
+
+class EncoderWatch:
+    """Compares the encoder with the torques on the shaft, in every tick with torque.
+
+    Parameters
+    ----------
+    prediction
+        Coupling torque of the beam at the measured angle; None: the rig has no beam.
+    rate_hz
+        Ticks a second.
+    resolution_rad
+        Resolution of the encoder.
+    inertia_kg_m2
+        Inertia of the motor.
+    breakaway_nm
+        Net torque that no friction of the shaft withstands.
+    delay_ticks
+        Ticks from a command to its torque.
+
+    Attributes
+    ----------
+    test_nm
+        Torque to add to the next command, for a test of the encoder.
+    tests
+        Number of tests that the encoder has answered.
+    """
+
+    __slots__ = (
+        "_angles",
+        "_breakaway_nm",
+        "_count",
+        "_coupling_nm2",
+        "_decay",
+        "_errors",
+        "_inertia_kg_m2",
+        "_long",
+        "_noise_nm",
+        "_pause",
+        "_pending",
+        "_prediction",
+        "_rate_hz",
+        "_repeats",
+        "_resolution_rad",
+        "_standing",
+        "_standstill",
+        "_test_start_rad",
+        "_test_step_nm",
+        "_torques",
+        "_uneven",
+        "_windows",
+        "test_nm",
+        "tests",
+    )
+
+    def __init__(
+        self,
+        prediction: BeamPrediction | None,
+        rate_hz: float,
+        *,
+        resolution_rad: float,
+        inertia_kg_m2: float,
+        breakaway_nm: float,
+        delay_ticks: int,
+    ) -> None:
+        self._prediction = prediction
+        self._rate_hz = rate_hz
+        self._resolution_rad = resolution_rad
+        self._inertia_kg_m2 = inertia_kg_m2
+        self._breakaway_nm = breakaway_nm
+        self._windows = tuple(max(_STOP_TICKS + 1, round(w * rate_hz)) for w in _WINDOWS_S)
+        self._standstill = max(self._windows[0], round(_STANDSTILL_S * rate_hz))
+        # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
+        self._long = inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
+        self._decay = 1.0 / (_VIBRATION_S * rate_hz)
+        longest = self._windows[-1] + 1
+        # Cumulative sums, of which two give the mean over a window.
+        self._torques: deque[tuple[float, float]] = deque(maxlen=longest)
+        self._errors: deque[float] = deque(maxlen=longest)
+        self._angles: deque[float] = deque(maxlen=_SPEED_TICKS + _STOP_TICKS + 1)
+        self._repeats: deque[int] = deque(maxlen=_MOST_REPEATS)
+        self._pending: deque[float] = deque(maxlen=delay_ticks)
+        self.reset(0.0, 0.0)
+
+    def reset(self, angle_rad: float, noise_nm: float) -> None:
+        """Start from rest.
+
+        Parameters
+        ----------
+        angle_rad
+            Angle of the shaft.
+        noise_nm
+            Standard deviation of a reading of the coupling torque.
+        """
+        if self._prediction is not None:
+            self._prediction.reset(angle_rad)
+        self._noise_nm = noise_nm
+        for history in (self._torques, self._errors, self._angles, self._repeats, self._pending):
+            history.clear()
+        self._torques.append((0.0, 0.0))
+        self._errors.append(0.0)
+        self._angles.append(angle_rad)
+        self._pending.extend([0.0] * (self._pending.maxlen or 0))
+        self._coupling_nm2 = 0.0
+        self._standing = self._count = self._pause = 0
+        self._uneven = 0
+        self.tests = 0
+        self._end_test()
+
+    def step(
+        self, angle_rad: float, coupling_nm: float, sent_nm: float, *, fresh: bool = True
+    ) -> Violation | None:
+        """Compare the readings of a tick.
+
+        Parameters
+        ----------
+        angle_rad, coupling_nm
+            Angle and coupling torque.
+        sent_nm
+            Torque that was commanded in the tick before.
+        fresh
+            Whether both readings are of this tick.
+
+        Returns
+        -------
+        Violation or None
+            What shows that the encoder has failed; `test_nm` is then to be ignored.
+        """
+        prediction = self._prediction
+        pending = self._pending
+        pending.append(sent_nm)
+        motor_nm = pending[0]
+        if not fresh:
+            self.skip(1, angle_rad)
+            return None
+        error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
+        net, motor = self._torques[-1]
+        self._torques.append((net + motor_nm - coupling_nm, motor + motor_nm))
+        self._errors.append(self._errors[-1] + error_nm)
+        self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
+        self._count += 1
+        angles = self._angles
+        standing = self._standing
+        moved_rad = angle_rad - angles[-1]
+        angles.append(angle_rad)
+        if self._uneven:
+            self._uneven -= 1
+        if moved_rad:
+            self._standing = 0
+            if standing == 1 and not self._uneven:
+                return self._check_repeats(moved_rad)
+            if self._test_step_nm:
+                answer_rad = _ANSWER_STEPS * self._resolution_rad
+                if abs(angle_rad - self._test_start_rad) > answer_rad:
+                    self._end_test()
+                    self.tests += 1
+                    self._pause = self._count + round(_PAUSE_S * self._rate_hz)
+                    return None
+        else:
+            self._standing = standing = standing + 1
+            if standing == _STOP_TICKS and not self._uneven:
+                violation = self._check_momentum()
+                if violation is not None:
+                    return violation
+            if standing >= self._windows[0]:
+                violation = self._check_net_torque(standing)
+                if violation is not None:
+                    return violation
+                if (
+                    standing >= self._standstill
+                    and not self._test_step_nm
+                    and self._count >= self._pause
+                ):
+                    self._compare_coupling_torque(standing)
+        if self._test_step_nm:
+            self.test_nm += self._test_step_nm
+            limit_nm = _RAMP_LIMIT * self._breakaway_nm
+            if abs(self.test_nm) > limit_nm:
+                return _violation("frozen encoder", self.test_nm, limit_nm)
+        return None
+
+    def skip(self, ticks: int, angle_rad: float) -> None:
+        """Go on by some ticks that were missed, or whose readings are old; the torque was held.
+
+        Parameters
+        ----------
+        ticks
+            Number of these ticks.
+        angle_rad
+            Last angle that was read.
+        """
+        net, motor = self._torques[-1]
+        error = self._errors[-1]
+        for _ in range(ticks):
+            if self._prediction is not None:
+                self._prediction.skip(angle_rad)
+            self._torques.append((net, motor))
+            self._errors.append(error)
+        self._standing = 0
+        self._uneven = self._angles.maxlen or 0
+
+    def _check_momentum(self) -> Violation | None:
+        """Check a stop within `_STOP_TICKS` against the impulse that it takes."""
+        angles = self._angles
+        if len(angles) < (angles.maxlen or 0):
+            return None
+        moved_rad = angles[_SPEED_TICKS] - angles[0]
+        if abs(moved_rad) < _STOP_STEPS * _SPEED_TICKS * self._resolution_rad or not moved_rad:
+            return None
+        ticks = min(_SPEED_TICKS + _STOP_TICKS, len(self._torques) - 1)
+        net, motor = self._over(ticks)
+        per_tick_nm = _MOMENTUM * self._inertia_kg_m2 * abs(moved_rad) / _SPEED_TICKS
+        needed_nm = per_tick_nm * self._rate_hz**2 / _STOP_TICKS
+        braking_nm = max(0.0, -net if moved_rad > 0 else net)
+        allowed_nm = (
+            self._breakaway_nm
+            + ((1.0 + _TORQUE_ERROR) * braking_nm + _TORQUE_ERROR * abs(motor)) / _STOP_TICKS
+        )
+        if needed_nm <= allowed_nm:
+            return None
+        return _violation("stopped encoder", needed_nm, allowed_nm)
+
+    def _check_net_torque(self, standing: int) -> Violation | None:
+        """Check the net torque on a shaft that seems to stand still."""
+        rate_hz = self._rate_hz
+        for ticks in self._windows:
+            if ticks > standing:
+                break
+            net, motor = self._over(ticks)
+            net_nm, coupling_nm = net / ticks, (motor - net) / ticks
+            # Within a step the shaft may turn round: `8 step/T²` at the most.
+            turn_nm = self._inertia_kg_m2 * 8.0 * self._resolution_rad * (rate_hz / ticks) ** 2
+            limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
+            if abs(net_nm) > limit_nm:
+                return _violation("frozen encoder", net_nm, limit_nm)
+        return None
+
+    def _compare_coupling_torque(self, standing: int) -> None:
+        """Begin a test of the encoder if the beam pulls at a shaft that seems to stand still."""
+        noise_nm = self._noise_nm
+        vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
+        missed_nm = _MODEL_ERROR * vibration_nm
+        errors = self._errors
+        for ticks in self._windows:
+            if ticks > standing or ticks >= len(errors):
+                return
+            error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
+            level_nm = max(
+                _SIGNIFICANT * noise_nm / sqrt(ticks), missed_nm * min(1.0, self._long / ticks)
+            )
+            if abs(error_nm) > level_nm:
+                # Against the pull, for a shaft that runs away is then braked; or the shorter way.
+                net_nm = self._over(ticks)[0] / ticks
+                shorter = abs(net_nm) > 0.5 * self._breakaway_nm
+                ramp_nm = self._breakaway_nm / (_RAMP_S * self._rate_hz)
+                self._test_step_nm = copysign(ramp_nm, net_nm if shorter else -error_nm)
+                self._test_start_rad = self._angles[-1]
+                return
+
+    def _check_repeats(self, moved_rad: float) -> Violation | None:
+        """Check a tick without movement between two in which the shaft moved the same way."""
+        angles = self._angles
+        if len(angles) < _SPEED_TICKS:
+            return None
+        before_rad = angles[-3] - angles[-4]
+        least_rad = _REPEAT_STEPS * self._resolution_rad
+        if moved_rad * before_rad <= 0.0 or min(abs(moved_rad), abs(before_rad)) < least_rad:
+            return None
+        repeats = self._repeats
+        repeats.append(self._count)
+        if len(repeats) < _MOST_REPEATS or self._count - repeats[0] >= _REPEAT_TICKS:
+            return None
+        return _violation("repeated angle", len(repeats), _MOST_REPEATS - 1)
+
+    def _over(self, ticks: int) -> tuple[float, float]:
+        """Return the sums of net torque and motor torque over the last ticks."""
+        net, motor = self._torques[-1]
+        net_before, motor_before = self._torques[-1 - ticks]
+        return net - net_before, motor - motor_before
+
+    def _end_test(self) -> None:
+        self.test_nm = self._test_step_nm = 0.0
+
+
+def _violation(name: str, value: float, limit: float) -> Violation:
+    row = BY_NAME[name]
+    return Violation(row.channel, value, limit, row.unit, row.remedy, row.limit)

@@ -1,0 +1,172 @@
+"""Sensor watch: detects a force-torque sensor, or a channel of it, that repeats its readings.
+
+Every reading of a working sensor contains noise, so that readings rarely repeat. How rarely depends
+on noise and resolution, and is measured at the tare, for each channel. Afterwards a run of
+identical readings that this makes next to impossible is a fault: of all channels together (a frozen
+sensor) or of one (a broken gauge, or one clipped at a plausible value).
+"""
+
+from collections.abc import Sequence
+from math import ceil, log
+from operator import eq
+
+from rigd.safety._limits import BY_NAME, Violation
+
+_FROZEN_S = 0.02
+_FROZEN_READINGS = 3
+"""Duration and number of identical readings that are a fault at the earliest."""
+_CHANNEL_FACTOR = 2.5
+"""A single channel is warned of at its limit, and is a fault after this many times as long."""
+_CHANCE = 1e-12
+"""Probability of a run of repeated readings that is taken for impossible."""
+_QUIET = 0.98
+"""Fraction of repeated readings at the tare above which repetitions mean nothing."""
+_RARE = 0.2
+"""Fraction of repeated readings at the tare up to which single repetitions are counted."""
+_OFTEN = 0.3
+"""Fraction of repeated readings over `_COUNTED` ticks above which the sensor repeats them."""
+_COUNTED = 64
+_LEARNED = 100
+"""Readings at the tare from which on the fractions are known."""
+
+
+class SensorWatch:
+    """Compares each reading of the sensor with the one before.
+
+    Parameters
+    ----------
+    channels
+        Names of the channels, as messages have them.
+    noisy
+        Whether each channel has noise at all; a simulated one may have none.
+    rate_hz
+        Ticks a second.
+    """
+
+    __slots__ = (
+        "_before",
+        "_channels",
+        "_counted",
+        "_learned",
+        "_limits",
+        "_noisy",
+        "_notices",
+        "_rare",
+        "_rate_hz",
+        "_repeated",
+        "_running",
+        "_runs",
+        "_warned",
+    )
+
+    def __init__(self, channels: Sequence[str], noisy: Sequence[bool], rate_hz: float) -> None:
+        self._channels = (*channels, "")
+        self._noisy = (*noisy, all(noisy))
+        self._rate_hz = rate_hz
+        self._notices: list[str] = []
+        self.learn()
+
+    def learn(self) -> None:
+        """Start over: the next readings, at rest, show how often a reading repeats."""
+        n = len(self._channels)
+        self._before: tuple[float, ...] = ()
+        self._learned = self._counted = 0
+        # Of each channel, and last of all together.
+        self._repeated = [0] * n
+        self._runs = [0] * n
+        self._running = False
+        self._limits: list[int] | None = None
+        self._rare = [False] * n
+        self._warned: set[str] = set()
+
+    def judge(self) -> Violation | None:
+        """End learning: derive the limits of the runs, and check the readings at rest."""
+        n = max(1, self._learned)
+        if n < _LEARNED:
+            return None
+        shares = [repeated / n for repeated in self._repeated]
+        least = max(_FROZEN_READINGS, ceil(_FROZEN_S * self._rate_hz))
+        never = 2**62
+        self._limits = []
+        for share, noisy in zip(shares, self._noisy, strict=True):
+            if not noisy or share > _QUIET:
+                self._limits.append(never)
+            else:
+                chance = max(share, 1.0 / n)
+                self._limits.append(max(least, ceil(log(_CHANCE) / log(chance))))
+        self._rare = [
+            share <= _RARE and noisy for share, noisy in zip(shares, self._noisy, strict=True)
+        ]
+        self._repeated = [0] * len(shares)
+        self._counted = 0
+        if self._noisy[-1] and shares[-1] > _QUIET:
+            return _violation("frozen sensor", "", self._runs[-1], least)
+        for channel, share, noisy in zip(self._channels[:-1], shares, self._noisy, strict=False):
+            if noisy and share > _QUIET:
+                self._notices.append(
+                    f"The sensor's {channel} shows no noise at rest: a broken gauge or cable is "
+                    "not detected there. Check the sensor."
+                )
+        return None
+
+    def step(self, reading: tuple[float, ...]) -> Violation | None:
+        """Compare a fresh reading with the one before."""
+        before, self._before = self._before, reading
+        if not before:
+            return None
+        self._learned += 1
+        if self._running or any(map(eq, reading, before)):
+            runs, repeated = self._runs, self._repeated
+            same = [*map(eq, reading, before), reading == before]
+            for number, repeats in enumerate(same):
+                if repeats:
+                    runs[number] += 1
+                    repeated[number] += 1
+                else:
+                    runs[number] = 0
+            self._running = any(same)
+        elif self._limits is None or self._counted + 1 < _COUNTED:
+            self._counted += 1
+            return None
+        return None if self._limits is None else self._check()
+
+    def _check(self) -> Violation | None:
+        runs, limits = self._runs, self._limits
+        assert limits is not None
+        if runs[-1] >= limits[-1]:
+            return _violation("frozen sensor", "", runs[-1], limits[-1])
+        self._counted += 1
+        if self._counted >= _COUNTED:
+            repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
+            for channel, count, rare in zip(
+                reversed(self._channels), reversed(repeated), reversed(self._rare), strict=True
+            ):
+                if rare and count > _OFTEN * _COUNTED:
+                    return _violation(
+                        "repeated wrench", channel, 100.0 * count / _COUNTED, 100.0 * _OFTEN
+                    )
+        if max(runs) < min(limits):
+            return None
+        for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):
+            if run < limit:
+                continue
+            if run >= _CHANNEL_FACTOR * limit:
+                return _violation("frozen channel", channel, run, _CHANNEL_FACTOR * limit)
+            if channel not in self._warned:
+                self._warned.add(channel)
+                self._notices.append(
+                    f"The sensor's {channel} has not changed for {run} ticks. "
+                    f"{BY_NAME['frozen channel'].remedy}"
+                )
+        return None
+
+    def take_notices(self) -> list[str]:
+        """Return the warnings since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+
+def _violation(name: str, channel: str, value: float, limit: float) -> Violation:
+    row = BY_NAME[name]
+    what = row.channel.format(channel=channel or "whole wrench")
+    return Violation(what, value, limit, row.unit, row.remedy, row.limit)
