@@ -23,13 +23,15 @@ from math import copysign, inf, sqrt
 from rigd.safety._beam_prediction import BeamPrediction
 from rigd.safety._limits import BY_NAME, Violation
 
-_WINDOWS_S = 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
+_WINDOWS_S = 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
 """Durations over which torques are averaged: short ones within half a period of whatever the
 excitation contains, long ones in which noise averages out."""
 _STANDSTILL_S = 0.016
 """Time without an encoder step after which the coupling torque is compared."""
 _SIGNIFICANT = 5.0
 """Standard deviations of the mean of the noise above which the beam pulls."""
+_LEAST_PULL = 0.005
+"""The same for a sensor without noise, as a fraction of the breakaway torque."""
 _MODEL_ERROR = 0.5
 """Part of the coupling torque's rms that the prediction may miss, for beams differ from their
 model. It vibrates: of a mean over more than half a period of the first mode, less is allowed."""
@@ -298,12 +300,14 @@ class EncoderWatch:
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
         missed_nm = _MODEL_ERROR * vibration_nm
         errors = self._errors
-        for ticks in self._windows:
+        for ticks in self._windows[1:]:
             if ticks > standing or ticks >= len(errors):
                 return
             error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
             level_nm = max(
-                _SIGNIFICANT * noise_nm / sqrt(ticks), missed_nm * min(1.0, self._long / ticks)
+                _LEAST_PULL * self._breakaway_nm,
+                _SIGNIFICANT * noise_nm / sqrt(ticks),
+                missed_nm * min(1.0, self._long / ticks),
             )
             if abs(error_nm) > level_nm:
                 # Against the pull, for a shaft that runs away is then braked; or the shorter way.

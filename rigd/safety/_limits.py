@@ -178,8 +178,8 @@ OVERLOADED: Final = "The computer is overloaded: close other programs."
 """Said of whatever came of a computer that was too busy."""
 
 _ENCODER_FAILED: Final = (
-    "The encoder does not follow the shaft: check the encoder, its cable and its coupling to the "
-    "shaft, then reset the rig and set the zero again."
+    "The encoder does not follow the torque: check the encoder, its cable and its coupling to the "
+    "shaft, and that nothing blocks the shaft; then reset the rig and set the zero again."
 )
 
 _SENSOR_FAILED: Final = (

@@ -15,7 +15,7 @@ from rigd.safety._limits import BY_NAME, Violation
 _FROZEN_S = 0.02
 _FROZEN_READINGS = 3
 """Duration and number of identical readings that are a fault at the earliest."""
-_CHANNEL_FACTOR = 2.5
+_CHANNEL_FACTOR = 3
 """A single channel is warned of at its limit, and is a fault after this many times as long."""
 _CHANCE = 1e-12
 """Probability of a run of repeated readings that is taken for impossible."""
@@ -85,7 +85,7 @@ class SensorWatch:
         if n < _LEARNED:
             return None
         shares = [repeated / n for repeated in self._repeated]
-        least = max(_FROZEN_READINGS, ceil(_FROZEN_S * self._rate_hz))
+        least = max(_FROZEN_READINGS, ceil(_FROZEN_S * self._rate_hz)) - 1
         never = 2**62
         self._limits = []
         for share, noisy in zip(shares, self._noisy, strict=True):
@@ -133,24 +133,27 @@ class SensorWatch:
     def _check(self) -> Violation | None:
         runs, limits = self._runs, self._limits
         assert limits is not None
-        if runs[-1] >= limits[-1]:
+        if runs[-1] > limits[-1]:
             return _violation("frozen sensor", "", runs[-1], limits[-1])
         self._counted += 1
         if self._counted >= _COUNTED:
             repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
-            for channel, count, rare in zip(
-                reversed(self._channels), reversed(repeated), reversed(self._rare), strict=True
-            ):
-                if rare and count > _OFTEN * _COUNTED:
+            # All together first, last in each list. What is frozen altogether is named as such.
+            for number in reversed(range(len(runs))):
+                count = repeated[number]
+                if not self._rare[number] or runs[number] > limits[number]:
+                    continue
+                if count > _OFTEN * _COUNTED:
+                    channel = self._channels[number]
                     return _violation(
                         "repeated wrench", channel, 100.0 * count / _COUNTED, 100.0 * _OFTEN
                     )
-        if max(runs) < min(limits):
+        if max(runs) <= min(limits):
             return None
         for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):
-            if run < limit:
+            if run <= limit:
                 continue
-            if run >= _CHANNEL_FACTOR * limit:
+            if run > _CHANNEL_FACTOR * limit:
                 return _violation("frozen channel", channel, run, _CHANNEL_FACTOR * limit)
             if channel not in self._warned:
                 self._warned.add(channel)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import chain
 from math import sin, tau
 from operator import mul
-from typing import IO
+from typing import IO, TypeVar, cast
 
 import numpy as np
 
@@ -23,10 +23,36 @@ from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wir
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
 
+T = TypeVar("T")
+
 _NAME = "Simulated drive"
 _MOST_MET = 4
 _NOISE_BLOCK = 128
 """Readings drawn at a time, 50 µs of work in one tick; thousands would take a whole period."""
+
+
+class Stuck:
+    """Readings that repeat the one before although their messages are new.
+
+    Parameters
+    ----------
+    every
+        Of so many readings in a row one is new; 0: none is.
+    """
+
+    __slots__ = ("_count", "_every", "_value")
+
+    def __init__(self, every: int = 0) -> None:
+        self._every = every
+        self._count = 0
+        self._value: object = None
+
+    def __call__(self, value: T) -> T:
+        """Return what is shown in place of a reading."""
+        if self._count == 0 or (self._every and self._count % self._every == 0):
+            self._value = value
+        self._count += 1
+        return cast("T", self._value)
 
 
 def open_simulated_rig(rig: RigParameters) -> Devices:
@@ -54,6 +80,8 @@ class SimulatedRig:
         Plant, and the sensor that measures it.
     records_per_period : int
         Readings of the sensor in one period.
+    stuck_encoder : Stuck or None
+        What an encoder shows that has failed; None: it works.
     """
 
     def __init__(self, rig: RigParameters) -> None:
@@ -79,6 +107,7 @@ class SimulatedRig:
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
         self._resolution_rad = rig.encoder.resolution_rad
+        self.stuck_encoder: Stuck | None = None
 
     def advance(self, n_periods: int) -> None:
         """Move on by whole periods, the torque held."""
@@ -179,7 +208,9 @@ class SimulatedRig:
         """Return the angle in whole encoder steps, in rad."""
         angle_rad = self.plant.sensed_angle_rad
         step_rad = self._resolution_rad
-        return round(angle_rad / step_rad) * step_rad if step_rad else angle_rad
+        if step_rad:
+            angle_rad = round(angle_rad / step_rad) * step_rad
+        return angle_rad if self.stuck_encoder is None else self.stuck_encoder(angle_rad)
 
 
 class SimulatedDrive:
@@ -195,6 +226,15 @@ class SimulatedDrive:
         self.angle_stale = False
         self.angle_time_ns = 0
         self.off_doubt = ""
+
+    @property
+    def stuck_encoder(self) -> Stuck | None:
+        """What an encoder shows that has failed; it may be set."""
+        return self._rig.stuck_encoder
+
+    @stuck_encoder.setter
+    def stuck_encoder(self, stuck: Stuck | None) -> None:
+        self._rig.stuck_encoder = stuck
 
     def connect(self) -> None:
         """Nothing to connect to."""
@@ -260,6 +300,11 @@ class SimulatedSensor:
     weights
         Weights of the last readings in the value, oldest first; one weight: a reading is taken when
         it is asked for.
+
+    Attributes
+    ----------
+    stuck : Stuck or None
+        What a sensor shows that has failed; None: it works.
     """
 
     def __init__(
@@ -287,6 +332,7 @@ class SimulatedSensor:
         self._hum_nm = simulation.hum_nm
         self._hum_turn = simulation.hum_hz / rate_hz
         self._hum_turns = 0.0
+        self.stuck: Stuck | None = None
         self._saturated = False  # since the last that was read
         self.wrench_stale = False
         self.wrench_time_ns = 0
@@ -351,7 +397,8 @@ class SimulatedSensor:
             row[axis] = round(value / step) * step if step else value
         self.wrench_saturated = saturated
         fx, fy, fz, tx, ty, tz = row
-        return fx, fy, fz, tx, ty, tz
+        wrench = fx, fy, fz, tx, ty, tz
+        return wrench if self.stuck is None else self.stuck(wrench)
 
     def close(self) -> None:
         """Nothing to release."""

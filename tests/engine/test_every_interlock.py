@@ -17,10 +17,15 @@ from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety import INTERLOCKS, Action
 from rigd.session._format import Status
+from rigd.sim import Stuck
 
 MIDDLE_NS = 3_000_000_000
 MIDDLE = 3000
 """Tick and time in the middle of the record: tare and settling take 1.5 s, the record 5 s."""
+
+
+FAST = 4700
+"""Tick at which the shaft moves fast."""
 
 
 class Sensor:
@@ -32,6 +37,7 @@ class Sensor:
         self.reads = 0
         self.added = [0.0] * 6
         self.stale = self.saturated = False
+        self.stuck = self.stuck_axis = None
         self.stale_every = 1
 
     def __getattr__(self, name):
@@ -54,6 +60,11 @@ class Sensor:
         wrench = self.inner.read_wrench()
         if not self._wrong:
             return wrench
+        if self.stuck is not None:
+            return self.stuck(wrench)
+        if self.stuck_axis is not None:
+            axis, stuck = self.stuck_axis
+            return (*wrench[:axis], stuck(wrench[axis]), *wrench[axis + 1 :])
         return tuple(value + more for value, more in zip(wrench, self.added, strict=True))
 
 
@@ -94,6 +105,10 @@ def sensor(session, wrong_from=MIDDLE, **faults):
 
 def jump(session):
     session.drive.fault_at, session.drive.fault = MIDDLE, lambda angle_rad: angle_rad + 0.005
+
+
+def stick_encoder(session, at, every=0):
+    session.drive.fault_at, session.drive.fault = at, Stuck(every)
 
 
 def asks_too_much(session):
@@ -147,6 +162,30 @@ CASES = {
         r"Tracking error -?0\.005\d* rad exceeds limit 0\.005 rad",
     ),
     "encoder jump": Case(jump, r"Encoder jump 0\.00[45]\d* rad exceeds limit 0\.002\d* rad"),
+    "frozen encoder": Case(
+        lambda s: stick_encoder(s, at=2000),
+        r"Net torque while the encoder stands still -?0\.\d+ N·m exceeds limit 0\.\d+ N·m",
+    ),
+    "stopped encoder": Case(
+        lambda s: stick_encoder(s, at=FAST),
+        r"Torque that the sudden stop of the encoder would have taken \d?\.?\d+ N·m exceeds limit",
+    ),
+    "repeated angle": Case(
+        lambda s: stick_encoder(s, at=2000, every=2),
+        r"Number of encoder readings that repeat the one before while the shaft moves 6 in 32 tick",
+    ),
+    "frozen sensor": Case(
+        lambda s: sensor(s, stuck=Stuck()),
+        r"Run of identical readings of all sensor channels 20 ticks exceeds limit 19 ticks",
+    ),
+    "frozen channel": Case(
+        lambda s: sensor(s, stuck_axis=(1, Stuck())),
+        r"Run of identical readings of the sensor's fy_n \d+ ticks exceeds limit \d+ ticks",
+    ),
+    "repeated wrench": Case(
+        lambda s: sensor(s, stuck=Stuck(2)),
+        r"Percentage of readings of the sensor's whole wrench that repeat the one before \d\d\.\d",
+    ),
     "torque command": Case(
         asks_too_much,
         r"Torque command -?0\.0\d+ N·m exceeds limit 0\.05 N·m",

@@ -26,7 +26,7 @@ def as_line(row):
     limit = f"`{row.limit}`" if row.limit else "it happens"
     if row.name == "encoder jump":
         limit += " and two encoder steps"
-    channel = row.channel.format(axis="fx … tz")
+    channel = row.channel.format(axis="fx … tz", channel="fx … tz, or gauge")
     cells = (
         row.name,
         channel,

@@ -32,6 +32,11 @@ MESSAGES = {
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
     "drive restarts": r"Drive .*it has restarted by itself; check its supply",
     "encoder jumps": r"Encoder jump .* rad exceeds limit",
+    "encoder frozen": r"(Net torque while the encoder|Torque that the sudden stop of the encoder)",
+    "encoder repeats every second angle": r"Number of encoder readings that repeat",
+    "sensor frozen": r"Run of identical readings of all sensor channels",
+    "sensor repeats every second wrench": r"readings of the sensor's whole wrench that repeat",
+    "gauge frozen": r"Run of identical readings of the sensor's gauge 2 ",
     "statusword corrupted": r"Drive .*statusword",
     "controlword corrupted": r"Drive .*command came over the bus that this computer did not give",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
@@ -43,9 +48,12 @@ MESSAGES = {
     "torque commands lost": r"Drive .*exerts .* commanded, for 10 ticks",
     "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",
     "stream silent": rf"wrench.*{STALE} ticks",
+    "streaming sensor frozen": r"Run of identical readings of all sensor channels",
     "streaming sensor restarts": rf"wrench.*{STALE} ticks",
     "stream reports an error": r"Sensor ATI Digital F/T .*error",
 }
+NOISE = {"simulation.torque_noise_nm": "5e-3", "simulation.force_noise_n": "2e-2"}
+"""Without noise all readings of a sensor at rest are the same."""
 READY = "the next session can be started"
 UNTIL_MENDED = {
     "drive silent": "no answer",
@@ -87,6 +95,10 @@ AGAIN = {
     "drive restarts",
     "drive's heartbeat lost",
     "encoder jumps",
+    "encoder repeats every second angle",
+    "gauge frozen",
+    "sensor repeats every second wrench",
+    "streaming sensor frozen",
     "gauge at its end",
     "half of each wrench lost",
     "loop's frames lost",
@@ -128,6 +140,8 @@ def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
 ):
     shortened = MESSAGES[row.name].endswith(f"{STALE} ticks")
     values = {"limits.stale_ticks_in_a_row": str(STALE)} if shortened else {}
+    if re.match("stuck,what=(sensor|gauge)", row.fault):
+        values |= NOISE
     profile, log = quiet_profile(row.profile, values), tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--lock-step", "--log", log)
     # The record could go on for long, so that the fault comes before its end at any pace.

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rigd.devices.contracts import Wrench
 from rigd.devices.parameters import WrenchSensor
+from rigd.sim import Stuck
 
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
 """Per N and per N·m, as both sensors of this family that are documented state them."""
@@ -58,6 +59,8 @@ class AtiGauges:
         What the rounding of the gauges does at most to each axis, in N and N·m. With the range and
         resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and one
         count of one gauge is less than that too.
+    stuck : tuple of int and Stuck, or None
+        Number of a gauge that has failed, and what it shows.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class AtiGauges:
         self.quantisation: NDArray[np.float64] = 0.5 * np.abs(matrix).sum(axis=1) / counts
         # For wrenches in rows.
         self._per_unit = np.ascontiguousarray((np.linalg.inv(matrix) * counts).T)
+        self.stuck: tuple[int, Stuck] | None = None
         self._bias = np.array(_BIAS, dtype=np.float64)
 
     def read(self, wrenches: Sequence[Wrench], saturated: int | None = None) -> NDArray[np.int16]:
@@ -94,4 +98,7 @@ class AtiGauges:
         np.maximum(gauges, _LOWEST, out=gauges)
         if saturated is not None:
             gauges[:, saturated] = np.copysign(_SATURATED, gauges[:, saturated])
+        if self.stuck is not None:
+            number, stuck = self.stuck
+            gauges[:, number] = [stuck(value) for value in gauges[:, number].tolist()]
         return gauges.astype(np.int16)

@@ -15,7 +15,7 @@ from rigd.beam import RealisationError
 from rigd.devices import Obstacle, ObstacleError
 from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.parameters import RigParameters
-from rigd.sim import SimulatedRig
+from rigd.sim import SimulatedRig, Stuck
 from rigd.sim.wire._faults import (
     ENCOUNTERS,
     LINE_KINDS,
@@ -465,7 +465,7 @@ class BusSimulation:
     def _check(self, fault: Fault) -> None:
         values = fault.values
         device = values.get("device", values.get("from", "drive"))
-        if fault.kind in ("saturate", "status"):
+        if fault.kind in ("saturate", "status") or values.get("what") in ("sensor", "gauge"):
             device = "sensor"
         on_serial = self._serial is not None and device == "sensor"
         if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
@@ -504,6 +504,8 @@ class BusSimulation:
             self._stand(fault, drive if values["device"] == "drive" else sensor, "frozen", True)
         elif fault.kind == "saturate":
             self._stand(fault, sensor, "saturate", values["gauge"])
+        elif fault.kind == "stuck":
+            self._get_stuck(fault, sensor)
         elif fault.kind == "status":
             self._stand(fault, sensor, "status_bits", values["bits"])
         elif fault.kind == "emcy":
@@ -534,6 +536,17 @@ class BusSimulation:
             self._cut_lines[values["device"]] = fault
             self._cut(values["device"])
         self._let_hear()
+
+    def _get_stuck(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
+        """Let encoder, sensor or one gauge repeat its readings."""
+        stuck = Stuck(int(fault.values.get("every", 0)))
+        what = fault.values["what"]
+        if what == "encoder":
+            self._stand(fault, self._simulated, "stuck_encoder", stuck)
+        elif what == "sensor":
+            self._stand(fault, self._simulated.sensor, "stuck", stuck)
+        else:
+            self._stand(fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck))
 
     def _stand(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
         """Let a fault hold an attribute of a device, until it ends."""

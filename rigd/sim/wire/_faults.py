@@ -102,6 +102,8 @@ KINDS: dict[str, dict[str, _Key]] = {
     "saturate": {"gauge": _whole(0, 5, needed=True), "for": _FOR},
     "status": {"bits": _whole(0, 0xFFFF, needed=True), "for": _FOR},
     "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},
+    "stuck": {"what": _one_of("encoder", "sensor", "gauge", needed=True)}
+    | {"gauge": _whole(0, 5, default=0), "every": _whole(2, 1000), "for": _FOR},
     "cut": {"device": _one_of("bus", "sensor", default="bus")},
     "restart": {"device": _DEVICE},
     "power_cycle": {"device": _DEVICE},
