@@ -127,12 +127,15 @@ class EncoderWatch:
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
         self._breakaway_nm = breakaway_nm
-        self._windows = tuple(max(_STOP_TICKS + 1, round(w * rate_hz)) for w in _WINDOWS_S)
-        self._standstill = max(self._windows[0], round(_STANDSTILL_S * rate_hz))
+        lengths = [max(_STOP_TICKS + 1, round(w * rate_hz)) for w in _WINDOWS_S]
+        # Within an encoder step the shaft may turn round, with `8 step/T²` at the most.
+        turn_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
+        self._windows = [(ticks, turn_nm / ticks**2) for ticks in lengths]
+        self._standstill = max(lengths[0], round(_STANDSTILL_S * rate_hz))
         # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
         self._long = inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
         self._decay = 1.0 / (_VIBRATION_S * rate_hz)
-        longest = self._windows[-1] + 1
+        longest = lengths[-1] + 1
         # Cumulative sums, of which two give the mean over a window.
         self._torques: deque[tuple[float, float]] = deque(maxlen=longest)
         self._errors: deque[float] = deque(maxlen=longest)
@@ -221,16 +224,9 @@ class EncoderWatch:
                 violation = self._check_momentum()
                 if violation is not None:
                     return violation
-            if standing >= self._windows[0]:
-                violation = self._check_net_torque(standing)
-                if violation is not None:
-                    return violation
-                if (
-                    standing >= self._standstill
-                    and not self._test_step_nm
-                    and self._count >= self._pause
-                ):
-                    self._compare_coupling_torque(standing)
+            violation = self._check_standstill(standing)
+            if violation is not None:
+                return violation
         if self._test_step_nm:
             self.test_nm += self._test_step_nm
             limit_nm = _RAMP_LIMIT * self._breakaway_nm
@@ -258,6 +254,29 @@ class EncoderWatch:
         self._standing = 0
         self._uneven = self._angles.maxlen or 0
 
+    def _check_standstill(self, standing: int) -> Violation | None:
+        """Check a shaft that has seemed to stand still for some ticks.
+
+        The shortest window is checked in every tick, the others in turn.
+        """
+        windows = self._windows
+        ticks, turn_nm = windows[0]
+        if standing < ticks:
+            return None
+        violation = self._check_net_torque(ticks, turn_nm)
+        ticks, turn_nm = windows[1 + self._count % (len(windows) - 1)]
+        if violation is not None or standing < ticks:
+            return violation
+        violation = self._check_net_torque(ticks, turn_nm)
+        if (
+            violation is None
+            and standing >= self._standstill
+            and not self._test_step_nm
+            and self._count >= self._pause
+        ):
+            self._compare_coupling_torque(ticks)
+        return violation
+
     def _check_momentum(self) -> Violation | None:
         """Check a stop within `_STOP_TICKS` against the impulse that it takes."""
         angles = self._angles
@@ -279,44 +298,33 @@ class EncoderWatch:
             return None
         return _violation("stopped encoder", needed_nm, allowed_nm)
 
-    def _check_net_torque(self, standing: int) -> Violation | None:
-        """Check the net torque on a shaft that seems to stand still."""
-        rate_hz = self._rate_hz
-        for ticks in self._windows:
-            if ticks > standing:
-                break
-            net, motor = self._over(ticks)
-            net_nm, coupling_nm = net / ticks, (motor - net) / ticks
-            # Within a step the shaft may turn round: `8 step/T²` at the most.
-            turn_nm = self._inertia_kg_m2 * 8.0 * self._resolution_rad * (rate_hz / ticks) ** 2
-            limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
-            if abs(net_nm) > limit_nm:
-                return _violation("frozen encoder", net_nm, limit_nm)
-        return None
+    def _check_net_torque(self, ticks: int, turn_nm: float) -> Violation | None:
+        """Check the mean net torque on a shaft that seems to stand still."""
+        net, motor = self._over(ticks)
+        net_nm, coupling_nm = net / ticks, (motor - net) / ticks
+        limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
+        if -limit_nm < net_nm < limit_nm:
+            return None
+        return _violation("frozen encoder", net_nm, limit_nm)
 
-    def _compare_coupling_torque(self, standing: int) -> None:
+    def _compare_coupling_torque(self, ticks: int) -> None:
         """Begin a test of the encoder if the beam pulls at a shaft that seems to stand still."""
-        noise_nm = self._noise_nm
+        errors, noise_nm = self._errors, self._noise_nm
+        error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
-        missed_nm = _MODEL_ERROR * vibration_nm
-        errors = self._errors
-        for ticks in self._windows[1:]:
-            if ticks > standing or ticks >= len(errors):
-                return
-            error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
-            level_nm = max(
-                _LEAST_PULL * self._breakaway_nm,
-                _SIGNIFICANT * noise_nm / sqrt(ticks),
-                missed_nm * min(1.0, self._long / ticks),
-            )
-            if abs(error_nm) > level_nm:
-                # Against the pull, for a shaft that runs away is then braked; or the shorter way.
-                net_nm = self._over(ticks)[0] / ticks
-                shorter = abs(net_nm) > 0.5 * self._breakaway_nm
-                ramp_nm = self._breakaway_nm / (_RAMP_S * self._rate_hz)
-                self._test_step_nm = copysign(ramp_nm, net_nm if shorter else -error_nm)
-                self._test_start_rad = self._angles[-1]
-                return
+        level_nm = max(
+            _LEAST_PULL * self._breakaway_nm,
+            _SIGNIFICANT * noise_nm / sqrt(ticks),
+            _MODEL_ERROR * vibration_nm * min(1.0, self._long / ticks),
+        )
+        if -level_nm < error_nm < level_nm:
+            return
+        # Against the pull, for a shaft that runs away is then braked; or the shorter way.
+        net_nm = self._over(ticks)[0] / ticks
+        shorter = abs(net_nm) > 0.5 * self._breakaway_nm
+        ramp_nm = self._breakaway_nm / (_RAMP_S * self._rate_hz)
+        self._test_step_nm = copysign(ramp_nm, net_nm if shorter else -error_nm)
+        self._test_start_rad = self._angles[-1]
 
     def _check_repeats(self, moved_rad: float) -> Violation | None:
         """Check a tick without movement between two in which the shaft moved the same way."""

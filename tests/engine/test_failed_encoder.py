@@ -1,0 +1,190 @@
+"""An encoder that fails while its messages stay fresh: how far the shaft turns, session by session.
+
+The true friction of the motor differs from the 0.03 N·m of the profile.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.control import close_loop, design_damper
+from rigd.devices import open_devices
+from rigd.devices.contracts import Devices
+from rigd.engine._messages import Ending
+from rigd.excitation import chirp, hold, multisine, quintic, step
+from rigd.excitation._signals import Excitation
+from rigd.profile import load_profile
+from rigd.sim import Stuck
+
+RATE_HZ = 1000.0
+BEFORE_RECORD = 1500
+"""Ticks of tare and settling."""
+ENCODER = r"Net torque while the encoder|Torque that the sudden stop of the encoder"
+REPEATS = r"Number of encoder readings that repeat"
+
+
+class FailingDrive:
+    """A simulated drive whose encoder fails at a given reading; notes where the shaft is."""
+
+    def __init__(self, inner, at, stuck):
+        self.inner, self.at, self.stuck = inner, at, stuck
+        self.reads = 0
+        self.angles_rad = []
+        self.speed_rad_s = 0.0
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def read_angle(self):
+        self.reads += 1
+        plant = self.inner._plant
+        if self.reads == self.at:
+            self.inner.stuck_encoder = self.stuck
+            self.speed_rad_s = abs(plant.velocity_rad_s)
+        if self.reads >= self.at:
+            self.angles_rad.append(plant.angle_rad)
+        return self.inner.read_angle()
+
+    def travel_rad(self):
+        """Greatest distance from where the encoder failed, up to rest."""
+        plant = self.inner._plant
+        for _ in range(3000):
+            plant.advance(1)
+            self.angles_rad.append(plant.angle_rad)
+        return float(np.ptp([self.angles_rad[0], *self.angles_rad]))
+
+
+def slew():
+    path = 0.4 * quintic(0.6, RATE_HZ)
+    return np.concatenate([np.zeros(500), path, np.full(1500, 0.4)])
+
+
+def sessions():
+    ends = {"rest_s": 0.5, "ring_down_s": 0.5}
+    slow = chirp(rate_hz=RATE_HZ, duration_s=6.0, start_hz=0.05, stop_hz=5.0, **ends)
+    fast = chirp(rate_hz=RATE_HZ, duration_s=5.0, stop_hz=50.0, **ends)
+    tones = multisine(
+        rate_hz=RATE_HZ, amplitude_rad=0.005, start_hz=1.0, stop_hz=40.0, period_s=2.0,
+        duration_s=4.0, **ends,
+    )  # fmt: skip
+    return {
+        "chirp": fast.reference_rad,
+        "slow chirp": slow.reference_rad,
+        "step": step(rate_hz=RATE_HZ, amplitude_rad=0.01, duration_s=4.0, **ends).reference_rad,
+        "multisine": tones.reference_rad,
+        "move": slew(),
+        "hold": hold(rate_hz=RATE_HZ, duration_s=4.0, **ends).reference_rad,
+    }
+
+
+REFERENCES = sessions()
+
+
+def run_with_failing_encoder(make_session, reference_rad, at, friction_nm, stuck=None):
+    session = make_session()
+    rig = session.profile.rig
+    truth = replace(rig, motor=replace(rig.motor, coulomb_nm=friction_nm))
+    devices = open_devices(truth)
+    drive = FailingDrive(devices.drive, at, stuck or Stuck())
+    session.devices = Devices(drive, devices.sensor, simulated=True)
+    excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
+    damper = design_damper(close_loop(session.profile.loop_model()))
+    session.obey(replace(session.order(excitation), ending=Ending(damper=damper)))
+    assert not drive.inner._plant.enabled
+    return session.finished, drive
+
+
+def further(*case):
+    return pytest.param(*case, marks=pytest.mark.further)
+
+
+CASES = [
+    ("chirp", BEFORE_RECORD, 0.02),
+    further("chirp", BEFORE_RECORD + 2000, 0.06),
+    ("slow chirp", BEFORE_RECORD + 4000, 0.02),
+    further("step", BEFORE_RECORD, 0.05),
+    ("step", BEFORE_RECORD + 2500, 0.02),
+    ("multisine", BEFORE_RECORD, 0.02),
+    further("multisine", BEFORE_RECORD + 1500, 0.1),
+    ("move", BEFORE_RECORD, 0.02),
+    further("move", BEFORE_RECORD + 800, 0.1),
+    further("hold", BEFORE_RECORD, 0.02),
+]
+
+
+@pytest.mark.parametrize(("name", "at", "friction_nm"), CASES)
+def test_a_frozen_encoder_ends_the_session_before_the_shaft_has_turned_far(
+    make_session, name, at, friction_nm
+):
+    finished, drive = run_with_failing_encoder(make_session, REFERENCES[name], at, friction_nm)
+    travel_rad = drive.travel_rad()
+    assert travel_rad <= 0.3
+    if finished.outcome == "fault" or finished.reason:
+        assert re.search(ENCODER, finished.reason)
+    else:
+        # Torque within the friction turns nothing.
+        assert travel_rad < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REFERENCES)
+def test_wherever_an_encoder_freezes_the_shaft_does_not_turn_far(make_session, name):
+    random = np.random.default_rng(7)
+    reference_rad = REFERENCES[name]
+    for _ in range(20):
+        at = int(random.integers(BEFORE_RECORD, BEFORE_RECORD + reference_rad.size))
+        friction_nm = random.uniform(0.02, 0.1)
+        finished, drive = run_with_failing_encoder(make_session, reference_rad, at, friction_nm)
+        bound_rad = 0.3 if drive.speed_rad_s < 1.5 else 0.15 + coasting_rad(drive, friction_nm)
+        assert drive.travel_rad() <= bound_rad, (at, friction_nm, finished.reason)
+
+
+def coasting_rad(drive, friction_nm):
+    rig = load_profile("sim").rig
+    inertia_kg_m2 = rig.motor.inertia_kg_m2 + rig.beam.inertia_kg_m2
+    return drive.speed_rad_s**2 * inertia_kg_m2 / (2 * friction_nm)
+
+
+@pytest.mark.parametrize(
+    ("name", "every"), [("move", 2), further("move", 3), further("chirp", 2), further("chirp", 3)]
+)
+def test_an_encoder_that_repeats_readings_is_detected(make_session, name, every):
+    finished, _ = run_with_failing_encoder(
+        make_session, REFERENCES[name], BEFORE_RECORD, 0.03, Stuck(every)
+    )
+    assert finished.outcome == "fault"
+    # Of three readings two repeat: the shaft seems to stop.
+    assert re.match(REPEATS if every == 2 else f"{REPEATS}|{ENCODER}", finished.reason)
+    assert finished.device_failed
+
+
+@pytest.mark.parametrize(
+    ("name", "friction_nm"),
+    [
+        ("step", 0.02),
+        further("step", 0.1),
+        further("hold", 0.02),
+        further("hold", 0.1),
+        further("slow chirp", 0.1),
+    ],
+)
+def test_no_working_encoder_is_called_failed(make_session, name, friction_nm):
+    """Not even where a knock makes the beam pull at a shaft that stands still."""
+    reference_rad = REFERENCES[name]
+    session = make_session()
+    rig = session.profile.rig
+    knocks = ("knock,x=0.5,force=0.4,at=1,duration=0.02", "x=0.8,force=-0.3,at=2,duration=0.01")
+    knocks = tuple(knock.removeprefix("knock,") for knock in knocks)
+    truth = replace(
+        rig,
+        motor=replace(rig.motor, coulomb_nm=friction_nm),
+        simulation=replace(rig.simulation, obstacles=knocks),
+    )
+    devices = open_devices(truth)
+    session.devices = Devices(devices.drive, devices.sensor, simulated=True)
+    excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
+    session.obey(session.order(excitation))
+    assert session.finished.outcome == "complete", session.finished.reason
+    assert session.finished.counts["scheduled"] == reference_rad.size
