@@ -18,6 +18,8 @@ after its own time:
 * the drive watches over the loop's heartbeat, and misses it when the loop has stopped;
 * a loop whose angles do not come goes on with the last one, heartbeat included, and ends the
   session after ``limits.stale_ticks_in_a_row``;
+* a loop whose encoder has failed, though its messages are fresh, ends the session by what the
+  torques say of the shaft, at full torque within `ENCODER_FAILURE_S`;
 * a loop that was held up looks again after the ticks it missed, up to
   ``limits.missed_ticks_in_a_row`` of them.
 
@@ -38,7 +40,7 @@ from rigd.devices.ati import RECORD_BITS
 from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
 from rigd.devices.cia402 import Grade, judge
 from rigd.profile import Profile
-from rigd.safety import Limits
+from rigd.safety import ENCODER_FAILURE_S, Limits
 
 # Closed loop
 
@@ -223,6 +225,12 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
             (stale + 1) / rig.rate_hz + rig.actuation.delay_s,
             f"of {stale} old angles (limits.stale_ticks_in_a_row)",
             "limits.stale_ticks_in_a_row",
+        ),
+        _Blindness(
+            "if the encoder fails",
+            ENCODER_FAILURE_S + 2 / rig.rate_hz + rig.actuation.delay_s,
+            "of the encoder watch",
+            "limits.standstill_torque_nm",
         ),
         _Blindness(
             "if ticks are missed",

@@ -23,7 +23,14 @@ from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import runtime_folder
-from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, SensorWatch, Violation
+from rigd.safety import (
+    BeamPrediction,
+    EncoderWatch,
+    LimitWatch,
+    ScaleWatch,
+    SensorWatch,
+    Violation,
+)
 from rigd.session import WRENCH_FIELDS, Status
 
 REMEDY = (
@@ -537,7 +544,7 @@ class Observers:
     """Compares each reading of the sensor with the one before."""
 
 
-def make_observers(profile: Profile, devices: Devices) -> Observers:
+def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -> Observers:
     """Return the observers of a profile's rig.
 
     Parameters
@@ -546,6 +553,8 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
         Profile of the rig.
     devices
         Devices that are read.
+    scales
+        Whether the data of the motor are known; False: a session measures them.
     """
     rig = profile.rig
     prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
@@ -556,6 +565,7 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
         delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
+        scales=ScaleWatch(rig.motor.inertia_kg_m2) if scales else None,
     )
     simulation = rig.simulation
     noisy = [True] * 6

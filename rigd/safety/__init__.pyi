@@ -1,4 +1,5 @@
 from ._beam_prediction import BeamPrediction as BeamPrediction
+from ._encoder_watch import ENCODER_FAILURE_S as ENCODER_FAILURE_S
 from ._encoder_watch import EncoderWatch as EncoderWatch
 from ._limits import BUFFERED_S as BUFFERED_S
 from ._limits import BY_NAME as BY_NAME
@@ -11,4 +12,5 @@ from ._limits import Limits as Limits
 from ._limits import Violation as Violation
 from ._monitor import LOOK_EVERY as LOOK_EVERY
 from ._monitor import LimitWatch as LimitWatch
+from ._scale_watch import ScaleWatch as ScaleWatch
 from ._sensor_watch import SensorWatch as SensorWatch

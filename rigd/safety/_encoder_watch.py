@@ -22,8 +22,11 @@ from math import copysign, inf, sqrt
 
 from rigd.safety._beam_prediction import BeamPrediction
 from rigd.safety._limits import BY_NAME, Violation
+from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
 
-_WINDOWS_S = 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
+ENCODER_FAILURE_S = 0.004
+"""Time after which net torque on an encoder that stands still is a fault, if it is large."""
+_WINDOWS_S = ENCODER_FAILURE_S, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
 """Durations over which torques are averaged: short ones within half a period of whatever the
 excitation contains, long ones in which noise averages out."""
 _STANDSTILL_S = 0.016
@@ -50,9 +53,10 @@ _TORQUE_ERROR = 0.25
 _MOMENTUM = 0.5
 """Part of the shaft's momentum that has to be accounted for: inertias are known to a quarter."""
 _STOP_TICKS = 2
-_SPEED_TICKS = 4
 _STOP_STEPS = 4.0
-"""Speed, in encoder steps a tick over `_SPEED_TICKS`, from which on a stop is examined."""
+"""Speed, in encoder steps a tick over `SPEED_TICKS`, from which on a stop is examined."""
+_SCALE_STEPS = 3.0
+"""Encoder steps within `SPEED_TICKS` from which on a speed counts for the scales."""
 _MOST_REPEATS = 6
 _REPEAT_TICKS = 32
 _REPEAT_STEPS = 3.5
@@ -76,6 +80,8 @@ class EncoderWatch:
         Net torque that no friction of the shaft withstands.
     delay_ticks
         Ticks from a command to its torque.
+    scales
+        Compares the scales of the readings; None: they are not known yet.
 
     Attributes
     ----------
@@ -101,6 +107,7 @@ class EncoderWatch:
         "_rate_hz",
         "_repeats",
         "_resolution_rad",
+        "_scales",
         "_standing",
         "_standstill",
         "_test_start_rad",
@@ -121,8 +128,10 @@ class EncoderWatch:
         inertia_kg_m2: float,
         breakaway_nm: float,
         delay_ticks: int,
+        scales: ScaleWatch | None = None,
     ) -> None:
         self._prediction = prediction
+        self._scales = scales
         self._rate_hz = rate_hz
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
@@ -139,7 +148,7 @@ class EncoderWatch:
         # Cumulative sums, of which two give the mean over a window.
         self._torques: deque[tuple[float, float]] = deque(maxlen=longest)
         self._errors: deque[float] = deque(maxlen=longest)
-        self._angles: deque[float] = deque(maxlen=_SPEED_TICKS + _STOP_TICKS + 1)
+        self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
         self._repeats: deque[int] = deque(maxlen=_MOST_REPEATS)
         self._pending: deque[float] = deque(maxlen=delay_ticks)
         self.reset(0.0, 0.0)
@@ -164,6 +173,8 @@ class EncoderWatch:
         self._angles.append(angle_rad)
         self._pending.extend([0.0] * (self._pending.maxlen or 0))
         self._coupling_nm2 = 0.0
+        if self._scales is not None:
+            self._scales.reset()
         self._standing = self._count = self._pause = 0
         self._uneven = 0
         self.tests = 0
@@ -207,6 +218,10 @@ class EncoderWatch:
         angles.append(angle_rad)
         if self._uneven:
             self._uneven -= 1
+        elif self._count % WINDOW_TICKS == 0 and self._scales is not None:
+            violation = self._compare_scales(self._scales)
+            if violation is not None:
+                return violation
         if moved_rad:
             self._standing = 0
             if standing == 1 and not self._uneven:
@@ -280,14 +295,15 @@ class EncoderWatch:
     def _check_momentum(self) -> Violation | None:
         """Check a stop within `_STOP_TICKS` against the impulse that it takes."""
         angles = self._angles
-        if len(angles) < (angles.maxlen or 0):
+        before = -1 - _STOP_TICKS
+        if len(angles) < SPEED_TICKS - before:
             return None
-        moved_rad = angles[_SPEED_TICKS] - angles[0]
-        if abs(moved_rad) < _STOP_STEPS * _SPEED_TICKS * self._resolution_rad or not moved_rad:
+        moved_rad = angles[before] - angles[before - SPEED_TICKS]
+        if abs(moved_rad) < _STOP_STEPS * SPEED_TICKS * self._resolution_rad or not moved_rad:
             return None
-        ticks = min(_SPEED_TICKS + _STOP_TICKS, len(self._torques) - 1)
+        ticks = min(SPEED_TICKS + _STOP_TICKS, len(self._torques) - 1)
         net, motor = self._over(ticks)
-        per_tick_nm = _MOMENTUM * self._inertia_kg_m2 * abs(moved_rad) / _SPEED_TICKS
+        per_tick_nm = _MOMENTUM * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
         needed_nm = per_tick_nm * self._rate_hz**2 / _STOP_TICKS
         braking_nm = max(0.0, -net if moved_rad > 0 else net)
         allowed_nm = (
@@ -329,7 +345,7 @@ class EncoderWatch:
     def _check_repeats(self, moved_rad: float) -> Violation | None:
         """Check a tick without movement between two in which the shaft moved the same way."""
         angles = self._angles
-        if len(angles) < _SPEED_TICKS:
+        if len(angles) < SPEED_TICKS:
             return None
         before_rad = angles[-3] - angles[-4]
         least_rad = _REPEAT_STEPS * self._resolution_rad
@@ -340,6 +356,29 @@ class EncoderWatch:
         if len(repeats) < _MOST_REPEATS or self._count - repeats[0] >= _REPEAT_TICKS:
             return None
         return _violation("repeated angle", len(repeats), _MOST_REPEATS - 1)
+
+    def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
+        """Compare the acceleration over the last `WINDOW_TICKS` with the net torque."""
+        angles, torques = self._angles, self._torques
+        n = WINDOW_TICKS
+        if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 2:
+            return None
+        now_rad = angles[-1] - angles[-1 - SPEED_TICKS]
+        before_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
+        least_rad = _SCALE_STEPS * self._resolution_rad
+        if now_rad * before_rad <= 0.0 or min(abs(now_rad), abs(before_rad)) < least_rad:
+            return None
+        # The same weights as the difference of two mean speeds gives the acceleration.
+        net = motor = 0.0
+        for j in range(1, SPEED_TICKS + 1):
+            for last in (torques[-1 - j], torques[-j]):
+                net, motor = net + last[0], motor + last[1]
+            for first in (torques[-1 - j - n], torques[-j - n]):
+                net, motor = net - first[0], motor - first[1]
+        net, motor = net / (2 * SPEED_TICKS * n), motor / (2 * SPEED_TICKS * n)
+        acceleration_rad_s2 = (now_rad - before_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
+        speed_rad_s = (now_rad + before_rad) * self._rate_hz / (2 * SPEED_TICKS)
+        return scales.add(acceleration_rad_s2, speed_rad_s, motor - net, net)
 
     def _over(self, ticks: int) -> tuple[float, float]:
         """Return the sums of net torque and motor torque over the last ticks."""

@@ -262,6 +262,17 @@ INTERLOCKS: Final = (
         _ENCODER_FAILED,
     ),
     Interlock(
+        "scales",
+        "ratio of the net torque on the shaft to its inertia times its measured acceleration",
+        "(1 if all scales are right)",
+        "",
+        None,
+        Checked.TICK,
+        Action.FAULT,
+        "Encoder step, gear, rated torque, inertia or a sign in the profile is wrong: run rigd "
+        "check, then rigd identify motor.",
+    ),
+    Interlock(
         "torque command",
         "torque command",
         "N·m",

@@ -111,6 +111,17 @@ def stick_encoder(session, at, every=0):
     session.drive.fault_at, session.drive.fault = at, Stuck(every)
 
 
+def weaken(session):
+    """Let the motor exert a third of what it is told."""
+    inner, command = session.drive.inner, session.drive.inner.command
+
+    def weak(torque_nm):
+        command(0.35 * torque_nm)
+        return torque_nm
+
+    inner.command = weak
+
+
 def asks_too_much(session):
     motor(session, peak_torque_nm=0.04)
     limit(session, torque_command_nm=0.05)
@@ -173,6 +184,10 @@ CASES = {
     "repeated angle": Case(
         lambda s: stick_encoder(s, at=2000, every=2),
         r"Number of encoder readings that repeat the one before while the shaft moves 6 in 32 tick",
+    ),
+    "scales": Case(
+        weaken,
+        r"Ratio of the net torque .* acceleration 2\.\d+ \(1 if all scales are right\) exceeds limit 2 ",
     ),
     "frozen sensor": Case(
         lambda s: sensor(s, stuck=Stuck()),
