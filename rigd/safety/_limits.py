@@ -179,7 +179,8 @@ OVERLOADED: Final = "The computer is overloaded: close other programs."
 
 _ENCODER_FAILED: Final = (
     "The encoder does not follow the torque: check the encoder, its cable and its coupling to the "
-    "shaft, and that nothing blocks the shaft; then reset the rig and set the zero again."
+    "shaft, and that nothing blocks the shaft or the motor; then reset the rig and set the zero "
+    "again."
 )
 
 _SENSOR_FAILED: Final = (

@@ -111,15 +111,15 @@ def stick_encoder(session, at, every=0):
     session.drive.fault_at, session.drive.fault = at, Stuck(every)
 
 
-def weaken(session):
-    """Let the motor exert a third of what it is told."""
+def strengthen(session):
+    """Let the motor exert more than twice the torque that is commanded."""
     inner, command = session.drive.inner, session.drive.inner.command
 
-    def weak(torque_nm):
-        command(0.35 * torque_nm)
+    def strong(torque_nm):
+        command(2.5 * torque_nm)
         return torque_nm
 
-    inner.command = weak
+    inner.command = strong
 
 
 def asks_too_much(session):
@@ -186,8 +186,8 @@ CASES = {
         r"Number of encoder readings that repeat the one before while the shaft moves 6 in 32 tick",
     ),
     "scales": Case(
-        weaken,
-        r"Ratio of the net torque .* acceleration 2\.\d+ \(1 if all scales are right\) exceeds limit 2 ",
+        strengthen,
+        r"Ratio of the net torque .* 0\.\d+ \(1 if all scales are right\) below limit 0\.5 ",
     ),
     "frozen sensor": Case(
         lambda s: sensor(s, stuck=Stuck()),
