@@ -406,8 +406,11 @@ def await_end(
             except _CrowdedError:
                 return None
             series = status["series"]
-            if status["state"] not in ("running", "stopping") and not (
-                series is not None and series["running"]
+            # A stop that comes while a session is planned is obeyed after that, before it begins.
+            if status["state"] not in ("running", "stopping") and (
+                series is None
+                or not series["running"]
+                or (series.get("stopped") and status.get("doing") == "planning")
             ):
                 return status
             if time.monotonic() > deadline_s:

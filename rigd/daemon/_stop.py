@@ -161,6 +161,9 @@ class _Stop:
             paths = set()
         for folder in [*known_folders(self._uid or None), COMMON]:
             report.places.append(str(folder))
+            fault = folder_fault(folder, shared=folder == COMMON)
+            if fault:
+                report.doubts.append(fault)
             try:
                 sockets = [path for path in folder.iterdir() if path.name.endswith(SUFFIX)]
             except (FileNotFoundError, NotADirectoryError):
@@ -172,9 +175,6 @@ class _Stop:
             except OSError as error:
                 report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
-            fault = folder_fault(folder, shared=folder == COMMON)
-            if fault:
-                report.doubts.append(fault)
             paths.update(sockets)
         found = []
         for path in sorted(paths):
@@ -311,9 +311,8 @@ class _Daemon:
     def _doubt_of(self, pid: int, uid: int) -> str:
         folder, rig = self._path.parent, self._path.name.removesuffix(SUFFIX)
         shared = folder == COMMON
-        fault = folder_fault(folder, shared=shared)
-        if fault:
-            return fault
+        if folder_fault(folder, shared=shared):
+            return "Other users can write to its folder."
         try:
             holds = holds_rig(pid, rig, folder)
         except OSError as error:
@@ -347,12 +346,13 @@ class _Daemon:
         where = f"the rig {rig} (rigd serve, process {self.pid})"
         if disabled and not self._reply:
             report.doubts.append(
-                f"{where}: it does not answer. Its control process has disabled the drive."
+                f"The daemon of {where} does not answer. Its control process has disabled the "
+                "drive."
             )
         elif self._error is not None:
-            report.doubts.append(f"{where}: {self._error.told()}")
+            report.doubts.append(f"Not stopped: {where}. {self._error.told()}")
         elif not self._reply:
-            report.doubts.append(f"{where}: it does not answer. {UNKNOWN_STATE}")
+            report.doubts.append(f"The daemon of {where} does not answer. {UNKNOWN_STATE}")
         elif not self._wait:
             if self._reply["stopping"]:
                 report.stopping.append(where)
@@ -421,7 +421,8 @@ class _Supervisor:
         """What runs, on which rig, in which process."""
         words = takewhile(lambda argument: not argument.startswith("-"), self._arguments[:2])
         name = " ".join(["rigd", *words]) if self._arguments else "a session"
-        rig = "an unknown rig" if self._rig is None else f"the rig {self._rig}"
+        given = self._rig or _option(self._arguments, "--profile")
+        rig = "an unknown rig" if given is None else f"the rig {given}"
         plain = "".join(c if c.isprintable() else "?" for c in f"{name} on {rig}")
         return f"{plain} (process {self.process.pid})"
 
