@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rigd.cli.options import (
-    EXIT_FAILED,
     EXIT_INTERRUPTED,
     EXIT_WRONG_USE,
     SESSIONS,
@@ -29,7 +28,7 @@ from rigd.units import suffix_of, unit_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rigd.daemon import Client, StopReport
+    from rigd.daemon import Client
 
 
 _LOOK_S = 0.5
@@ -170,51 +169,11 @@ def stop(
 
     Example: rigd stop
     """
-    from rigd.daemon import stop_all
+    from rigd.cli.stop_report import stop_and_report
 
-    report = stop_all(profile, wait=not no_wait)
-    if profile is not None and not report.found:
-        from rigd.cli.options import profile_named
-
-        name = profile_named(profile).name
-        if name != profile:
-            report = stop_all(name, wait=not no_wait)
-    _print_stop(report)
-    if not report.sure:
-        raise typer.Exit(EXIT_FAILED)
-
-
-def _print_stop(report: "StopReport") -> None:
-    """Print what a stop found, and what became of it."""
-    for text in report.stopped:
-        typer.echo(f"Stopped: {text}.")
-    for text in report.stopping:
-        typer.echo(f"{text} is being stopped.")
-    for text in report.quiet:
-        typer.echo(text)
-    if report.sure and not report.stopping:
-        if len(report.stopped) == 1:
-            typer.echo("The session has ended; the torque is off.")
-        elif report.stopped:
-            typer.echo(f"All {len(report.stopped)} sessions have ended; the torque is off.")
-        elif not report.quiet:
-            typer.echo(f"No session is running. Searched: {', '.join(report.places)}.")
-    for text in report.others:
-        typer.echo(f"Not stopped: {text}; only that user or root can stop it.", err=True)
-    for text in report.running:
-        typer.echo(
-            f"Error: {text} was asked to stop, but its session did not end; check rigd status and "
-            "the rig, and press the wired stop (STO) if anything moves.",
-            err=True,
-        )
-    for text in report.doubts:
-        typer.echo(f"Error: {text}", err=True)
-    if report.doubts and not report.running:
-        typer.echo(
-            "Whether another session runs is not known: check the rig, and press the wired stop "
-            "(STO) if anything moves.",
-            err=True,
-        )
+    code = stop_and_report(profile, wait=not no_wait)
+    if code:
+        raise typer.Exit(code)
 
 
 def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:

@@ -44,6 +44,7 @@ _DOUBTED_PATIENCE_S: Final = 2.0
 _AGAIN_S: Final = 0.5
 _SETTLED_S: Final = 0.05
 _POLL_S: Final = 0.02
+_REREAD_S: Final = 0.25
 _SESSIONS: Final = ("run", "identify")
 """Commands that run sessions in the foreground."""
 
@@ -223,7 +224,10 @@ class _Stop:
                 return left
             if self._passed_s > _END_PATIENCE_S and not waiting:
                 return left
-            time.sleep(_POLL_S)
+            if left or not waiting:
+                time.sleep(_POLL_S)
+            else:  # reading the table takes processor time that the daemon may need
+                waiting[0].join(_REREAD_S)
 
     def _is_reached(self, daemon: "_Daemon") -> bool:
         """Whether a daemon's own word is enough: it is the rig's, and has answered in time."""

@@ -1,12 +1,13 @@
+from ._control_names import IDLE_NAME as IDLE_NAME
+from ._control_names import SESSION_NAME as SESSION_NAME
+from ._control_names import supervisor_of_control as supervisor_of_control
 from ._cycle import Cycle as Cycle
 from ._cycle import make_watch as make_watch
 from ._ipc import CONTROL as CONTROL
 from ._ipc import FIT as FIT
-from ._ipc import IDLE_NAME as IDLE_NAME
 from ._ipc import LIVE as LIVE
 from ._ipc import PROCESSES as PROCESSES
 from ._ipc import RECORDER as RECORDER
-from ._ipc import SESSION_NAME as SESSION_NAME
 from ._ipc import SUPERVISOR as SUPERVISOR
 from ._ipc import TOUCH as TOUCH
 from ._ipc import Child as Child
@@ -14,7 +15,6 @@ from ._ipc import ChildError as ChildError
 from ._ipc import Parent as Parent
 from ._ipc import Process as Process
 from ._ipc import Pulse as Pulse
-from ._ipc import supervisor_of_control as supervisor_of_control
 from ._messages import Armed as Armed
 from ._messages import Close as Close
 from ._messages import Closed as Closed

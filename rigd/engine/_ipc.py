@@ -19,6 +19,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rigd.engine._control_names import CONTROL_MODULE
 from rigd.engine._messages import MessageReader, encode, is_ready
 from rigd.engine._shared_state import Word
 from rigd.errors import FailureError
@@ -241,19 +242,6 @@ class Parent:
 # Table of processes
 
 
-def supervisor_of_control(command: Sequence[str]) -> int | None:
-    """Return the number of the supervisor of a control process, by the command line of the latter.
-
-    Parameters
-    ----------
-    command
-        Command line of any process; None is returned if it is no control process.
-    """
-    if tuple(command[-3:-1]) != ("-m", CONTROL.module) or not command[-1].isdecimal():
-        return None
-    return int(command[-1])
-
-
 @dataclass(frozen=True, slots=True)
 class Process:
     """One kind of process."""
@@ -276,7 +264,7 @@ class Process:
 
 CONTROL = Process(
     "control",
-    "rigd.engine.control_process",
+    CONTROL_MODULE,
     Word.CONTROL_BEAT,
     hung_after_s=3.0,
     grace_s=5.0,
@@ -331,12 +319,6 @@ SUPERVISOR = Process(
     for_one_session=False,
     loss="the control process ends the session as a fault",
 )
-
-CONNECTING_NAME = "rigd connecting"
-IDLE_NAME = "rigd idle"
-SESSION_NAME = "rigd session"
-"""Short names of the control process in the process table: before the devices are connected, with
-the drive disabled, and from the start of a session until the drive is disabled again."""
 
 PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
 """All processes, in the order in which they are ended: the one with the torque first."""

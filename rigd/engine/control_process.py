@@ -12,6 +12,7 @@ from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
 from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
+from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
 from rigd.engine._cycle import (
     Cycle,
     Rest,
@@ -21,7 +22,7 @@ from rigd.engine._cycle import (
     recalled_heat_nm2,
     remember_heat,
 )
-from rigd.engine._ipc import CONNECTING_NAME, IDLE_NAME, SESSION_NAME, Parent
+from rigd.engine._ipc import Parent
 from rigd.engine._messages import (
     Connected,
     ControlJob,
