@@ -182,21 +182,27 @@ def sessions() -> list[int]:
 
 
 def begin(socket: Path) -> None:
-    """Have a daemon run a session; return when it records."""
+    """Have a daemon run a session; return when it records.
 
-    def status() -> dict:
-        with suppress(DaemonGoneError), Client(socket) as client:
-            return client.ask("status")
-        return {"state": "", "progress": None}
+    A session that a busy computer has ended is begun again.
+    """
+    parameters = {"duration_s": 100.0, "rest_s": 0.2, "ring_down_s": 0.0}
 
     def recording() -> bool:
-        progress = status()["progress"]
-        return progress is not None and progress["phase"] == "running"
+        with suppress(DaemonGoneError, RefusedByDaemonError), Client(socket) as client:
+            status = client.ask("status")
+            if status["state"] == "fault":
+                client.ask("reset")
+            elif status["state"] == "ready":
+                client.ask("start", excitation="hold", parameters=parameters)
+            progress = status["progress"]
+            return (
+                progress is not None
+                and progress["phase"] == "running"
+                and control_of(client.pid) == SESSION_NAME
+            )
+        return False
 
-    until(lambda: status()["state"] == "ready")
-    with suppress(RefusedByDaemonError), Client(socket) as client:
-        parameters = {"duration_s": 100.0, "rest_s": 0.2, "ring_down_s": 0.0}
-        client.ask("start", excitation="hold", parameters=parameters)
     until(recording)
 
 
