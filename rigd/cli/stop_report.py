@@ -46,7 +46,8 @@ def _print(report: "StopReport") -> None:
         elif report.stopped:
             lines.append(f"All {len(report.stopped)} sessions have ended; the torque is off.")
         elif not report.quiet:
-            lines.append(f"No session is running. Searched: {', '.join(report.places)}.")
+            whose = " of yours" if report.others else ""
+            lines.append(f"No session{whose} is running. Searched: {', '.join(report.places)}.")
     problems = [
         f"Not stopped: {text}; only that user or root can stop it." for text in report.others
     ]

@@ -179,9 +179,11 @@ def own_sockets() -> list[Path]:
     """
     found = []
     for path in listening_sockets():
-        if path.name.endswith(SUFFIX):
+        folder = path.parent.name
+        if path.name.endswith(SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
             with suppress(OSError, ValueError):  # it is gone, or in a folder of another user
-                if os.getuid() in (0, path.stat().st_uid):
+                status = path.lstat()
+                if stat.S_ISSOCK(status.st_mode) and os.getuid() in (0, status.st_uid):
                     found.append(path)
     return found
 

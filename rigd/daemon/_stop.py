@@ -463,8 +463,10 @@ class _Supervisor:
             return all(control.name == IDLE_NAME for control in self.controls)
         settled = time.monotonic() - self._signalled_s > _SETTLED_S
         obeyed = self._sent and settled and not self.process.awaits(STOP_SIGNAL)
-        if self._in_foreground and self.process.handles(STOP_SIGNAL) and not self._recorded:
-            return obeyed  # nothing will be recorded, and it may plan for a while
+        if self._in_foreground and self.process.handles(STOP_SIGNAL):
+            # Its control process ends once the file is closed. Where no session was begun, none
+            # will be, and it may plan for a while.
+            return obeyed and not (self._recorded and self.controls)
         return not self.has_session and (obeyed or not self._sent)
 
     def is_for(self, rig: str) -> bool:
