@@ -3,6 +3,7 @@
 import os
 import select
 import signal
+import sys
 
 _NOTHING_BEGAN = b"Stopped before anything began.\n"
 
@@ -11,10 +12,13 @@ def main() -> None:
     """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
     signal.signal(signal.SIGINT, _end)
     _fill_standard_descriptors()
-    from rigd.cli.app import main as run
     from rigd.runtime import let_pass, use_one_thread
 
     use_one_thread()
+    if sys.argv[1:] == ["stop"]:
+        from rigd.cli.stop_report import main as run
+    else:
+        from rigd.cli.app import main as run
     try:
         run()
     finally:

@@ -24,6 +24,7 @@
      |    +-- SessionFailedError    the recorder died; part of the record is kept
      |    +-- SeriesFailedError     either of the two, after some sessions of a series
      |    +-- RigBusyError          another program runs the rig
+     |    +-- UnsafeFolderError     others can write to the runtime folder
      |    +-- AddressError          no daemon is running, or its socket cannot be made
      |    +-- DaemonGoneError       the daemon was killed while it was asked
      |    +-- SessionError          a session file is damaged, or the disk is full

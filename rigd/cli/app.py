@@ -1,11 +1,5 @@
 """The command line ``rigd``, put together from its commands."""
 
-import contextlib
-import errno
-import io
-import os
-import signal
-import sys
 from typing import Annotated, Any, Final
 
 import typer
@@ -14,14 +8,14 @@ from typer.core import TyperGroup
 import rigd
 from rigd.cli.check import bench, check, reset
 from rigd.cli.daemon import serve, status, stop, tare, zero
+from rigd.cli.entry import run_command
 from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
-from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
+from rigd.cli.options import errors_told
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
-from rigd.runtime import raise_on
 
 
 def _tell(asked: bool) -> None:
@@ -107,43 +101,5 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
-    # Reading the arguments takes longer than the whole stop, which mostly has none.
     # All as long as Ctrl-C only has to say that nothing began.
-    command = _stop_at_once if sys.argv[1:] == ["stop"] else typer.main.get_command(app)
-    raise_on(signal.SIGINT)
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-    try:
-        command()
-    except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # standard error may be closed as well
-            sys.stderr.write(f"Error: {_explained(error)}\n")
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(EXIT_FAILED)
-
-
-def _stop_at_once() -> None:
-    """Do what ``rigd stop`` does."""
-    try:
-        with errors_told():
-            stop()
-    except typer.Exit as ending:
-        sys.exit(ending.exit_code)
-
-
-def _explained(error: OSError) -> str:
-    """Say what the system refused, where no command has."""
-    if error.errno in (errno.EMFILE, errno.ENFILE):
-        return (
-            f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "
-            "or close other programs."
-        )
-    if error.filename is not None:
-        return f"{error.filename}: {error.strerror}."
-    # The output of a command is not read, or the disk behind it is full.
-    return f"the output cannot be written ({error.strerror})."
+    run_command(typer.main.get_command(app))

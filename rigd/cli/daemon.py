@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rigd.cli.options import (
-    EXIT_FAILED,
     EXIT_INTERRUPTED,
     EXIT_WRONG_USE,
     SESSIONS,
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 
 _LOOK_S = 0.5
-_END_PATIENCE_S = 10.0
 
 
 def serve(
@@ -156,49 +154,26 @@ def status(
 
 
 def stop(
-    profile: DaemonOf = None,
+    profile: Annotated[
+        str | None, typer.Option("--profile", help="Stop the rig of this profile only.")
+    ] = None,
     no_wait: Annotated[
-        bool, typer.Option("--no-wait", help="Do not wait until the session has ended.")
+        bool, typer.Option("--no-wait", help="Do not wait until the sessions have ended.")
     ] = False,
 ) -> None:
-    """Stop the running session safely (any user); its file is kept.
+    """Stop all your running sessions safely; their files are kept. Not an emergency stop.
 
-    Waits up to 10 s for the session to end. Not an emergency stop.
+    Finds daemons and sessions in the foreground, whatever the runtime folder; as root those of all
+    users. Daemons go on. Waits up to 10 s for the sessions to end. Exit code 0 only if no session
+    runs any more.
 
     Example: rigd stop
     """
-    from rigd.daemon import await_end, stop_session
+    from rigd.cli.stop_report import stop_and_report
 
-    path = _socket_of(profile)
-    told = stop_session(path)
-    if told["stopping"] and no_wait:
-        typer.echo("The session is being stopped; rigd status shows when it has ended.")
-        return
-    status = await_end(path, _END_PATIENCE_S)
-    if status is None:
-        fail(
-            f"The daemon was asked to stop, but its session did not end within "
-            f"{_END_PATIENCE_S:g} s; check rigd status and the rig, and press the wired stop "
-            "(STO) if anything moves.",
-            EXIT_FAILED,
-        )
-    series = status["series"]
-    by_signal = told["signalled"] and series is not None and series["stopped"]
-    if status["state"] == "fault":
-        typer.echo(f"No session is running. The rig is in fault: {status['reason']}")
-    elif told["stopping"] or by_signal:
-        typer.echo(f"The session has ended; the torque is off.{_file_of_last(status)}")
-    elif status["state"] == "idle":
-        typer.echo("No session is running; the devices are not connected yet.")
-    else:
-        typer.echo("No session is running; the torque is off.")
-
-
-def _file_of_last(status: dict[str, Any]) -> str:
-    """Say where the file of the session is that a stop has ended."""
-    sessions = status["series"]["sessions"] if status["series"] is not None else []
-    path = sessions[-1]["path"] if sessions else None
-    return "" if path is None else f" Its file is {path}."
+    code = stop_and_report(profile, wait=not no_wait)
+    if code:
+        raise typer.Exit(code)
 
 
 def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from rigd.cli import entry
 from rigd.errors import RigdError
 from rigd.printable import progress_bar
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
 
-EXIT_FAILED = 1
-EXIT_WRONG_USE = 2
-EXIT_INTERRUPTED = 130
+EXIT_FAILED = entry.EXIT_FAILED
+EXIT_WRONG_USE = entry.EXIT_WRONG_USE
+EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 
 def fail(message: str, code: int) -> NoReturn:

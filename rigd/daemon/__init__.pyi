@@ -12,3 +12,5 @@ from ._client import find_views as find_views
 from ._client import stop_session as stop_session
 from ._main import run_daemon as run_daemon
 from ._page import page_address as page_address
+from ._stop import StopReport as StopReport
+from ._stop import stop_all as stop_all

@@ -6,14 +6,23 @@ import os
 import socket
 import stat
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 from rigd.errors import FailureError, UserError
-from rigd.runtime import address_files, answers, file_name, runtime_folder
+from rigd.runtime import (
+    address_files,
+    answers,
+    file_name,
+    folder_fault,
+    listening_sockets,
+    runtime_folder,
+)
 
 COMMON = Path("/run/rigd")
 """Folder of daemons that a group may use: a user's own runtime folder is closed to others."""
-_SUFFIX = ".daemon"
+SUFFIX = ".daemon"
+"""Ends the name of each daemon's socket."""
 _CREDENTIALS = struct.Struct("3i")
 
 
@@ -35,7 +44,7 @@ def socket_path(rig: str, folder: Path | None = None) -> Path:
     folder
         Folder of the socket; None: the user's runtime folder.
     """
-    return (folder or runtime_folder()) / f"{file_name(rig)}{_SUFFIX}"
+    return (folder or runtime_folder()) / f"{file_name(rig)}{SUFFIX}"
 
 
 def peer_of(link: socket.socket) -> tuple[int, int]:
@@ -68,9 +77,13 @@ def bind(path: Path, group: str | None) -> socket.socket:
     UnknownGroupError
         If there is no such group.
     AddressError
-        If the socket cannot be made, its folder is closed to the group, or a living daemon has it.
+        If the socket cannot be made, its folder is closed to the group or writable by others, or a
+        living daemon has it.
     """
     number = None if group is None else _group_number(group)
+    fault = folder_fault(path.parent, shared=group is not None)
+    if fault:
+        raise AddressError(fault)
     if answers(path):
         raise AddressError(f"Another daemon answers on {path}; see rigd status.")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
@@ -96,7 +109,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
 
 def running() -> list[Path]:
     """Return the sockets of all daemons that this user can reach."""
-    sockets = address_files(f"*{_SUFFIX}", runtime_folder(), COMMON)
+    sockets = address_files(f"*{SUFFIX}", *_folders())
     return [path for path in sockets if answers(path)]
 
 
@@ -109,20 +122,91 @@ def find(rig: str | None) -> Path:
         Naming the remedy.
     """
     if rig is not None:
-        for folder in (runtime_folder(), COMMON):
+        for folder in _folders():
             path = socket_path(rig, folder)
             if answers(path):
                 return path
         raise AddressError(
-            f"No daemon of the rig {rig} is running; start it with rigd serve --profile {rig}."
+            f"No daemon of the rig {rig} {_elsewhere(file_name(rig))}rigd serve --profile {rig}."
         )
     found = running()
     if not found:
-        raise AddressError("No daemon is running; start it with rigd serve --profile NAME.")
+        raise AddressError(f"No daemon {_elsewhere(None)}rigd serve --profile NAME.")
     if len(found) > 1:
-        rigs = ", ".join(path.name.removesuffix(_SUFFIX) for path in found)
+        rigs = ", ".join(path.name.removesuffix(SUFFIX) for path in found)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
     return found[0]
+
+
+def _folders() -> list[Path]:
+    """Return the folders in which a daemon is found, without that of groups if it is unsafe."""
+    return [runtime_folder()] if folder_fault(COMMON, shared=True) else [runtime_folder(), COMMON]
+
+
+def _elsewhere(rig: str | None) -> str:
+    """Return the reason why no daemon is found, up to the command that starts one.
+
+    Parameters
+    ----------
+    rig
+        Name of the rig as file names have it; None: any.
+    """
+    fault = folder_fault(COMMON, shared=True)
+    unsafe = address_files(f"*{SUFFIX}", COMMON) if fault else []
+    others = []
+    with suppress(OSError):
+        others = [path for path in own_sockets() if rig in (None, path.name.removesuffix(SUFFIX))]
+    folders = " or ".join(map(str, _folders()))
+    if unsafe:
+        return f"answers in {folders}. {fault} Without one there, start it with "
+    if others:
+        return (
+            f"answers in {folders}, but one listens on {others[0]}: set XDG_RUNTIME_DIR as it was "
+            "set for that one, or start another with "
+        )
+    return "is running; start it with "
+
+
+def own_sockets() -> list[Path]:
+    """Return the sockets on which this user's daemons listen, by the kernel's list.
+
+    For root they are those of all users.
+
+    Raises
+    ------
+    OSError
+        If the system has no such list.
+    """
+    found = []
+    for path in listening_sockets():
+        folder = path.parent.name
+        if path.name.endswith(SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
+            with suppress(OSError, ValueError):  # it is gone, or in a folder of another user
+                status = path.lstat()
+                if stat.S_ISSOCK(status.st_mode) and os.getuid() in (0, status.st_uid):
+                    found.append(path)
+    return found
+
+
+def peer_at(path: Path) -> tuple[int, int] | None:
+    """Return process and user that listen on a socket; None if its queue is full.
+
+    Parameters
+    ----------
+    path
+        Path of the socket.
+
+    Raises
+    ------
+    OSError
+        If nobody listens there, or this user may not connect.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as link:
+        try:
+            link.connect(os.fspath(path))
+        except BlockingIOError:
+            return None
+        return peer_of(link)
 
 
 def _group_number(group: str) -> int:

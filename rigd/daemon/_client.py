@@ -2,12 +2,11 @@
 
 import json
 import os
-import signal
 import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -18,11 +17,9 @@ from rigd.daemon._address import peer_of, running
 from rigd.errors import FailureError, RigdError
 from rigd.live import LiveAddress
 from rigd.live import running as running_views
+from rigd.runtime import STOP_SIGNAL, read_process, read_processes, send_signal
 
 Document = dict[str, Any]
-
-STOP_SIGNAL = signal.SIGUSR1
-"""Asks the daemon's process for what `stop` asks for."""
 
 _ANSWER_PATIENCE_S = 60.0
 """Reconnecting the devices takes up to half of it."""
@@ -37,7 +34,7 @@ _END_PATIENCE_S = 3.0
 _PAUSE_S = 0.02
 _LOOK_S = 0.1
 _TIME = struct.Struct("@ll")
-_UNKNOWN = (
+UNKNOWN_STATE = (
     "A session may still be running: check the rig, and press the wired stop (STO) if "
     "anything moves."
 )
@@ -131,7 +128,7 @@ class Client:
             link.close()
             raise DaemonGoneError(
                 f"The daemon on {self._path} takes no connection within {self._connect_s:g} s: "
-                f"it is suspended, or overloaded by other clients. {_UNKNOWN}"
+                f"it is suspended, or overloaded by other clients. {UNKNOWN_STATE}"
             ) from None
         except OSError as error:
             link.close()
@@ -239,7 +236,7 @@ class Client:
                 return message
         raise DaemonGoneError(
             f"The daemon (process {self.pid}) does not answer within {self._answer_s:g} s. "
-            f"{_UNKNOWN}"
+            f"{UNKNOWN_STATE}"
         )
 
     def send(self, command: str, **fields: object) -> None:
@@ -335,8 +332,8 @@ def stop_session(path: Path) -> Document:
     Returns
     -------
     dict
-        Its reply, and ``signalled``: whether its process was sent the signal before. Then what ran
-        may have ended before it replied.
+        Its reply; ``signalled``: whether its process was sent the signal before, so that what ran
+        may have ended before it replied; ``peer``: process and user that replied.
 
     Raises
     ------
@@ -353,7 +350,7 @@ def stop_session(path: Path) -> Document:
         try:
             with Client(path, answer_s, answer_s) as client:
                 seen = client.pid, client.uid
-                return client.ask("stop") | {"signalled": signalled}
+                return client.ask("stop") | {"signalled": signalled, "peer": seen}
         except (DaemonGoneError, _CrowdedError) as error:
             failure = str(error)
         waited_s = time.monotonic() - began_s
@@ -370,11 +367,13 @@ def stop_session(path: Path) -> Document:
         raise DaemonGoneError(failure, seen)
     raise DaemonGoneError(
         f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
-        f"has said nothing for {waited_s:.0f} s. {_UNKNOWN}"
+        f"has said nothing for {waited_s:.0f} s. {UNKNOWN_STATE}"
     )
 
 
-def await_end(path: Path, patience_s: float) -> Document | None:
+def await_end(
+    path: Path, patience_s: float, peer: tuple[int, int] | None = None
+) -> Document | None:
     """Wait until a daemon says that no session runs.
 
     Parameters
@@ -383,6 +382,8 @@ def await_end(path: Path, patience_s: float) -> Document | None:
         Socket of the daemon.
     patience_s
         Longest wait.
+    peer
+        Process and user that have to answer there; None: any.
 
     Returns
     -------
@@ -397,14 +398,19 @@ def await_end(path: Path, patience_s: float) -> Document | None:
     """
     deadline_s = time.monotonic() + patience_s
     with Client(path, answer_s=patience_s) as client:
+        if peer not in (None, (client.pid, client.uid)):
+            raise DaemonGoneError(f"Another process listens on {path} now. {UNKNOWN_STATE}")
         while True:
             try:
                 status = client.ask("status")
             except _CrowdedError:
                 return None
             series = status["series"]
-            if status["state"] not in ("running", "stopping") and not (
-                series is not None and series["running"]
+            # A stop that comes while a session is planned is obeyed after that, before it begins.
+            if status["state"] not in ("running", "stopping") and (
+                series is None
+                or not series["running"]
+                or (series.get("stopped") and status.get("doing") == "planning")
             ):
                 return status
             if time.monotonic() > deadline_s:
@@ -422,14 +428,14 @@ def what_is_left(pid: int, uid: int) -> str:
     """
     deadline_s = time.monotonic() + _END_PATIENCE_S
     while True:
-        daemon, control = _is_there(pid), list(_control_processes(pid))
+        daemon, control = _is_there(pid), _control_processes(pid)
         if not (daemon or control) or time.monotonic() > deadline_s:
             break
         time.sleep(_PAUSE_S)
     if daemon:
         return (
             f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
-            f"status. {_UNKNOWN}"
+            f"status. {UNKNOWN_STATE}"
         )
     begin_again = "see the daemon's log for the cause, and start it again with rigd serve."
     if control:
@@ -438,7 +444,7 @@ def what_is_left(pid: int, uid: int) -> str:
             "and may move the motor: press the wired stop (STO). Then " + begin_again
         )
     if uid != os.getuid() and not _sees_other_users():
-        return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
+        return f"The daemon is gone (process {pid}). {UNKNOWN_STATE} Then {begin_again}"
     return (
         "The daemon is gone. Its control process, which alone moves the motor, has ended too: "
         "check that the rig is at rest. What was recorded of a session is in the daemon's output "
@@ -467,27 +473,26 @@ def _sees_other_users() -> bool:
         return False
 
 
-def _control_processes(pid: int) -> Iterator[int]:
+def _control_processes(pid: int) -> list[int]:
     """Return the control processes of a supervisor: its number is their only argument."""
-    from rigd.engine import CONTROL
+    from rigd.engine import supervisor_of_control
 
-    wanted = [b"-m", CONTROL.module.encode(), str(pid).encode(), b""]
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            with suppress(OSError):
-                if (entry / "cmdline").read_bytes().split(b"\0")[-4:] == wanted:
-                    yield int(entry.name)
+    with suppress(OSError):
+        return [
+            process.pid
+            for process in read_processes()
+            if supervisor_of_control(process.command) == pid
+        ]
+    return []
 
 
 def _signal_stop(pid: int) -> bool:
     """Send the daemon its signal, if it is one that handles it: others would die of it."""
-    with suppress(OSError, ValueError, IndexError):
-        status = Path(f"/proc/{pid}/status").read_text()
-        caught = int(status.partition("SigCgt:")[2].split()[0], 16)
-        if caught >> (STOP_SIGNAL - 1) & 1:
-            os.kill(pid, STOP_SIGNAL)
-            return True
-    return False
+    process = read_process(pid)
+    if process is None or not process.handles(STOP_SIGNAL):
+        return False
+    born = process.born
+    return born is not None and send_signal(process, born, STOP_SIGNAL)
 
 
 # Running daemons

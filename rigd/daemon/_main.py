@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 from rigd.daemon._address import COMMON, bind, socket_path
-from rigd.daemon._client import STOP_SIGNAL
 from rigd.daemon._log import NAME, Log
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
@@ -18,7 +17,7 @@ from rigd.daemon._states import look_up_user
 from rigd.devices import WhatMoves, reality, simulated_differently, what_moves
 from rigd.profile import Profile
 from rigd.runner import Rig
-from rigd.runtime import RigLock
+from rigd.runtime import STOP_SIGNAL, RigLock
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 

@@ -5,22 +5,16 @@ looks here first, so that a motor never moves where a simulation was meant.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigd.runtime import announce as write_address
-from rigd.runtime import answers, read_address, runtime_folder
+from rigd.runtime import answers, listening_sockets, read_address, runtime_folder
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
-
-_SOCKETS = Path("/proc/net/unix")
-_LISTENER = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
-"""Any user may give a socket any name, even with a line break in it."""
-_LISTENS = 0x10000
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,18 +86,10 @@ def unreachable_simulators(rig_name: str) -> list[Path]:
     The kernel lists them whoever runs the simulator, and wherever its runtime folder is. Ask only
     if `find_simulator` finds none: those that are listed then cannot be reached from here.
     """
-    found = set()
     try:
-        # Num RefCount Protocol Flags Type St Inode Path
-        lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").split("\n")
+        return [path for path in listening_sockets() if path.name == f"{rig_name}.control"]
     except OSError:
         return []
-    for match in filter(None, map(_LISTENER.fullmatch, lines)):
-        if int(match[1], 16) & _LISTENS:
-            path = Path(match[2])
-            if path.name == f"{rig_name}.control":
-                found.add(path)
-    return sorted(found)
 
 
 def _flat(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:

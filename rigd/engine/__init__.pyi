@@ -1,3 +1,6 @@
+from ._control_names import IDLE_NAME as IDLE_NAME
+from ._control_names import SESSION_NAME as SESSION_NAME
+from ._control_names import supervisor_of_control as supervisor_of_control
 from ._cycle import Cycle as Cycle
 from ._cycle import make_observers as make_observers
 from ._cycle import make_watch as make_watch

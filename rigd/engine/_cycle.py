@@ -22,7 +22,7 @@ from rigd.control import PidController
 from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
-from rigd.runtime import runtime_folder
+from rigd.runtime import UnsafeFolderError, runtime_folder
 from rigd.safety import (
     BeamPrediction,
     EncoderWatch,
@@ -583,9 +583,9 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
 
     Without a place for it, the next one takes the motor for cold.
     """
-    path = _heat_file(profile)
     document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
-    with suppress(OSError):
+    with suppress(OSError, UnsafeFolderError):
+        path = _heat_file(profile)
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         fresh = path.with_suffix(".new")
         fresh.write_text(json.dumps(document), encoding="utf-8")
@@ -600,7 +600,7 @@ def recalled_heat_nm2(profile: Profile) -> float:
     try:
         document = json.loads(_heat_file(profile).read_text("utf-8"))
         heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, UnsafeFolderError, ValueError, TypeError, KeyError):
         return 0.0
     passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
     if not isfinite(heat_nm2) or not passed_s >= 0.0:  # from before a reboot

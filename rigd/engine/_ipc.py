@@ -19,6 +19,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rigd.engine._control_names import CONTROL_MODULE
 from rigd.engine._messages import MessageReader, encode, is_ready
 from rigd.engine._shared_state import Word
 from rigd.errors import FailureError
@@ -263,7 +264,7 @@ class Process:
 
 CONTROL = Process(
     "control",
-    "rigd.engine.control_process",
+    CONTROL_MODULE,
     Word.CONTROL_BEAT,
     hung_after_s=3.0,
     grace_s=5.0,

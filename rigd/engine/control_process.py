@@ -12,6 +12,7 @@ from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
 from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
+from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
 from rigd.engine._cycle import (
     Cycle,
     Rest,
@@ -49,7 +50,7 @@ from rigd.engine._timing import (
 )
 from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
-from rigd.runtime import StopRequest
+from rigd.runtime import StopRequest, name_this_process
 from rigd.safety import LOOK_EVERY
 from rigd.session import WRENCH_FIELDS
 
@@ -105,6 +106,7 @@ def attend(
         The real-time settings that were granted, for the file.
     """
     failure = ""
+    name_this_process(CONNECTING_NAME)
     try:
         # The drive last: once it is operational it expects a SYNC every period.
         devices.sensor.connect()
@@ -113,6 +115,7 @@ def attend(
         attendance = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
         channels.board[Word.PHASE] = Phase.OFF
         attendance.take_up_standstill()
+        name_this_process(IDLE_NAME)
         parent.send(
             Connected(
                 calibration=devices.sensor.calibration(),
@@ -296,6 +299,7 @@ class _ControlServer:
         )
         outcome, reason = "complete", ""
         recorded = device_failed = False
+        name_this_process(SESSION_NAME)
         try:
             tare = procedure.tare()
             devices.drive.enable(procedure.stop_asked)
@@ -320,6 +324,8 @@ class _ControlServer:
         doubt = devices.drive.off_doubt
         if doubt:
             outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
+        else:
+            name_this_process(IDLE_NAME)
         failure, fault = reason, outcome == "fault"
         if recorded and reason:
             # What happens after the last tick does not make the record any less complete.

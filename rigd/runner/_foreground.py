@@ -235,6 +235,7 @@ def _tell(text: str, *, err: bool) -> None:
 
 def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
     """Give the last quick looks their time; another Ctrl-C skips them."""
+    stop.sessions_are_over()
     before, skipped = stop.requested, False
 
     def skip() -> None:

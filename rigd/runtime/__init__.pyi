@@ -1,7 +1,10 @@
+from ._addresses import UnsafeFolderError as UnsafeFolderError
 from ._addresses import address_files as address_files
 from ._addresses import announce as announce
 from ._addresses import answers as answers
 from ._addresses import file_name as file_name
+from ._addresses import folder_fault as folder_fault
+from ._addresses import known_folders as known_folders
 from ._addresses import read_address as read_address
 from ._addresses import runtime_folder as runtime_folder
 from ._addresses import started_at as started_at
@@ -16,7 +19,16 @@ from ._locks import HeldError as HeldError
 from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
+from ._locks import held_rig as held_rig
+from ._locks import holds_rig as holds_rig
 from ._plain_files import open_plain_file as open_plain_file
+from ._processes import RunningProcess as RunningProcess
+from ._processes import listening_sockets as listening_sockets
+from ._processes import name_this_process as name_this_process
+from ._processes import read_process as read_process
+from ._processes import read_processes as read_processes
+from ._processes import send_signal as send_signal
+from ._stop_signals import STOP_SIGNAL as STOP_SIGNAL
 from ._stop_signals import StopRequest as StopRequest
 from ._stop_signals import held_back as held_back
 from ._stop_signals import ignore as ignore

@@ -8,6 +8,7 @@ by that process being gone (`started_at`).
 import itertools
 import json
 import os
+import re
 import socket
 import stat
 import tempfile
@@ -16,6 +17,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from rigd.errors import FailureError
+
+_LOGINS: Final = Path("/run/user")
+"""Holds the runtime folder of each user who is logged in."""
+_FALLBACK: Final = re.compile(r"rigd-(\d{1,10})(?:-(\d{1,9}))?")
 _PROBE_S: Final = 1.0
 _MOST_BYTES: Final = 65_536
 
@@ -23,25 +29,124 @@ _MOST_BYTES: Final = 65_536
 # Folder
 
 
+class UnsafeFolderError(FailureError):
+    """Other users can change what is in the runtime folder; the message names the remedy."""
+
+
 def runtime_folder() -> Path:
-    """Return the folder for sockets and addresses: of this user, gone after a restart."""
+    """Return the folder for sockets and addresses: of this user, gone after a restart.
+
+    Raises
+    ------
+    UnsafeFolderError
+        If other users can write to it.
+    """
     base = os.environ.get("XDG_RUNTIME_DIR")
     if base and Path(base).is_dir():
-        return Path(base) / "rigd"
-    return _own_folder(Path(tempfile.gettempdir()) / f"rigd-{os.getuid()}")
+        folder = Path(base) / "rigd"
+    else:
+        folder = _own_folder(Path(tempfile.gettempdir()))
+    fault = folder_fault(folder)
+    if fault:
+        raise UnsafeFolderError(fault)
+    return folder
 
 
-def _own_folder(path: Path) -> Path:
-    """Make a folder where everybody may; a name that somebody else took is passed over."""
+def folder_fault(folder: Path, *, shared: bool = False) -> str:
+    """Say why other users can replace what is in a runtime folder; empty if they cannot.
+
+    Parameters
+    ----------
+    folder
+        The folder; one that does not exist is sound if its parent is.
+    shared
+        The folder may belong to any user, as that of a group does.
+    """
+    for path in (folder.parent, folder):
+        try:
+            status = path.stat()
+        except OSError:
+            continue
+        writable = status.st_mode & 0o022
+        if path == folder.parent and status.st_mode & stat.S_ISVTX:
+            writable = 0  # in a sticky folder a user can remove only what is that user's own
+        if writable:
+            whom = "every user" if writable & 0o002 else "its group"
+            return (
+                f"The runtime folder {path} is writable by {whom} (mode "
+                f"{stat.S_IMODE(status.st_mode):04o}), who could replace the daemon's socket; run "
+                f"chmod go-w {path}, or set XDG_RUNTIME_DIR to a folder that only you can write to."
+            )
+        owners = (0, os.getuid())
+        if path == folder and not shared and os.getuid() and status.st_uid not in owners:
+            return (
+                f"The runtime folder {path} belongs to another user ({status.st_uid}); set "
+                "XDG_RUNTIME_DIR to a folder that is yours."
+            )
+    return ""
+
+
+def known_folders(uid: int | None) -> list[Path]:
+    """Return where runtime folders of a user are, whatever the environment of its processes.
+
+    Parameters
+    ----------
+    uid
+        Number of the user; None: any user.
+
+    Returns
+    -------
+    list of Path
+        That of this environment, the login session's, and those in the folder for temporary files.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    found = [Path(base) / "rigd"] if base else []
+    if uid is None:
+        with suppress(OSError):
+            found += [each / "rigd" for each in _LOGINS.iterdir()]
+    else:
+        found.append(_LOGINS / str(uid) / "rigd")
+    for temporary in {Path(tempfile.gettempdir()), Path("/tmp")}:
+        found += _fallback_folders(temporary, uid)
+    return sorted(set(found))
+
+
+def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
+    """Return the folders that `_own_folder` has made for a user, or for all, lowest number first.
+
+    A folder of such a name that belongs to another user is left out.
+    """
+    found = []
+    with suppress(OSError), os.scandir(base) as entries:
+        for entry in entries:
+            match = _FALLBACK.fullmatch(entry.name)
+            if match is None or uid not in (None, int(match[1])):
+                continue
+            with suppress(OSError):
+                status = entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(status.st_mode) and status.st_uid == int(match[1]):
+                    found.append((int(match[1]), int(match[2] or 0), Path(entry.path)))
+    return [path for *_, path in sorted(found)]
+
+
+def _own_folder(base: Path) -> Path:
+    """Return the user's folder among those of all users; make it if there is none.
+
+    A name that another user took is passed over. A folder made while that was so is found again
+    after the other user has given the name up.
+    """
+    uid = os.getuid()
+    own = _fallback_folders(base, uid)
+    path = own[0] if own else base / f"rigd-{uid}"
     for number in itertools.count(1):
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
         status = path.lstat()
-        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid():
-            if status.st_mode & 0o077:
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == uid:
+            if status.st_mode & 0o055 and not status.st_mode & 0o022:
                 path.chmod(0o700)
             return path
-        path = path.with_name(f"rigd-{os.getuid()}-{number}")
+        path = base / f"rigd-{uid}-{number}"
     raise AssertionError("never reached")
 
 

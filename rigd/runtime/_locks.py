@@ -15,6 +15,7 @@ from rigd.runtime._addresses import file_name, runtime_folder
 _COMMON = Path("/run/lock")
 _LOCKS = Path("/proc/locks")
 _NAME_SIZE = 200
+_RIG_LOCK = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$")
 
 
 class HeldError(Exception):
@@ -100,21 +101,35 @@ def _others(fd: int, said: str) -> str:
 
     Any user may write to the file, and hold the lock.
     """
-    inode = str(os.fstat(fd).st_ino)
+    inode = os.fstat(fd).st_ino
     try:
-        # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
-        rows = [line.split() for line in _LOCKS.read_text("ascii").splitlines()]
+        holders = sorted(pid for pid, held in _held_inodes() if held == inode)
     except OSError:
         return ""
     found = ""
-    for row in rows:
-        if len(row) < 6 or row[1] != "FLOCK" or row[5].rpartition(":")[2] != inode:
-            continue
-        if re.search(rf"\bprocess {row[4]}\b", said):
+    for pid in holders:
+        if re.search(rf"\bprocess {pid}\b", said):
             return ""
         with suppress(OSError):
-            found = f"; held by process {row[4]} of user {Path('/proc', row[4]).stat().st_uid}"
+            found = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
     return found
+
+
+def _held_inodes() -> set[tuple[int, int]]:
+    """Return process and inode of each file lock on this computer, by the kernel's table.
+
+    Raises
+    ------
+    OSError
+        If the system has no such table.
+    """
+    # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
+    rows = [line.split() for line in _LOCKS.read_text("ascii").splitlines()]
+    return {
+        (int(row[4]), int(row[5].rpartition(":")[2]))
+        for row in rows
+        if len(row) >= 6 and row[1] == "FLOCK"
+    }
 
 
 # One program at a time on a rig
@@ -177,3 +192,59 @@ class RigLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def holds_rig(pid: int, rig: str, folder: Path) -> bool:
+    """Whether a process holds the lock of a rig, by the kernel's table of locks.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+    rig
+        Name of the rig.
+    folder
+        Runtime folder in which the lock is looked for, apart from where the process opened it.
+
+    Raises
+    ------
+    OSError
+        If the system has no such table.
+    """
+    held = _held_inodes()
+    plain = f"rig-{file_name(rig)}"
+    files = [folder / f"{plain}.lock", _COMMON / f"rigd-{plain}.lock"]
+    files += [path for name, path in _open_locks(pid) if name == file_name(rig)]
+    for path in files:
+        with suppress(OSError):
+            if (pid, path.stat().st_ino) in held:
+                return True
+    return False
+
+
+def held_rig(pid: int) -> str | None:
+    """Return the name of the rig whose lock a process has open, as file names have it.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+
+    Returns
+    -------
+    str or None
+        The name; None if it has none, or the system does not show its files.
+    """
+    return next((name for name, _ in _open_locks(pid)), None)
+
+
+def _open_locks(pid: int) -> list[tuple[str, Path]]:
+    """Return the rigs' locks that a process has open: name of the rig, and way to the file."""
+    found = []
+    with suppress(OSError):
+        for entry in Path("/proc", str(pid), "fd").iterdir():
+            with suppress(OSError):
+                match = _RIG_LOCK.search(str(entry.readlink()))
+                if match is not None:
+                    found.append((match[1], entry))
+    return found

@@ -80,7 +80,17 @@ def signal_when_orphaned(number: int) -> None:
 
 # In the processes of a rig
 
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+STOP_SIGNAL: Final = signal.SIGUSR1
+"""Asks the process that runs sessions for their end, and for nothing else: a daemon goes on.
+
+The process table shows whether there can be any: by default they have not begun, a process that
+handles the signal may run one, a process that ignores it runs none any more.
+"""
+
+_STOPPING = (
+    *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP),
+    STOP_SIGNAL,
+)
 
 
 @contextmanager
@@ -124,6 +134,12 @@ class StopRequest:
             if signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, lambda *_: self.request())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
+
+    def sessions_are_over(self) -> None:
+        """Show in the process table that this process runs no session any more."""
+        if callable(signal.getsignal(STOP_SIGNAL)):
+            with contextlib.suppress(ValueError):  # not in the main thread
+                signal.signal(STOP_SIGNAL, signal.SIG_IGN)
 
     def request(self) -> None:
         """Ask for a stop."""

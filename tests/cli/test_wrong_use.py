@@ -122,7 +122,7 @@ def test_a_plain_word_in_the_wrong_place_is_explained(rigd_here, tmp_path):
     ],
 )
 def test_what_the_system_refuses_is_told_as_what_it_is(error, words):
-    from rigd.cli.app import _explained
+    from rigd.cli.entry import _explained
 
     for word in words:
         assert word in _explained(error)

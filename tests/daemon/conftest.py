@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -9,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from rigd.daemon import _protocol as protocol
+from rigd.daemon import _stop as stop_module
+from rigd.daemon._address import own_sockets
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._service import Service
 from rigd.daemon._states import Peer, State
@@ -21,6 +24,7 @@ from rigd.profile import load_profile
 from rigd.runner import _rig as rig_module
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
+from rigd.runtime import read_processes
 from rigd.runtime._stop_signals import StopRequest
 from rigd.session import SessionError, SessionWriter
 
@@ -360,3 +364,32 @@ def operate(profile, tmp_path, monkeypatch):
 def operated(operate):
     """A service whose rig is connected."""
     return operate().open()
+
+
+@pytest.fixture
+def stop_here(runtime_folder, rigd_here, monkeypatch):
+    """Run `rigd stop` in this process; it finds only what this test has started."""
+
+    def own_processes():
+        rows = {process.pid: process for process in read_processes()}
+
+        def is_own(process):
+            while process is not None and process.pid != os.getpid():
+                process = rows.get(process.parent)
+            return process is not None
+
+        return [process for process in rows.values() if is_own(process)]
+
+    def sockets():
+        return [path for path in own_sockets() if runtime_folder in path.parents]
+
+    monkeypatch.setattr(stop_module, "read_processes", own_processes)
+    monkeypatch.setattr(stop_module, "own_sockets", sockets)
+    monkeypatch.setattr(stop_module, "known_folders", lambda _: [runtime_folder / "rigd"])
+    monkeypatch.setattr(stop_module, "COMMON", runtime_folder / "common")
+
+    def run(*arguments):
+        done = rigd_here("stop", *arguments)
+        return done.returncode, done.stdout, done.stderr
+
+    return run

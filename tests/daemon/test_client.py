@@ -192,11 +192,19 @@ def test_a_process_that_is_dead_but_not_buried_is_gone():
     process.wait()
 
 
-def test_the_end_is_waited_for_until_it_is_seen(path):
+@pytest.mark.parametrize(
+    "last",
+    [
+        {"state": "ready", "series": {"running": False}},
+        {"state": "ready", "doing": "planning", "series": {"running": True, "stopped": True}},
+    ],
+)
+def test_the_end_is_waited_for_until_it_is_seen(path, last):
     states = [
         {"state": "running", "series": {"running": True}},
         {"state": "stopping", "series": {"running": True}},
-        {"state": "ready", "series": {"running": False}},
+        {"state": "ready", "doing": "planning", "series": {"running": True, "stopped": False}},
+        last,
     ]
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))

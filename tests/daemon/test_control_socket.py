@@ -343,6 +343,10 @@ def test_a_group_may_use_it_if_asked_for(runtime_folder):
     with pytest.raises(AddressError, match=f"closed to the group {group}"):
         bind(path, group)
     common.chmod(0o710)
+    common.chmod(0o2770)
+    with pytest.raises(AddressError, match=f"{common} is writable by its group"):
+        bind(path, group)
+    common.chmod(0o710)
     with bind(path, group):
         assert mode(path) == 0o660
         assert path.stat().st_gid == os.getgid()
@@ -372,6 +376,12 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
         assert find("two") == socket_path("two")
         with pytest.raises(AddressError, match="rigd serve --profile three"):
             find("three")
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime_folder / "rigd"))
+        elsewhere = f"one listens on {socket_path('one', runtime_folder / 'rigd')}"
+        with pytest.raises(AddressError, match=elsewhere):
+            find("one")
+        monkeypatch.undo()
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime_folder))
         assert isinstance(find("one"), Path)
 
 

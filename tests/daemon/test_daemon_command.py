@@ -118,7 +118,7 @@ def control_process():
 
 
 def test_without_a_daemon_every_command_says_how_to_start_one(runtime_folder, ask_here):
-    for command in (("status",), ("stop",), ("start", "hold")):
+    for command in (("status",), ("start", "hold")):
         code, out, err = ask_here(*command)
         assert (code, out) == (1, "")
         assert "rigd serve --profile" in err
@@ -227,7 +227,7 @@ def test_a_record_is_fitted_while_it_is_recorded(serve, ask, ask_here):
     assert told["text"][0] in out
 
 
-def test_a_session_survives_its_client_and_ends_by_a_stop(serve, ask, rigd):
+def test_a_session_survives_its_client_and_ends_by_a_stop(serve, stop_here, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
     until(recording, daemon)
@@ -235,7 +235,7 @@ def test_a_session_survives_its_client_and_ends_by_a_stop(serve, ask, rigd):
     client.wait()
     until(lambda: request("status")["controller"] is None)
     assert request("status")["state"] == "running"
-    code, out, _ = ask("stop")
+    code, out, _ = stop_here()
     assert code == 0
     assert "The session has ended; the torque is off." in out
     assert request("status")["state"] == "ready"
@@ -247,11 +247,11 @@ def test_a_session_survives_its_client_and_ends_by_a_stop(serve, ask, rigd):
 
 
 @pytest.mark.further  # as by a stop that is waited for
-def test_a_session_ends_by_every_other_way_of_stopping_it(serve, ask, rigd):
+def test_a_session_ends_by_every_other_way_of_stopping_it(serve, stop_here, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
-    code, out, _ = ask("stop", "--no-wait")
+    code, out, _ = stop_here("--no-wait")
     assert code == 0
     assert "is being stopped" in out
     client.communicate(timeout=300.0)
@@ -263,8 +263,10 @@ def test_a_session_ends_by_every_other_way_of_stopping_it(serve, ask, rigd):
     client.communicate(timeout=300.0)
     assert client.returncode == 130
     until(lambda: request("status")["state"] == "ready", daemon)
-    code, out, _ = ask("stop")
-    assert (code, out) == (0, "No session is running; the torque is off.\n")
+    code, out, _ = stop_here()
+    assert code == 0
+    assert out.startswith("No session is running on the rig sim")
+    assert out.endswith("; the torque is off.\n")
 
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
@@ -307,7 +309,7 @@ while True:
 
 
 @pytest.mark.further  # as test_control_socket.py
-def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask):
+def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask, stop_here):
     daemon = serve()
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
@@ -319,7 +321,7 @@ def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask):
         code, out, err = ask("status", "--json")
         assert code == 0, err
         assert json.loads(out)["state"] == "running"
-        code, out, err = ask("stop")
+        code, out, err = stop_here()
         assert code == 0, err
         assert "The session has ended; the torque is off." in out
     finally:

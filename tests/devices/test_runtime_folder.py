@@ -6,7 +6,7 @@ import tempfile
 
 import pytest
 
-from rigd.runtime._addresses import runtime_folder
+from rigd.runtime._addresses import UnsafeFolderError, folder_fault, known_folders, runtime_folder
 from rigd.runtime._locks import HeldFile
 
 
@@ -37,6 +37,42 @@ def test_without_one_of_its_own_a_user_gets_one_that_nobody_else_can_enter(
     assert (folder == name) is (taken_by == "nobody")
     assert stat.S_IMODE(folder.lstat().st_mode) == 0o700
     assert folder.lstat().st_uid == os.getuid()
+
+
+def test_a_folder_made_beside_another_user_s_is_found_after_that_one_is_gone(common):
+    taken = common / f"rigd-{os.getuid()}"
+    taken.touch()
+    folder = runtime_folder()
+    taken.unlink()
+    assert runtime_folder() == folder
+    assert folder in known_folders(os.getuid())
+    assert not taken.exists()
+    taken.mkdir(mode=0o700)  # both are this user's
+    assert runtime_folder() == taken
+    assert set(known_folders(os.getuid())) >= {folder, taken}
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o2770, 0o1777])
+def test_a_folder_that_others_can_write_to_is_refused(runtime_folder, mode):
+    folder = runtime_folder / "rigd"
+    held = HeldFile("rig-a", everybody=False)  # before the mode is wrong
+    held.acquire("rigd run")
+    held.release()
+    folder.chmod(mode)
+    with pytest.raises(UnsafeFolderError, match=rf"{folder} .*{mode:04o}.*chmod go-w {folder}"):
+        HeldFile("rig-a", everybody=False)
+    assert folder_fault(folder, shared=True)
+    folder.chmod(0o2750)
+    assert not folder_fault(folder)
+    assert HeldFile("rig-a", everybody=False).path.parent == folder
+
+
+def test_a_folder_whose_parent_others_can_write_to_is_refused(runtime_folder):
+    runtime_folder.chmod(0o770)
+    with pytest.raises(UnsafeFolderError, match=f"{runtime_folder} is writable by its group"):
+        HeldFile("rig-a", everybody=False)
+    runtime_folder.chmod(0o1777)  # as /tmp: nobody can replace what is another's
+    assert HeldFile("rig-a", everybody=False).path.parent == runtime_folder / "rigd"
 
 
 def test_a_lock_follows_no_link(runtime_folder):

@@ -1,0 +1,47 @@
+"""What every command of ``rigd`` begins and ends with; quick to import, for a stop."""
+
+import contextlib
+import errno
+import io
+import os
+import signal
+import sys
+from collections.abc import Callable
+
+from rigd.runtime import raise_on
+
+EXIT_FAILED = 1
+EXIT_WRONG_USE = 2
+EXIT_INTERRUPTED = 130
+
+
+def run_command(command: Callable[[], object]) -> None:
+    """Run a command, and end the process as it ends."""
+    raise_on(signal.SIGINT)
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    try:
+        command()
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)
+    except OSError as error:
+        with contextlib.suppress(OSError):  # standard error may be closed as well
+            sys.stderr.write(f"Error: {_explained(error)}\n")
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_FAILED)
+
+
+def _explained(error: OSError) -> str:
+    """Say what the system refused, where no command has."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return (
+            f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "
+            "or close other programs."
+        )
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}."
+    # The output of a command is not read, or the disk behind it is full.
+    return f"the output cannot be written ({error.strerror})."

@@ -1,0 +1,68 @@
+"""What ``rigd stop`` does and prints; quick to import, without reading options."""
+
+import sys
+from typing import TYPE_CHECKING
+
+from rigd.cli.entry import EXIT_FAILED, run_command
+from rigd.daemon import stop_all
+
+if TYPE_CHECKING:
+    from rigd.daemon import StopReport
+
+
+def main() -> None:
+    """Entry point of ``rigd stop`` without options: reading them takes longer than the stop."""
+    run_command(lambda: sys.exit(stop_and_report(None, wait=True)))
+
+
+def stop_and_report(profile: str | None, *, wait: bool) -> int:
+    """Stop what runs, print what became of it, and return the exit code.
+
+    Parameters
+    ----------
+    profile
+        Profile of the only rig to stop; None: all.
+    wait
+        Wait until the sessions have ended.
+    """
+    report = stop_all(profile, wait=wait)
+    if profile is not None and not report.found:
+        from rigd.profile import load_profile
+
+        name = load_profile(profile).name
+        if name != profile:
+            report = stop_all(name, wait=wait)
+    _print(report)
+    return 0 if report.sure else EXIT_FAILED
+
+
+def _print(report: "StopReport") -> None:
+    lines = [f"Stopped: {text}." for text in report.stopped]
+    lines += [f"{text} is being stopped." for text in report.stopping]
+    lines += report.quiet
+    if report.sure and not report.stopping:
+        if len(report.stopped) == 1:
+            lines.append("The session has ended; the torque is off.")
+        elif report.stopped:
+            lines.append(f"All {len(report.stopped)} sessions have ended; the torque is off.")
+        elif not report.quiet:
+            whose = " of yours" if report.others else ""
+            lines.append(f"No session{whose} is running. Searched: {', '.join(report.places)}.")
+    problems = [
+        f"Not stopped: {text}; only that user or root can stop it." for text in report.others
+    ]
+    problems += [
+        f"Error: {text} was asked to stop, but its session did not end; check rigd status and "
+        "the rig, and press the wired stop (STO) if anything moves."
+        for text in report.running
+    ]
+    problems += [f"Error: {text}" for text in report.doubts]
+    if report.doubts and not report.running:
+        problems.append(
+            "Whether another session runs is not known: check the rig, and press the wired stop "
+            "(STO) if anything moves."
+        )
+    for texts, stream in ((lines, sys.stdout), (problems, sys.stderr)):
+        if texts:
+            stream.write("".join(f"{text}\n" for text in texts))
+            stream.flush()

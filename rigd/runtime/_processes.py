@@ -1,0 +1,161 @@
+"""Process table of this computer, read from the kernel: what runs, listens and holds a lock.
+
+It does not depend on the environment of who asks, nor on the folder in which another process of
+the same user made its socket.
+"""
+
+import os
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rigd.runtime._addresses import started_at
+
+_PROC: Final = Path("/proc")
+_SOCKETS: Final = Path("/proc/net/unix")
+_LISTENER: Final = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
+"""Any user may give a socket any name, even with a line break in it."""
+_LISTENS: Final = 0x10000
+
+
+@dataclass(frozen=True, slots=True)
+class RunningProcess:
+    """One row of the process table."""
+
+    pid: int
+    """Its number."""
+    parent: int
+    """Number of the process that started it, or has taken it over."""
+    uid: int
+    """Its user; -1 while it changes users (a setuid program)."""
+    name: str
+    """Its short name (`name_this_process`)."""
+    command: tuple[str, ...]
+    """Its command line."""
+    caught: int
+    """Signals that it handles: bit n-1 for signal n; likewise the next two."""
+    ignored: int
+    """Signals that it ignores."""
+    pending: int
+    """Signals that were sent and not yet taken."""
+    suspended: bool
+    """It is stopped by a signal or a debugger."""
+
+    @property
+    def born(self) -> int | None:
+        """Start of the process in clock ticks since that of the computer; None: it has ended."""
+        return started_at(self.pid)
+
+    def handles(self, number: int) -> bool:
+        """Whether the process has a handler for a signal."""
+        return bool(self.caught >> (number - 1) & 1)
+
+    def ignores(self, number: int) -> bool:
+        """Whether the process ignores a signal."""
+        return bool(self.ignored >> (number - 1) & 1)
+
+    def awaits(self, number: int) -> bool:
+        """Whether a signal was sent that the process has not taken yet."""
+        return bool(self.pending >> (number - 1) & 1)
+
+
+def read_processes() -> list[RunningProcess]:
+    """Return all processes that this user can see, by number; those that have ended are left out.
+
+    Raises
+    ------
+    OSError
+        If the system has no process table.
+    """
+    numbers = sorted(int(entry.name) for entry in _PROC.iterdir() if entry.name.isdigit())
+    found = [process for process in map(read_process, numbers) if process is not None]
+    if not any(process.pid == os.getpid() for process in found):
+        raise FileNotFoundError(2, "this process is not in it", os.fspath(_PROC))
+    return found
+
+
+def read_process(pid: int) -> RunningProcess | None:
+    """Return the row of one process, or None if it has ended or cannot be seen.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+    """
+    try:
+        status = Path(_PROC, str(pid), "status").read_text("utf-8", errors="replace")
+        command = Path(_PROC, str(pid), "cmdline").read_bytes()
+        return _row(pid, status, command)
+    except (OSError, KeyError, ValueError, IndexError):
+        return None
+
+
+def _row(pid: int, status: str, command: bytes) -> RunningProcess | None:
+    rows = [line.partition(":\t") for line in status.split("\n")]
+    told = {key: value for key, _, value in reversed(rows)}  # the first of a name counts
+    state = told["State"][:1]
+    if state in "ZX":
+        return None
+    users = {int(number) for number in told["Uid"].split()}
+    return RunningProcess(
+        pid=pid,
+        parent=int(told["PPid"]),
+        uid=users.pop() if len(users) == 1 else -1,
+        name=told["Name"],
+        command=tuple(os.fsdecode(command).split("\0")[:-1]),
+        caught=int(told["SigCgt"], 16),
+        ignored=int(told["SigIgn"], 16),
+        pending=int(told["SigPnd"], 16) | int(told["ShdPnd"], 16),
+        suspended=state in "Tt",
+    )
+
+
+def send_signal(process: RunningProcess, born: int, number: int) -> bool:
+    """Send a signal to a process, unless it has ended; return whether it was sent.
+
+    Parameters
+    ----------
+    process
+        The process.
+    born
+        Its start: another process may have its number by now.
+    number
+        The signal.
+    """
+    if process.born != born:
+        return False
+    with suppress(OSError):
+        os.kill(process.pid, number)
+        return True
+    return False
+
+
+def name_this_process(name: str) -> None:
+    """Set the short name of the calling thread, which every user sees in the process table.
+
+    Parameters
+    ----------
+    name
+        At most 15 bytes.
+    """
+    with suppress(OSError):  # not on Linux
+        Path("/proc/thread-self/comm").write_text(name)
+
+
+def listening_sockets() -> list[Path]:
+    """Return the paths of the Unix sockets on which any process of this computer listens.
+
+    The kernel lists them whoever made them, and wherever; each only once, sorted. Any user may
+    give a socket any path.
+
+    Raises
+    ------
+    OSError
+        If the system has no such list.
+    """
+    # Num RefCount Protocol Flags Type St Inode Path
+    lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").split("\n")
+    matches = filter(None, map(_LISTENER.fullmatch, lines))
+    return sorted({Path(match[2]) for match in matches if int(match[1], 16) & _LISTENS})

@@ -1,0 +1,228 @@
+"""`rigd stop` finds what runs, and says that it has ended only where that was seen."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import replace
+
+import pytest
+from processes import eventually
+from stop_scenarios import SITUATIONS, can_isolate, isolated
+
+from rigd.daemon import Client
+from rigd.daemon import _stop as stop_module
+from rigd.daemon._address import socket_path
+from rigd.engine import CONTROL, IDLE_NAME, SESSION_NAME, supervisor_of_control
+from rigd.runtime import STOP_SIGNAL, answers, read_process, read_processes
+
+
+def control_of(pid):
+    """Short name of the control process of a supervisor."""
+    for process in read_processes():
+        if supervisor_of_control(process.command) == pid:
+            return process.name
+    return None
+
+
+def test_where_nothing_runs_it_says_where_it_looked(stop_here, runtime_folder):
+    code, out, err = stop_here()
+    assert (code, err) == (0, "")
+    assert out.startswith("No session is running. Searched: the process table")
+    assert str(runtime_folder / "rigd") in out
+
+
+def test_a_session_in_the_foreground_is_stopped_from_another_folder(
+    stop_here, start_rigd, monkeypatch, write_profile, tmp_path
+):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    with monkeypatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(elsewhere))
+        profile = write_profile("sim", patient=True)
+        hold = ("hold", "--duration", "100", "--rest", "0.2", "--no-look")
+        run = start_rigd("run", *hold, "--profile", profile)
+    assert eventually(lambda: run.poll() is not None or control_of(run.pid) == SESSION_NAME)
+    assert run.poll() is None, run.communicate()
+    code, out, err = stop_here("--profile", "sim")
+    assert (code, err) == (0, "")
+    assert f"Stopped: rigd run hold on the rig sim (process {run.pid})." in out
+    assert out.endswith("The session has ended; the torque is off.\n")
+    run.wait(60.0)
+    assert run.returncode == 130
+
+
+class Impostor:
+    """A thread that listens in place of a daemon, and says what a daemon would."""
+
+    def __init__(self, path):
+        path.unlink(missing_ok=True)
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(path))
+        self._listener.listen(8)
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self):
+        with suppress(OSError):
+            while True:
+                link, _ = self._listener.accept()
+                threading.Thread(target=self._answer, args=(link,), daemon=True).start()
+
+    def _answer(self, link):
+        with suppress(OSError), link, link.makefile("rw") as file:
+            for line in file:
+                reply = {"reply": json.loads(line)["command"], "ok": True, "stopping": True}
+                reply |= {"state": "ready", "series": None, "reason": ""}
+                file.write(json.dumps(reply) + "\n")
+                file.flush()
+
+    def close(self):
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+
+def test_an_impostor_on_the_socket_is_not_believed(
+    stop_here, start_rigd, runtime_folder, write_profile
+):
+    profile = write_profile("sim", patient=True)
+    daemon = start_rigd("serve", "--profile", profile, "--no-look")
+    path = socket_path("sim")
+    assert eventually(lambda: answers(path) and control_of(daemon.pid) == IDLE_NAME)
+    parameters = {"duration_s": 100.0, "rest_s": 0.2}
+    with Client(path) as client:
+        eventually(lambda: client.ask("status")["state"] == "ready")
+        client.ask("start", excitation="hold", parameters=parameters)
+    assert eventually(lambda: control_of(daemon.pid) == SESSION_NAME)
+    impostor = Impostor(path)
+    code, out, err = stop_here()
+    assert code == 1
+    assert f"Stopped: rigd serve on the rig sim (process {daemon.pid})." in out
+    assert "torque is off" not in out
+    assert f"The reply of process {os.getpid()} that listens on {path} is not believed." in err
+    assert control_of(daemon.pid) == IDLE_NAME
+    assert daemon.poll() is None
+
+    impostor.close()  # its socket does not listen any more, and the daemon's has no name
+    code, out, err = stop_here()
+    assert (code, err) == (0, "")
+    assert "No session is running on rigd serve on the rig sim" in out
+    assert "the torque is off" in out
+    daemon.terminate()
+
+
+def test_a_folder_that_others_can_write_to_is_no_proof(stop_here, runtime_folder):
+    runtime_folder.chmod(0o770)
+    impostor = Impostor(runtime_folder / "sim.daemon")
+    code, out, err = stop_here()
+    impostor.close()
+    assert (code, out) == (1, "")
+    assert f"{runtime_folder} is writable by its group" in err
+    assert "Whether another session runs is not known" in err
+
+
+def test_without_a_process_table_it_is_not_sure(stop_here, monkeypatch):
+    def no_table():
+        raise FileNotFoundError(2, "no such table")
+
+    monkeypatch.setattr(stop_module, "read_processes", no_table)
+    code, out, err = stop_here()
+    assert (code, out) == (1, "")
+    assert "The process table cannot be read (no such table)" in err
+
+
+LISTENER = """
+import signal, sys
+for number in (signal.SIGUSR1, signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: print(number, flush=True))
+print("listens", flush=True)
+for number in iter(signal.pause, 1):
+    pass
+"""
+
+
+@pytest.fixture
+def bystander():
+    """A process that prints each signal that it gets, and its row in the process table."""
+    process = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "listens\n"
+    yield process, read_process(process.pid)
+    process.kill()
+    process.communicate()
+
+
+RUN = ("/usr/bin/python3", "/usr/bin/rigd", "run", "hold")
+FORGED = ("python", "-m", CONTROL.module)
+OTHER = os.getuid() + 1
+
+
+@pytest.mark.parametrize(
+    ("command", "changes", "expected"),
+    [
+        (RUN, {}, STOP_SIGNAL),
+        (RUN, {"caught": 0}, signal.SIGTERM),  # it has not begun, and its SIGINT is ignored
+        (RUN, {"caught": 1 << signal.SIGINT - 1}, signal.SIGINT),
+        (RUN, {"ignored": 1 << STOP_SIGNAL - 1, "caught": 0}, None),  # a quick look is left
+        (("python3", "-m", "rigd", "identify", "motor"), {}, STOP_SIGNAL),
+        (("python3", "rigd", "identify", "motor", "--from", "a.mcap"), {"caught": 0}, None),
+        (("sudo", "rigd", "run", "hold"), {}, None),
+        (("python3", "rigd", "check"), {}, None),
+        (RUN, {"uid": -1}, None),
+        pytest.param(
+            *(RUN, {"uid": OTHER}, None),
+            marks=pytest.mark.skipif(os.getuid() == 0, reason="root stops every user's"),
+        ),
+    ],
+)
+def test_only_what_runs_sessions_gets_a_signal(
+    stop_here, bystander, monkeypatch, command, changes, expected
+):
+    process, row = bystander
+    monkeypatch.setattr(
+        stop_module, "read_processes", lambda: [replace(row, command=command, **changes)]
+    )
+    stop_here("--no-wait")
+    if expected is None:
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout.readline() == f"{int(signal.SIGTERM)}\n"
+    else:
+        assert process.stdout.readline() == f"{int(expected)}\n"
+
+
+def test_a_process_that_a_forged_command_line_names_gets_no_signal(
+    stop_here, bystander, monkeypatch
+):
+    process, row = bystander
+    forged = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
+    try:
+        assert forged.stdout.readline() == "listens\n"
+        command = (*FORGED, str(process.pid))
+        other = replace(read_process(forged.pid), command=command, name=IDLE_NAME)
+        monkeypatch.setattr(stop_module, "read_processes", lambda: [row, other])
+        stop_here("--no-wait")
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout.readline() == f"{int(signal.SIGTERM)}\n"
+    finally:
+        forged.kill()
+        forged.communicate()
+
+
+@pytest.mark.further  # as in this process, from other users and environments; benchmarks/bench_stop
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_it_stops_wherever_it_is_called(situation):
+    if not can_isolate():
+        pytest.skip("needs root, and namespaces of its own (unshare)")
+    import stop_scenarios
+
+    done = subprocess.run(
+        isolated(sys.executable, stop_scenarios.__file__, situation, 2),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for line in done.stdout.splitlines():
+        assert json.loads(line)["wrong"] == [], line
