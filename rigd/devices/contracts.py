@@ -181,6 +181,9 @@ class Devices:
     """Force-torque sensor under the clamp."""
     simulated: bool
     """No motor moves: the rig may run under the virtual clock."""
+    renew_noise: Callable[[int | None], int] | None = None
+    """Begins the noise of a simulated rig anew before a session, from the seed given or (None) one
+    of the rig's own, and returns that seed; None: there is nothing to begin anew."""
 
     @property
     def on_lines(self) -> bool:

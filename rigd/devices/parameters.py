@@ -92,8 +92,8 @@ class Simulation:
     """Standard deviation of white noise on each force axis, each sample."""
     offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
-    seed: Annotated[int, Ge(0)] = 0
-    """Seed of the noise."""
+    seed: Annotated[int, Ge(0)] | None = field(default=None, metadata=OPTIONAL)
+    """Seed of the noise, for sessions that repeat each other; None: each has a fresh one."""
     density_ratio: Positive = field(default=1.0, metadata=OPTIONAL)
     """Density of the simulated beam over the one that the profile states."""
     stiffness_ratio: Positive = field(default=1.0, metadata=OPTIONAL)

@@ -99,10 +99,22 @@ def test_the_same_seed_gives_the_same_samples_and_another_one_does_not(make_sess
     first = make_session().run().samples
     again = make_session().run().samples
     assert np.array_equal(first, again)
-    profile = make_session().profile
-    simulation = replace(profile.rig.simulation, seed=2)
-    other = replace(profile, rig=replace(profile.rig, simulation=simulation))
-    assert not np.array_equal(first, make_session(profile=other).run().samples)
+    other = make_session()
+    other.obey(other.order(seed=2))
+    assert not np.array_equal(first, other.samples)
+
+
+def test_without_a_seed_each_session_has_a_fresh_one_and_states_it(make_session):
+    session = make_session()
+    session.obey(session.order(seed=None), session.order(seed=None))
+    first, second = (int(ready.tare["simulation_seed"]) for ready in session.parent.said(Ready))
+    assert first != second
+    samples = session.samples
+    here, there = np.split(samples["coupling_torque_nm"], 2)
+    assert not np.array_equal(here, there)
+    again = make_session()
+    again.obey(again.order(seed=first))
+    assert np.array_equal(samples[: samples.size // 2], again.samples)
 
 
 class StopAt(VirtualClock):
