@@ -51,6 +51,7 @@ from ._reader import read_touches as read_touches
 from ._recovery import Recovery as Recovery
 from ._recovery import holds_samples as holds_samples
 from ._recovery import recover as recover
+from ._sample_digests import sample_digests as sample_digests
 from ._schema import EVENT_TOPIC as EVENT_TOPIC
 from ._schema import SAMPLE_SCHEMA as SAMPLE_SCHEMA
 from ._schema import SAMPLE_TOPIC as SAMPLE_TOPIC
