@@ -534,14 +534,18 @@ class Session:
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
                 outcome["reason"] = self._fit.shortcoming
+            elif self._fit.failure:
+                # The session was about to end for it: a stop that came before is not the cause.
+                outcome["reason"] = f"{self._fit.failure} {finished.reason}"
         self._group.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
         self._group.recorder.send(Close(outcome, packed, segments))
         closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
-        whole = closed if closed.path is not None else finished
-        ended, reason = whole.outcome, whole.reason
+        ended, reason = finished.outcome, outcome["reason"]
+        if closed.path is not None:
+            ended, reason = closed.outcome, closed.reason
         return SessionResult(
             path=closed.path,
             outcome=ended,
@@ -555,7 +559,7 @@ class Session:
             stale_wrenches=counts["stale_wrenches"],
             fault=finished.fault
             or ended == "fault"
-            or (self._fit is not None and self._fit.ended_session),
+            or (self._fit is not None and bool(self._fit.failure)),
             live_dropped=self._board[Word.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
             fit=fit,

@@ -231,7 +231,7 @@ def test_real_time_keeps_its_books(rigd, patient, tmp_path):
     assert session["outcome"] == "complete"
     assert session["lost"] == 0
     assert session["scheduled"] == session["recorded"] + session["missed"] <= 20_000
-    assert session["fit"]["search"]["reached"] == (run.returncode == 0)
+    assert (session["fit"]["search"]["reached"] is True) == (run.returncode == 0)
     assert len(read_session(tmp_path / session["path"]).samples) == session["recorded"]
 
 
