@@ -14,6 +14,7 @@ from rigd.engine._messages import Connected, Finished, Ready
 from rigd.engine._shared_state import Phase, Stop, Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import hold
+from rigd.session import MAX_SAMPLES
 from rigd.session._format import Status, decode_samples
 
 
@@ -379,7 +380,8 @@ class WorkingClock(VirtualClock):
 
 def test_a_long_record_starts_without_a_gap(make_session):
     rate_hz = make_session().profile.rig.rate_hz
-    session = make_session(excitation=hold(rate_hz=rate_hz, duration_s=3600.0, rest_s=0.0))
+    longest = hold(rate_hz=rate_hz, duration_s=MAX_SAMPLES / rate_hz, rest_s=0.0, ring_down_s=0.0)
+    session = make_session(excitation=longest)
     session.clock = WorkingClock(3_000_000_000, session.stop.request)
     session.run()
     assert session.finished.outcome == "stopped"
