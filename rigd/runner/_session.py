@@ -540,7 +540,9 @@ class Session:
         self._group.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
         self._group.recorder.send(Close(outcome, packed, segments))
-        closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
+        # A disk may stall at the end of a record for as long as within it.
+        stall_s = self._order.profile.limits.recorder_lag_s
+        closed = self._ask_recorder(Closed, stall_s + 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
         ended, reason = finished.outcome, outcome["reason"]

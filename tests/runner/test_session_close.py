@@ -10,7 +10,7 @@ from shipped_profile import load_shipped
 from rigd.engine import Closed, Connected, Finished
 from rigd.excitation import hold
 from rigd.runner._request import Order
-from rigd.runner._session import Session, always
+from rigd.runner._session import Session, SessionFailedError, always
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -21,7 +21,7 @@ COUNTS = {"scheduled": 1200, "missed": 0, "late": 0, "stale_angles": 0, "stale_w
 def close():
     """Close a session whose fit process failed, or did not; with a file, or without."""
 
-    def closed(finished, failure, shortcoming="", *, recorded=True):
+    def closed(finished, failure, shortcoming="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
         order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
@@ -42,7 +42,7 @@ def close():
                 return Closed()
             return Closed(order.path, COUNTS, outcome["outcome"], outcome["reason"])
 
-        group.recorder.poll.side_effect = poll
+        group.recorder.poll.side_effect = slow(poll)
         return session._close(finished)
 
     return closed
@@ -65,3 +65,24 @@ def test_a_complete_record_says_what_it_lacks_once(close):
     later = replace(complete, reason="After the record: The tare drifted.", fault=True)
     result = close(later, KILLED, "unused")
     assert result.reason == f"{KILLED} After the record: The tare drifted."
+
+
+@pytest.mark.parametrize(("stall_s", "whole"), [(11.9, True), (60.0, False)])
+def test_the_disk_may_stall_at_the_end_as_long_as_in_the_record(close, monkeypatch, stall_s, whole):
+    now_s = 0.0
+
+    def poll(answer):
+        def polled(patience_s):
+            nonlocal now_s
+            now_s += 10 * patience_s
+            return answer(patience_s) if now_s > stall_s else None
+
+        return polled
+
+    monkeypatch.setattr("rigd.runner._session.time.monotonic", lambda: now_s)
+    complete = Finished("complete", "", fault=False, counts=COUNTS)
+    if whole:
+        assert close(complete, "", slow=poll).outcome == "complete"
+    else:
+        with pytest.raises(SessionFailedError, match="does not answer within 22 s"):
+            close(complete, "", slow=poll)
