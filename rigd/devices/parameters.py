@@ -216,9 +216,10 @@ class ServoDrive:
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
     """After how long the drive's own watchdog takes the torque off when SYNC and RPDO stay
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
-    sync_gaps: bool = field(default=True, metadata=OPTIONAL)
-    """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late.
-    False: no SYNC is ever left out, and replies are told apart by counting alone."""
+    sync_gaps: bool = field(default=False, metadata=OPTIONAL)
+    """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late: for
+    drives that tolerate a missing SYNC. False: no SYNC is ever left out, and replies are told
+    apart by counting alone."""
     torque_response_s: Annotated[float, Ge(0), Le(1)] = field(default=0.0, metadata=OPTIONAL)
     """Time constant with which the actual torque (6077) follows the commanded one; 0: at once."""
     follows_target_bit: bool = field(default=True, metadata=OPTIONAL)

@@ -355,6 +355,8 @@ class SessionSequence:
         if end is not None:
             cycle.torque_off()
         self._show()
+        for count in self._display.doubt_counts:
+            self._say("warning", count)
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
@@ -465,6 +467,7 @@ class SessionSequence:
             return None
         if violation.channel in _OF_MOTION and self._turns_against_torque():
             violation = replace(violation, remedy=_AGAINST_TORQUE)
+        violation = self._cycle.with_cause(violation)
         # The zero is void then, and with it the limits of every further session.
         slipped = violation.channel == BY_NAME["encoder jump"].channel
         return SessionEnd("fault", str(violation), device_failed=slipped)
@@ -499,7 +502,7 @@ class SessionSequence:
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         silent = self._cycle.check_stale()
         if silent is not None:
-            raise SessionEnd("fault", str(silent))
+            raise SessionEnd("fault", str(self._cycle.with_cause(silent)))
 
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
@@ -516,7 +519,7 @@ class SessionSequence:
         reason = self._cycle.watch.check_stale_share(
             counts.stale_angles, counts.stale_wrenches, scheduled
         )
-        return None if reason is None else SessionEnd("fault", str(reason))
+        return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
 
     def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]

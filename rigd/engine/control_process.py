@@ -411,7 +411,7 @@ class _ControlServer:
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         silent = self._cycle.check_stale()
         if silent is not None:
-            raise SessionEnd("fault", str(silent))
+            raise SessionEnd("fault", str(self._cycle.with_cause(silent)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         rig = profile.rig

@@ -615,13 +615,29 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
 
     def doubtful():
         late = session.board[Word.SCHEDULED] > 1000 or session.parent.said(Finished)
-        return replace(health(), doubt="Records are late." if late else "")
+        count = f"Late so far: {session.board[Word.SCHEDULED]}." if late else ""
+        return replace(health(), doubt="Records are late." if late else "", doubt_count=count)
 
     session.devices.sensor.health = doubtful
     short = hold(rate_hz=1000.0, duration_s=2.0, rest_s=0.2, ring_down_s=0.0)
     session.obey(session.order(short), session.order(short))
-    told = [event for event in session.events if event.message == "Records are late."]
+    events = session.events
+    told = [event for event in events if event.message == "Records are late."]
     assert [event.level for event in told] == ["warning", "warning"]
     assert told[0].t_ns > 1_000_000_000
     assert told[1].t_ns == 0, "in its tare"
+    counts = [event.message for event in events if event.message.startswith("Late so far")]
+    assert counts == ["Late so far: 2200."] * 2
     assert [m.outcome for m in session.parent.said(Finished)] == ["complete"] * 2
+
+
+def test_what_the_sensor_knows_of_the_cause_is_the_remedy(make_session):
+    session = make_session()
+    sensor = session.devices.sensor
+    health = sensor.health
+    sensor.health = lambda: replace(health(), cause="Set the latency timer to 1 ms.")
+    sensor.wrench_stale = True
+    finished = session.run().finished
+    assert finished.outcome == "fault"
+    assert finished.reason.endswith("(limits.stale_ticks_in_a_row). Set the latency timer to 1 ms.")
+    session.assert_safe()
