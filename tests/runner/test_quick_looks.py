@@ -69,6 +69,11 @@ def done(looks):
     return looks.told
 
 
+def spent_s(looks):
+    looks.attend()
+    return looks.spent_s
+
+
 def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
     paths = [tmp_path / f"{name}.mcap" for name in ("a", "b")]
     for path in paths:
@@ -160,7 +165,7 @@ def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeyp
         process = looks._process
         late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
         late.start()
-        time.sleep(0.1)
+        assert eventually(lambda: spent_s(looks) >= 0.05)
         end()
         assert looks.told == []
         assert process.poll() is None
