@@ -12,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
 	rm -rf demo
-	$(BIN)/rigd run chirp --profile sim --fast --output demo
+	$(BIN)/rigd run chirp --profile sim --fast --seed 1 --output demo
 	$(BIN)/analyze demo/*.mcap --report demo/report
 	@echo "The operator's page on the simulated rig: $(BIN)/rigd serve --profile sim --web --output demo"
 

@@ -2,7 +2,7 @@
 
 As a program, ``python -m analysis.quick_look FILE``, it writes the look beside the session file, as
 ``STEM.look.json``, and prints its text. `rigd run` and the daemon start it after each session, at
-the lowest priority there is. The report of `analyze` says more and takes longer.
+a low priority. The report of `analyze` says more and takes longer.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library import change_between
 from rigd.printable import listed
-from rigd.runtime import begin_background, give_way, raise_on
+from rigd.runtime import begin_background, raise_on
 from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_line, read_look
 from rigd.units import decimals
 
@@ -46,6 +46,9 @@ _NEAR: Final = 0.1
 """Distance of two such bands, relative to their frequency, below which they are told as one."""
 
 _QUANTITIES: Final = ("frequency_hz", "damping_ratio")
+
+_NICE: Final = 10
+"""Niceness of the program: a tenth of what an ordinary one gets beside it."""
 
 
 class LookError(ValueError):
@@ -418,7 +421,9 @@ def main() -> None:
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
     asked = begin_background(parser)
-    give_way()
+    # Not as the last of all programs: no session runs meanwhile, and others may never pause.
+    with suppress(OSError):
+        os.nice(_NICE)
     try:
         document = look_at(asked.file, asked.last)
         write_look(document, asked.file)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rigd.beam import Beam
+from rigd.session import MAX_SAMPLES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -213,9 +214,8 @@ MAX_SPAN = 10
 """Most ticks per recorded sample: a file with next to no samples in its span would only fill the
 memory, and no sweep in it could be analysed."""
 
-MAX_TICKS = 2_400_000
-"""Longest record: 40 minutes at 1 kHz. An analysis was measured to take 0.29 kB a sample beside
-0.16 GB (0.53 GB for 1.27 million), and is to do with 1 GB."""
+MAX_TICKS = MAX_SAMPLES
+"""Longest record: missing ticks count, as they are interpolated."""
 
 MAX_VALUE = 1e9
 """Largest angle in rad, or torque in N·m: squares of what is far beyond would overflow."""

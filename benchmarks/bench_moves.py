@@ -69,7 +69,7 @@ def rig(folder: Path, number: int) -> tuple[Path, Path]:
 def run(profile: Path, *arguments: str) -> Path:
     """Run a session under the virtual clock; return its file."""
     command = [sys.executable, "-m", "rigd", "run", *arguments, "--profile", str(profile)]
-    command += ["--fast", "--json", "--no-look", "--output", str(profile.parent)]
+    command += ["--fast", "--seed", "1", "--json", "--no-look", "--output", str(profile.parent)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stderr)

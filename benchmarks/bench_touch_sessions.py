@@ -69,7 +69,17 @@ def said(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def model_of(profile: Path, folder: Path) -> Path:
     """Identify a rig by one session."""
-    until = ["--fast", "--damping", "1%", "--profile", str(profile), "--output", "told"]
+    until = [
+        "--fast",
+        "--seed",
+        "1",
+        "--damping",
+        "1%",
+        "--profile",
+        str(profile),
+        "--output",
+        "told",
+    ]
     said(folder, "rigd", "run", "until", *until)
     [file] = (folder / "told").glob("*.mcap")
     path = folder / "model.json"

@@ -72,8 +72,8 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     ----------
     counts
         ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
-        ``stale_wrenches``, as numbers or as texts; of the last three only what occurred is told.
-        None: it is not known, as of a file that could not be read.
+        ``stale_wrenches``, as numbers or as texts; of the last three only what occurred, or may
+        have, is told. None: it is not known, as of a file that could not be read.
 
     Examples
     --------
@@ -88,7 +88,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
         *(
             f"{_count_text(counts[name])} {name.replace('_', ' ')}"
             for name in rare
-            if int(counts.get(name) or 0)
+            if name in counts and (counts[name] is None or int(counts[name]))
         ),
     ]
     return ", ".join(told)

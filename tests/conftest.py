@@ -95,6 +95,7 @@ PATIENT = {
     "cia402.torque_tolerance_percent": "0.0",
 }
 BRIEF = {"session.tare_s": "0.5", "session.return_s": "0.3"}
+SEEDED = {"simulation.seed": "1"}
 
 
 @pytest.fixture(scope="session")
@@ -105,7 +106,7 @@ def write_profile_in():
         base = HW_PROFILES / f"{name}.toml"
         sections = tomllib.loads(base.read_text("utf-8"))
         borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
-        texts = BRIEF | (borne if patient else {}) | (values or {})
+        texts = BRIEF | SEEDED | (borne if patient else {}) | (values or {})
         other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
         return testing.write_profile(folder, other, base=str(base))
 
@@ -297,7 +298,7 @@ def paper_session(made_once):
     """The paper's session on the simulated rig as shipped: its file, and what the command told."""
 
     def make(folder):
-        command = [RIGD, "run", "chirp", "--fast", "--json", "--output", folder]
+        command = [RIGD, "run", "chirp", "--fast", "--seed", "1", "--json", "--output", folder]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         (folder / "told.json").write_text(done.stdout)
 

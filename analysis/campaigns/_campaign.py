@@ -322,6 +322,12 @@ def _reason_against(
             return "the file is given more than once, and counts once."
         if result.experiment.identity == other.experiment.identity:
             return f"it is the same session as {other.path}, which would count twice."
+        if result.digests & other.digests:
+            return (
+                f"it has samples of {other.path}, noise included, which would count twice: a copy "
+                "or a part of that file, or a simulation with the same seed; analyse this one by "
+                "itself."
+            )
     both = common.frequency_hz.size and result.frequency_hz.size
     if both and not np.array_equal(common.frequency_hz, result.frequency_hz):
         return (

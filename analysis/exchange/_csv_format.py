@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.exchange._source import (
-    MAX_SAMPLES,
     ExchangeError,
     SourceChannel,
     check_samples,
     place_of,
 )
 from rigd.printable import printable
+from rigd.session import MAX_SAMPLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

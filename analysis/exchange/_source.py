@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rigd.printable import printable
+from rigd.session import MAX_SAMPLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -180,10 +181,6 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-MAX_SAMPLES: Final = 3_000_000
-"""Most samples of a channel: 50 minutes at 1 kHz. Ten such channels are a quarter of a gigabyte."""
 
 
 def check_samples(path: Path, what: str, samples: int) -> None:

@@ -6,7 +6,14 @@ from typing import Any
 
 from rigd.checks._devices import calibration_rows, inspect_devices
 from rigd.checks._machine import machine_rows, rights_rows
-from rigd.checks._on_paper import eds_rows, loop_rows, profile_rows, travel_rows, wiring_rows
+from rigd.checks._on_paper import (
+    eds_rows,
+    loop_rows,
+    profile_rows,
+    record_row,
+    travel_rows,
+    wiring_rows,
+)
 from rigd.checks._rows import Row, Verdict
 from rigd.profile import Profile
 
@@ -45,6 +52,7 @@ def _rows_without_devices(profile: Profile) -> list[Row]:
     return [
         *_drive_rows(profile),
         *profile_rows(profile),
+        record_row(profile),
         *wiring_rows(profile.rig),
         *loop_rows(profile),
         *travel_rows(profile),

@@ -173,11 +173,14 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
         yield Row("sensor", "more", f"{len(more)} values, below", "", Verdict.OK, detail)
 
 
-def measured_rows(measured: Mapping[str, float], rig: RigParameters) -> Iterator[Row]:
-    """Judge rate and turn-round of the sensor."""
+def measured_rows(
+    measured: Mapping[str, float], rig: RigParameters, cause: str = ""
+) -> Iterator[Row]:
+    """Judge rate and turn-round of the sensor; `cause` is what it says of gaps in its stream."""
     for key, value in measured.items():
         wanted, verdict = _judge(key, value, rig)
-        yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict)
+        detail = cause if key == "longest_gap_s" and verdict is not Verdict.OK else ""
+        yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
 
 
 def _value(key: str, found: Mapping[str, object]) -> str:
@@ -354,7 +357,8 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
         if not isinstance(sensor, MeasurableSensor) or moves.any_clock:
             yield Row("sensor", "rate", f"not measured: {moves.value}", "", Verdict.SKIPPED)
         else:
-            yield from measured_rows(sensor.measure(MEASURED_S), rig)
+            measured = sensor.measure(MEASURED_S)
+            yield from measured_rows(measured, rig, sensor.health().cause)
 
     # The drive last: once it is operational it expects a SYNC every period.
     sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)

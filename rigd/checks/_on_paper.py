@@ -29,6 +29,7 @@ friction alone.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from inspect import signature
 from math import degrees, inf, isinf, log10, radians
 from pathlib import Path
 
@@ -39,8 +40,10 @@ from rigd.devices import AtiSerial, EdsError, RigParameters, read_eds
 from rigd.devices.ati import RECORD_BITS
 from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
 from rigd.devices.cia402 import Grade, judge
+from rigd.excitation import chirp
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S, Limits
+from rigd.session import MAX_SAMPLES
 
 # Closed loop
 
@@ -363,6 +366,22 @@ def profile_rows(profile: Profile) -> Iterator[Row]:
         "none",
         grade(fail=False, warn=bool(assumed)),
         f"Assumed: {', '.join(assumed)}." if assumed else "",
+    )
+
+
+def record_row(profile: Profile) -> Row:
+    """Return how long a record may be, and whether a chirp as it is by default fits into it."""
+    options = signature(chirp).parameters
+    limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
+    usual_s = sum(float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s"))
+    longest_s = MAX_SAMPLES / profile.rig.rate_hz
+    return Row(
+        "profile",
+        "longest record",
+        f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
+        f"{usual_s:g} s (run chirp)",
+        grade(fail=False, warn=longest_s < usual_s),
+        f"A chirp of {usual_s:g} s is refused: {limit}." if longest_s < usual_s else "",
     )
 
 

@@ -81,7 +81,11 @@ SESSIONS = Path("sessions")
 """Where session files go unless told otherwise."""
 Seed = Annotated[
     int | None,
-    typer.Option("--seed", min=0, help="Seed of a simulated rig's noise (default: the profile's)."),
+    typer.Option(
+        "--seed",
+        min=0,
+        help="Seed of a simulated rig's noise, to repeat it (default: a fresh one each session).",
+    ),
 ]
 Fast = Annotated[
     bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")

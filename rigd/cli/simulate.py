@@ -1,11 +1,12 @@
 """``rigd simulate`` and ``rigd inject``: the simulated rig on the wire, and its faults."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rigd.cli.options import Obstacles, ProfileName, profile_named
+from rigd.cli.options import Obstacles, ProfileName, Seed, profile_named
 
 
 def simulate(
@@ -33,6 +34,7 @@ def simulate(
         ),
     ] = None,
     obstacle: Obstacles = None,
+    seed: Seed = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing on the terminal.")] = False,
 ) -> None:
     """Simulate the devices of a profile on the wire; Ctrl-C ends it.
@@ -58,6 +60,8 @@ def simulate(
         from rigd.devices import with_obstacles
 
         rig = with_obstacles(rig, obstacle)
+    if seed is not None and rig.simulation is not None:
+        rig = replace(rig, simulation=replace(rig.simulation, seed=seed))
     raise typer.Exit(simulator.run_simulator(rig, options))
 
 

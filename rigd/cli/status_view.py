@@ -61,7 +61,10 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     daemon, series, progress = (told[name] for name in ("daemon", "series", "progress"))
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
     doing = f" ({told['doing']})" if told["doing"] else ""
-    state = Text(f"{told['state']}{doing}", style=_STYLES.get(told["state"], ""))
+    word = told["state"]
+    if word == "running" and progress is not None:
+        word = progress.get("activity", word)  # a daemon of before an update has none
+    state = Text(f"{word}{doing}", style=_STYLES.get(told["state"], ""))
     state.append(f" since {_clock(told['since_utc_ns'])}: {told['reason']}", style="default")
     yield "state", state
     if told["zero_lost"]:

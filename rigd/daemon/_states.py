@@ -333,6 +333,7 @@ def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Doc
     left = max(0, total - look.tick)
     return {
         "phase": look.phase.name.lower(),
+        "activity": look.activity.value,
         "tick": look.tick,
         "total": total,
         "percent": round(100.0 * look.tick / total, 1) if total else 100.0,

@@ -21,8 +21,11 @@ from ._registry import reality as reality
 from ._registry import simulated_differently as simulated_differently
 from ._registry import simulator as simulator
 from ._registry import what_moves as what_moves
+from ._seeds import fresh_seed as fresh_seed
+from ._seeds import session_seed as session_seed
 from ._simulator import SimulatorAddress as SimulatorAddress
 from ._simulator import announce as announce
+from ._simulator import ask_simulator as ask_simulator
 from ._simulator import described as described
 from ._simulator import find_simulator as find_simulator
 from ._simulator import forget as forget

@@ -5,17 +5,21 @@ looks here first, so that a motor never moves where a simulation was meant.
 """
 
 import json
+import socket
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rigd.devices.contracts import DeviceError
 from rigd.runtime import announce as write_address
 from rigd.runtime import answers, listening_sockets, read_address, runtime_folder
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
 
+_LONGEST_LINE = 65_536
+_TIMEOUT_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class SimulatorAddress:
@@ -41,12 +45,15 @@ def described(rig: "RigParameters") -> dict[str, object]:
 
 
 def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
-    """List the differences of the simulated rig from a profile's: one phrase per key."""
+    """List the differences of the simulated rig from a profile's: one phrase per key.
+
+    The seed of the noise is none: each session has its own.
+    """
     ours, theirs = described(rig), simulator.rig
     return [
         f"{key} = {_shown(theirs[key])} instead of {_shown(value)}"
         for key, value in ours.items()
-        if key in theirs and theirs[key] != value
+        if key in theirs and theirs[key] != value and key != "simulation.seed"
     ]
 
 
@@ -78,6 +85,37 @@ def find_simulator(rig_name: str) -> SimulatorAddress | None:
         return None
     found = isinstance(address.control_socket, str) and answers(address.control_socket)
     return address if found else None
+
+
+def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
+    """Send a request to a running simulator, and return its reply.
+
+    Parameters
+    ----------
+    address
+        Address of the simulator.
+    request
+        The request, by one key: ``inject``, ``status`` or ``renew_noise``.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or refuses; then with its own words.
+    """
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+            link.settimeout(_TIMEOUT_S)
+            link.connect(address.control_socket)
+            link.sendall(json.dumps(request).encode() + b"\n")
+            with link.makefile("rb") as lines:
+                reply = json.loads(lines.readline(_LONGEST_LINE))
+    except (OSError, ValueError) as error:
+        raise DeviceError(
+            f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
+        ) from None
+    if not isinstance(reply, dict) or "error" in reply:
+        raise DeviceError(str(reply["error"] if isinstance(reply, dict) else reply))
+    return reply
 
 
 def unreachable_simulators(rig_name: str) -> list[Path]:

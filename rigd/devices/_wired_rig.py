@@ -1,11 +1,12 @@
 """Drive and sensor on a CAN bus or serial line, opened as one rig, and the reset of a fault."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from rigd.devices._registry import WhatMoves, objections, open_devices
-from rigd.devices._simulator import SimulatorAddress, find_simulator
+from rigd.devices._simulator import SimulatorAddress, ask_simulator, find_simulator
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
@@ -43,7 +44,13 @@ def open_wired_rig(rig: RigParameters) -> Devices:
         drive=Cia402Drive(rig, link),
         sensor=_sensor(rig, link, simulator),
         simulated=simulator is not None,
+        renew_noise=None if simulator is None else partial(_renew_noise, simulator),
     )
+
+
+def _renew_noise(simulator: SimulatorAddress, seed: int | None) -> int:
+    """Have a simulated rig begin its noise anew; return the seed."""
+    return int(ask_simulator(simulator, {"renew_noise": seed})["seed"])
 
 
 def _sensor(rig: RigParameters, link: CanLink, simulator: SimulatorAddress | None) -> WrenchSensor:

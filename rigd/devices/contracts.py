@@ -56,8 +56,12 @@ class LineHealth:
     status
         Status word of the device; 0: all is well.
     doubt
-        Why its readings may be older than they are said to be, for the operator; empty: they are
-        not.
+        Why its readings may be older than they are said to be, for the operator, in the same words
+        as long as the reason is the same; empty: they are not.
+    doubt_count
+        How much of it there has been so far, a sentence; empty without a doubt.
+    cause
+        What probably keeps readings from coming, with its remedy; empty: not known.
     """
 
     bits: int | None = None
@@ -65,6 +69,8 @@ class LineHealth:
     errors: int | None = None
     status: int | None = None
     doubt: str = ""
+    doubt_count: str = ""
+    cause: str = ""
 
 
 class Drive(Protocol):
@@ -189,6 +195,9 @@ class Devices:
     """Force-torque sensor under the clamp."""
     simulated: bool
     """No motor moves: the rig may run under the virtual clock."""
+    renew_noise: Callable[[int | None], int] | None = None
+    """Begins the noise of a simulated rig anew before a session, from the seed given or (None) one
+    of the rig's own, and returns that seed; None: there is nothing to begin anew."""
 
     @property
     def on_lines(self) -> bool:

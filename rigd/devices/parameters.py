@@ -92,8 +92,8 @@ class Simulation:
     """Standard deviation of white noise on each force axis, each sample."""
     offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
-    seed: Annotated[int, Ge(0)] = 0
-    """Seed of the noise."""
+    seed: Annotated[int, Ge(0)] | None = field(default=None, metadata=OPTIONAL)
+    """Seed of the noise, for sessions that repeat each other; None: each has a fresh one."""
     density_ratio: Positive = field(default=1.0, metadata=OPTIONAL)
     """Density of the simulated beam over the one that the profile states."""
     stiffness_ratio: Positive = field(default=1.0, metadata=OPTIONAL)
@@ -216,9 +216,10 @@ class ServoDrive:
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
     """After how long the drive's own watchdog takes the torque off when SYNC and RPDO stay
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
-    sync_gaps: bool = field(default=True, metadata=OPTIONAL)
-    """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late.
-    False: no SYNC is ever left out, and replies are told apart by counting alone."""
+    sync_gaps: bool = field(default=False, metadata=OPTIONAL)
+    """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late: for
+    drives that tolerate a missing SYNC. False: no SYNC is ever left out, and replies are told
+    apart by counting alone."""
     torque_response_s: Annotated[float, Ge(0), Le(1)] = field(default=0.0, metadata=OPTIONAL)
     """Time constant with which the actual torque (6077) follows the commanded one; 0: at once."""
     follows_target_bit: bool = field(default=True, metadata=OPTIONAL)

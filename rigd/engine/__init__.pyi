@@ -59,12 +59,14 @@ from ._reference import put_reference as put_reference
 from ._ring import Observer as Observer
 from ._ring import Ring as Ring
 from ._ring import shared_memory_fd as shared_memory_fd
+from ._shared_state import Activity as Activity
 from ._shared_state import Event as Event
 from ._shared_state import Level as Level
 from ._shared_state import Phase as Phase
 from ._shared_state import SharedState as SharedState
 from ._shared_state import Stop as Stop
 from ._shared_state import Word as Word
+from ._shared_state import activity as activity
 from ._shared_state import read_events as read_events
 from ._timing import RealClock as RealClock
 from ._timing import TickScheduler as TickScheduler

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, inf, isfinite
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import UnsafeFolderError, runtime_folder
 from rigd.safety import (
+    BY_NAME,
     BeamPrediction,
     EncoderWatch,
     LimitWatch,
@@ -46,6 +47,9 @@ _UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
 _TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
 _LIMIT_WARNING = int(Status.LIMIT_WARNING)
 _TORQUE_OFF = int(Status.TORQUE_OFF)
+
+_STALE_ANGLES = tuple(BY_NAME[name].channel for name in ("stale angle", "stale angle share"))
+_STALE_WRENCHES = tuple(BY_NAME[name].channel for name in ("stale wrench", "stale wrench share"))
 
 _RECENT_TICKS = 32
 _SPEED_TICKS = 4
@@ -377,6 +381,19 @@ class Cycle:
             bool(flags & _WRENCH_STALE),
             bool(flags & _WRENCH_SATURATED),
         )
+
+    def with_cause(self, violation: Violation) -> Violation:
+        """Return a violation with what its device knows of the cause in place of the usual remedy.
+
+        Parameters
+        ----------
+        violation
+            Any; only readings that do not come have such a cause.
+        """
+        for device, names in ((self._drive, _STALE_ANGLES), (self._sensor, _STALE_WRENCHES)):
+            if violation.channel in names and (cause := device.health().cause):
+                return replace(violation, remedy=cause)
+        return violation
 
     def look(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf

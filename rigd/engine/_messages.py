@@ -99,6 +99,8 @@ class SessionJob:
     """What follows the record."""
     touch: TouchOrder | None = None
     """What to look for; None: nothing."""
+    seed: int | None = None
+    """Seed of a simulated rig's noise; None: one of the rig's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,7 @@ class Ready:
     """The motor is held where it stands; the record may begin."""
 
     tare: Mapping[str, str]
-    """Metadata of the tare."""
+    """Metadata of the tare, and the seed of a simulated rig's noise."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,12 +28,15 @@ class Display:
     ----------
     doubts
         About the age of the readings, as of the last call of `show`, for the operator.
+    doubt_counts
+        How much of it there has been so far, likewise.
     """
 
     def __init__(self, board: SharedState, devices: Devices) -> None:
         self._board = board
         self._devices = devices
         self.doubts: list[str] = []
+        self.doubt_counts: list[str] = []
         self._before: tuple[int, tuple[int, ...]] | None = None
 
     def show(self, cycle: Cycle, now_ns: int) -> None:
@@ -57,6 +60,7 @@ class Display:
                 board[word] = round(value * 1e9)
         drive, sensor = self._devices.drive.health(), self._devices.sensor.health()
         self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
+        self.doubt_counts = [line.doubt_count for line in (drive, sensor) if line.doubt_count]
         known = [line.errors for line in (drive, sensor) if line.errors is not None]
         board[Word.BUS_ERRORS] = sum(known) if known else UNKNOWN
         board[Word.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status

@@ -366,6 +366,8 @@ class SessionSequence:
         if end is not None:
             cycle.torque_off()
         self._show()
+        for count in self._display.doubt_counts:
+            self._say("warning", count)
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
@@ -476,6 +478,7 @@ class SessionSequence:
             return None
         if violation.channel in _OF_MOTION and self._turns_against_torque():
             violation = replace(violation, remedy=_AGAINST_TORQUE)
+        violation = self._cycle.with_cause(violation)
         # The zero is void then, and with it the limits of every further session.
         failed = violation.channel in _OF_ENCODER
         return SessionEnd("fault", str(violation), device_failed=failed)
@@ -510,7 +513,7 @@ class SessionSequence:
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(failed))
+            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
 
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
@@ -528,7 +531,7 @@ class SessionSequence:
         reason = self._cycle.watch.check_stale_share(
             counts.stale_angles, counts.stale_wrenches, scheduled
         )
-        return None if reason is None else SessionEnd("fault", str(reason))
+        return None if reason is None else SessionEnd("fault", str(self._cycle.with_cause(reason)))
 
     def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]

@@ -17,7 +17,7 @@ import contextlib
 import mmap
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, StrEnum
 from typing import Literal, Self
 
 from rigd.engine._ring import Ring, reserve
@@ -53,6 +53,21 @@ _WORDS = {
     Phase.OFF: "drive off",
     Phase.WAITING: "waiting for the beam to rest",
 }
+
+
+class Activity(StrEnum):
+    """State of a session for its operator, the same word in every view."""
+
+    PREPARING = "preparing"
+    """The record has not begun."""
+    RUNNING = "running"
+    """The record runs."""
+    RETURNING = "returning"
+    """The record is over, and the motor returns to where it started."""
+    FINISHING = "finishing"
+    """The record is over and the torque off; the file is being completed."""
+    STOPPING = "stopping"
+    """A stop was asked for."""
 
 
 class Stop(IntEnum):
@@ -216,3 +231,30 @@ def read_events(block: bytes) -> list[Event]:
         text = block[start : start + size].decode(errors="replace")
         events.append(Event(t_ns, LEVELS[level], text))
     return events
+
+
+def activity(board: SharedState) -> Activity:
+    """Return the state of the session that a board is about.
+
+    Parameters
+    ----------
+    board
+        State that the processes share.
+
+    Examples
+    --------
+    >>> from rigd.engine import Phase, SharedState, Word, activity, shared_memory_fd
+    >>> board = SharedState.create(shared_memory_fd())
+    >>> board[Word.PHASE] = Phase.TARING
+    >>> activity(board)
+    <Activity.PREPARING: 'preparing'>
+    """
+    phase = Phase(board[Word.PHASE])
+    if board[Word.STOP] != Stop.NO:
+        return Activity.STOPPING
+    if phase is Phase.RUNNING:
+        return Activity.RUNNING
+    # Until tick 0 the phase may be that of the session before.
+    if board[Word.GO] and phase is not Phase.READY:
+        return Activity.FINISHING if phase is Phase.OFF else Activity.RETURNING
+    return Activity.PREPARING

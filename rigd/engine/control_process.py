@@ -301,10 +301,11 @@ class _ControlServer:
         recorded = device_failed = False
         name_this_process(SESSION_NAME)
         try:
+            seed = self._renew_noise(job)
             tare = procedure.tare()
             devices.drive.enable(procedure.stop_asked)
             procedure.hold()
-            self._parent.send(Ready(tare))
+            self._parent.send(Ready(tare | seed))
             procedure.wait_for_go()
             procedure.record()
             recorded = True
@@ -342,6 +343,17 @@ class _ControlServer:
         )
         if device_failed:
             raise DeviceError(failure)
+
+    def _renew_noise(self, job: SessionJob) -> dict[str, str]:
+        """Begin the noise of a simulated rig; return its seed as metadata.
+
+        Raises
+        ------
+        DeviceError
+            If the simulated rig does not answer.
+        """
+        renew = self._devices.renew_noise
+        return {} if renew is None else {"simulation_seed": str(renew(job.seed))}
 
     def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
         """Do something at rest and tell what came out, or why it could not be done."""
@@ -410,7 +422,7 @@ class _ControlServer:
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         failed = self._cycle.check_stale() or self._cycle.check_sensor()
         if failed is not None:
-            raise SessionEnd("fault", str(failed))
+            raise SessionEnd("fault", str(self._cycle.with_cause(failed)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         rig = profile.rig

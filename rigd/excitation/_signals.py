@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
+from rigd.session import MAX_SAMPLES
 
 if TYPE_CHECKING:
     from rigd.excitation._touch_passes import Approach
@@ -22,9 +23,6 @@ SAMPLES_PER_PERIOD = 4
 SHARE_OF_LIMITS = 0.9
 """Share of every limit that an excitation made for a rig is predicted to take; the rest is for a
 beam unlike the one it was made with."""
-
-MAX_TICKS = 7_200_000
-"""Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
 
 
 class ExcitationError(UserError, ValueError):
@@ -162,7 +160,8 @@ def lay_out_segments(
     not_negative("rest_s", rest_s)
     positive("duration_s", duration_s, "s")
     not_negative("ring_down_s", ring_down_s)
-    check_ticks("The session", (rest_s + duration_s + ring_down_s) * rate_hz, rate_hz)
+    around_s = rest_s + ring_down_s
+    check_ticks("The session", (duration_s + around_s) * rate_hz, rate_hz, around_s)
     first = round(rate_hz * rest_s)
     end = first + round(rate_hz * duration_s)
     last = max(end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
@@ -174,12 +173,19 @@ def lay_out_segments(
     return {"rest": (0, first), "sweep": (first, end), "ring_down": (end, last)}
 
 
-def check_ticks(what: str, ticks: float, rate_hz: float) -> None:
-    """Refuse what would take more than `MAX_TICKS` ticks."""
-    if ticks > MAX_TICKS:
+def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
+    """Refuse a record that would be too long to be analysed; `around_s` are rest and ring-down."""
+    if ticks > MAX_SAMPLES:
+        longest_s = MAX_SAMPLES / rate_hz
+        between = (
+            f" ({longest_s - around_s:g} s between rest and ring-down)"
+            if 0.0 < around_s < longest_s
+            else ""
+        )
         raise ExcitationError(
-            f"{what} would take {ticks / rate_hz:g} s; {MAX_TICKS / rate_hz:g} s is the most at "
-            f"{rate_hz:g} Hz: shorten it or run several sessions."
+            f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
+            f"Hz{between}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
+            "or replayed: shorten it or run several sessions."
         )
 
 

@@ -126,6 +126,8 @@ def touch(
     not_negative("settle_s", settle_s)
     if passes < 1:
         raise ExcitationError(f"passes = {passes} must be at least 1.")
+    at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
+    check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
     plant = rig.move_plant(path)
     out = slew(
         by_rad,

@@ -16,6 +16,7 @@ from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
+    check_ticks,
     frequency,
     lay_out_segments,
     positive,
@@ -145,6 +146,7 @@ def until(
             f"scan_s = {scan_s:g} s is too short for fades of {_FADE_S:g} s at both ends; choose "
             f"at least {2 * _FADE_S:g} s."
         )
+    check_ticks("With at_most_s, the session", at_most_s * rate_hz, rate_hz)
     planned_ticks = end + round(PAUSE_S * rate_hz)
     ticks = round(at_most_s * rate_hz)
     if ticks < planned_ticks:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigd.identification._estimate import EstimateError, Timing, Window
 from rigd.identification._experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
-from rigd.session import Session, Status, read_session
+from rigd.session import Session, Status, read_session, sample_digests
 
 _USELESS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
@@ -42,13 +42,24 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     SessionError
         If a file cannot be read.
     EstimateError
-        If a file is of another excitation, or its rate or delays are not those of the first.
+        If a file is of another excitation, its rate or delays are not those of the first, or two
+        files have samples in common.
     """
     windows: list[Window] = []
     unusable = 0
     first: tuple[Timing, float] | None = None
+    digests: dict[Path, frozenset[bytes]] = {}
     for number, path in enumerate(paths):
         session = read_session(path)
+        samples = session.samples
+        own = sample_digests(samples["angle_rad"], samples["coupling_torque_nm"])
+        for other, theirs in digests.items():
+            if own & theirs:
+                raise EstimateError(
+                    f"{path}: it has samples of {other}, noise included, which would count twice; "
+                    "give each session once."
+                )
+        digests[path] = own
         found = (
             Timing(
                 session.number("rate_hz"),

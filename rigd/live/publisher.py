@@ -19,13 +19,14 @@ import numpy as np
 from rigd.engine import (
     SAMPLE,
     TOPICS,
+    Activity,
     Channels,
     Failed,
     Parent,
     Phase,
     Pulse,
-    Stop,
     Word,
+    activity,
     attach_channels,
 )
 from rigd.live._feed import Feed
@@ -42,6 +43,7 @@ from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import last_look, look_path, read_look, touch_line
 from rigd.view import (
+    FINISHING,
     RETURNING,
     RUNNING,
     STOPPING,
@@ -415,6 +417,12 @@ def last_response(session: "LiveSession", own: LastResponse | None) -> LastRespo
 _SILENT_S: Final = 0.6
 """Time without a heartbeat of the supervisor from which on the view says so."""
 _TORQUE_PHASES: Final = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
+_STATES: Final = {
+    Activity.STOPPING: STOPPING,
+    Activity.RUNNING: RUNNING,
+    Activity.RETURNING: RETURNING,
+    Activity.FINISHING: FINISHING,
+}
 
 
 class StateWatch:
@@ -446,14 +454,10 @@ class StateWatch:
                 return SUPERVISOR_SILENT
             if board[Word.GO] and phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
-        if board[Word.STOP] != Stop.NO:
-            return STOPPING
-        if phase is Phase.RUNNING:
-            return RUNNING
-        # Until tick 0 the phase may be that of the session before.
-        if board[Word.GO] and phase is not Phase.READY:
-            return RETURNING
-        return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
+        now = activity(board)
+        if now is Activity.PREPARING:
+            return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
+        return _STATES[now]
 
 
 LOOK_S: Final = 0.25

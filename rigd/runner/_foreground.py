@@ -24,7 +24,10 @@ from rigd.runner._session import SessionFailedError, SessionProgress, SessionRes
 from rigd.runtime import RigLock, StopRequest
 
 _LOOK_PATIENCE_S: Final = 10.0
-"""Longest wait for the last quick look at the end."""
+"""Longest wait for the last quick look at the end, without the time for which it waits for a
+processor that other programs use."""
+_LOOK_LONGEST_S: Final = 120.0
+"""Longest wait for it in all."""
 _POLL_S: Final = 0.05
 
 _Tell = Callable[[str], None]
@@ -246,12 +249,21 @@ def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
     looks.attend()
     if looks.busy:
         _tell("Quick look at the session; Ctrl-C skips it.", err=True)
-    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
-    while looks.busy and not skipped and time.monotonic() < deadline_s:
+    deadline_s = time.monotonic() + _LOOK_LONGEST_S
+    while (
+        looks.busy
+        and not skipped
+        and looks.spent_s < _LOOK_PATIENCE_S
+        and time.monotonic() < deadline_s
+    ):
         time.sleep(_POLL_S)
         looks.attend()
     if looks.busy and not skipped:
-        _tell("The quick look took too long and was skipped.", err=True)
+        why = "took too long" if looks.spent_s >= _LOOK_PATIENCE_S else "got no processor time"
+        _tell(
+            f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
+            err=True,
+        )
     stop.requested = before  # what was skipped is not a session
 
 

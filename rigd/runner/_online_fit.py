@@ -64,8 +64,8 @@ class OnlineFit:
     segments
         Those that were planned while the record ran, once the search has ended.
     shortcoming
-        What is missing of the precision that was asked for, once the record is fitted; empty if
-        nothing is.
+        What is missing of the precision that was asked for, or that this is not known; empty if
+        the whole record has it.
     """
 
     def __init__(
@@ -86,6 +86,7 @@ class OnlineFit:
         self._ended: SearchEnded | None = None
         self._ready = self._begun = False
         self._lost = ""
+        self._skipped = ""
         self._pulse = Pulse()
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.shortcoming = ""
@@ -151,6 +152,7 @@ class OnlineFit:
             self._listen(_POLL_S)
             meanwhile()
             if self._board[Word.STOP] != Stop.NO and time.monotonic() > begun_s + _STOP_PATIENCE_S:
+                self._skipped = "A stop skipped the fit of the whole record."
                 break
             if time.monotonic() > begun_s + _LAST_PATIENCE_S:
                 self._lose("The fit of the whole record took too long.")
@@ -159,11 +161,11 @@ class OnlineFit:
         if self._search is not None:
             targets = self._search.targets
             found = stated(document, targets) if "modes" in document else []
-            self.shortcoming = self._judge(found)
+            reached, self.shortcoming = self._judge(found)
             document["search"] = {
                 "asked": [str(target) for target in targets],
                 "targets": targets_json(found),
-                "reached": not self.shortcoming,
+                "reached": reached,
                 "reason": self.shortcoming or self._success,
                 "pieces": self._pieces,
             }
@@ -181,22 +183,36 @@ class OnlineFit:
             return self._ended.reason
         return "Reached by the fit of the whole record."
 
-    def _judge(self, found: Sequence[Stated]) -> str:
-        """Say what is missing of what was asked for; empty if the whole record has all of it."""
-        if self._told is None:
-            return self._reason or "Nothing was fitted."
-        short = [each for each in found if each.ratio > 1.0]
-        if self._told.final and not short:
-            return ""
+    def _judge(self, found: Sequence[Stated]) -> tuple[bool | None, str]:
+        """Return whether the whole record has what was asked for, and what is missing of it.
+
+        Without a fit of the whole record that is not known, whatever was found on the way.
+        """
+        told, ended = self._told, self._ended
+        on_the_way = ended is not None and ended.reached
+        unknown = "" if told is None else str(told.document.get("problem") or "")
+        if told is None or not told.final:
+            unknown = self._lost or self._skipped or "The whole record was not fitted."
+        elif not unknown and not found:
+            unknown = "Its fit has no modes."
+        if unknown:
+            way = "Reached on the way." if on_the_way else self._reason
+            parts = ["" if way == unknown else way]
+            parts.append(f"Not known whether the whole record has the precision: {unknown}")
+            parts.append(f"Last estimate: {in_words(found)}." if found else "")
+            return None, " ".join(filter(None, parts))
+        short = [each for each in found if not each.ratio <= 1.0]
+        if not short:
+            return True, ""
         reason = self._reason
-        if self._ended is not None and self._ended.reached:
+        if on_the_way:
             reason = self._lost or "Reached on the way, but not by the whole record."
-        return f"{reason} So far: {in_words(short)}.".strip()
+        return False, f"{reason} So far: {in_words(short)}.".strip()
 
     @property
-    def ended_session(self) -> bool:
-        """Whether the session ended because the process was lost."""
-        return self._search is not None and self._ended is None and bool(self._lost)
+    def failure(self) -> str:
+        """Why the process was lost before its search ended, which ends a session; else empty."""
+        return self._lost if self._search is not None and self._ended is None else ""
 
     def _send(self, message: object) -> None:
         if self._lost:

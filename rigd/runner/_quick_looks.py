@@ -1,8 +1,9 @@
 """Quick looks: a program that looks at each session that has ended, and never while one runs.
 
-The program is ``python -m analysis.quick_look``, a separate process at the lowest priority. One
-runs at a time. It is suspended before a session begins and goes on when that has ended; one that
-takes too long is killed, and all end with the process that started them.
+The program is ``python -m analysis.quick_look``, a separate process at a low priority. One runs at
+a time. It is suspended before a session begins and goes on when that has ended; one that takes too
+long is killed, and all end with the process that started them. The time for which it waits for a
+processor that others use does not count.
 """
 
 import contextlib
@@ -19,12 +20,13 @@ from typing import Any, Final
 
 from rigd.printable import printable
 from rigd.runner._session import SessionResult
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
 from rigd.session import look_path, read_look
 
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0
-"""Time in which a look has to be done, without that for which it was suspended."""
+"""Time in which a look has to be done, without that for which it was suspended or waited for a
+processor."""
 _END_S: Final = 0.5
 """Longest wait, when this process ends, for a look that was killed."""
 _MOST_WAITING: Final = 3
@@ -99,14 +101,21 @@ class QuickLooks:
         self._process: subprocess.Popen[str] | None = None
         self._session = Path()
         self._held = False
-        self._left_s = 0.0
-        """Time that the running look still has, at `_looked_s`."""
+        self._spent_s = 0.0
+        """Time that the running look has taken, at `_looked_s`."""
         self._looked_s = 0.0
+        self._processor_s = 0.0
+        """Processor time that it had used then."""
 
     @property
     def busy(self) -> bool:
         """Whether a look is still to be told."""
         return self._process is not None or bool(self._waiting)
+
+    @property
+    def spent_s(self) -> float:
+        """Time that the present look has taken, without its waits for a processor."""
+        return self._spent_s
 
     def begin(self, session: Path) -> None:
         """Look at a session as soon as that is possible."""
@@ -150,13 +159,11 @@ class QuickLooks:
         """Look after the running process; yield what became of it once it has ended."""
         if self._process is None or self._held:
             return
-        now_s = time.monotonic()
-        self._left_s -= now_s - self._looked_s
-        self._looked_s = now_s
-        slow = self._left_s <= 0.0
+        self._count(self._process.pid)
+        slow = self._spent_s >= _LONGEST_S
         if self._process.poll() is None:
             if slow:
-                # Not waited for: at the lowest priority it ends when others leave it the time.
+                # Not waited for: at a low priority it ends when others leave it the time.
                 self._process.kill()
             return
         said = self._process.communicate()[1]
@@ -171,6 +178,17 @@ class QuickLooks:
         else:
             yield self._done()
 
+    def _count(self, pid: int) -> None:
+        """Count the time that the running look has taken since the last call."""
+        now_s = time.monotonic()
+        passed_s, self._looked_s = now_s - self._looked_s, now_s
+        if (found := processor_use(pid)) is not None:
+            wants, processor_s = found
+            used_s, self._processor_s = processor_s - self._processor_s, processor_s
+            if wants:
+                passed_s = min(passed_s, used_s)
+        self._spent_s += passed_s
+
     def _go_on(self) -> Iterator[QuickLook]:
         """Start the next look; yield those that cannot be."""
         while len(self._waiting) > _MOST_WAITING:
@@ -178,7 +196,7 @@ class QuickLooks:
         if self._held or self._process is not None or not self._waiting:
             return
         self._session = self._waiting.popleft()
-        self._left_s, self._looked_s = _LONGEST_S, time.monotonic()
+        self._spent_s, self._processor_s, self._looked_s = 0.0, 0.0, time.monotonic()
         try:
             self._process = subprocess.Popen(
                 [

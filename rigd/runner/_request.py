@@ -68,6 +68,8 @@ class Order:
     """What the loop looks for; None: nothing."""
     watch_fit: bool = False
     """Fit the record while it is recorded."""
+    seed: int | None = None
+    """Seed of a simulated rig's noise; None: a fresh one."""
 
 
 def load_rig(
@@ -87,7 +89,7 @@ def load_rig(
     fast
         Not in real time.
     seed
-        Seed of a simulated rig's noise; None keeps the profile's.
+        Seed of a simulated rig's noise; None: that of the profile, if it states one.
     hardware
         The operator says that the hardware is to move.
     obstacles
@@ -124,12 +126,16 @@ def load_rig(
             + (" Or start rigd simulate with --lock-step." if moving is WhatMoves.SIMULATOR else "")
         )
     if seed is not None:
-        if moving is not WhatMoves.SIMULATED:
+        if moving is WhatMoves.HARDWARE:
             raise RefusedError(
-                f"--seed: the noise of {moving.value} of {profile.path} is not simulated here; "
+                f"--seed: {moving.value} of {profile.path} moves, whose noise is not simulated; "
                 "omit the option."
             )
-        assert profile.rig.simulation is not None
+        if profile.rig.simulation is None:
+            raise RefusedError(
+                f"--seed: {profile.path} has no section [simulation]; copy it from that of rigd "
+                "profiles show sim, or omit the option."
+            )
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
     if obstacles:
@@ -334,7 +340,7 @@ def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> 
     connected
         What the control process told of the devices and of its real-time settings.
     tare
-        Metadata of the tare.
+        Metadata of the tare, and the seed of a simulated rig's noise.
     """
     specimen = order.profile.specimen
     return FileHeader(
@@ -394,10 +400,8 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
     if rig.sensor.filter_hz > 0:
         metadata["torque_filter_hz"] = repr(rig.sensor.filter_hz)
         metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
-    if rig.devices.drive == "sim" and rig.simulation is not None:
-        metadata["simulation_seed"] = str(rig.simulation.seed)
-        if rig.simulation.obstacles:
-            metadata["simulation_obstacles"] = "; ".join(rig.simulation.obstacles)
+    if rig.devices.drive == "sim" and rig.simulation is not None and rig.simulation.obstacles:
+        metadata["simulation_obstacles"] = "; ".join(rig.simulation.obstacles)
     return metadata
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from rigd.devices import session_seed
 from rigd.engine import Event
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
@@ -179,6 +180,7 @@ class Series:
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
+                self._seed(number),
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:
@@ -192,6 +194,13 @@ class Series:
                 looks.begin(seen)
             if not result.went_well:
                 return
+
+    def _seed(self, number: int) -> int | None:
+        """Return the seed of a simulated rig's noise in a session; None: a fresh one."""
+        simulation = self._profile.rig.simulation
+        if simulation is None or simulation.seed is None:
+            return None
+        return session_seed(simulation.seed, number)
 
     def _make_room(self) -> None:
         make_room(self._folder, self._excitation, self._profile.limits)

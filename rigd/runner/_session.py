@@ -316,7 +316,12 @@ class Session:
         self._control_at_work = True
         touch = None if order.touch is None else order.touch.order
         job = SessionJob(
-            order.profile, reference, self._refused_to_supervision(), order.ending, touch
+            order.profile,
+            reference,
+            self._refused_to_supervision(),
+            order.ending,
+            touch,
+            order.seed,
         )
         group.control.send(job)
         answer = self._listen_to_control()
@@ -529,14 +534,20 @@ class Session:
             outcome["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
                 outcome["reason"] = self._fit.shortcoming
+            elif self._fit.failure:
+                # The session was about to end for it: a stop that came before is not the cause.
+                outcome["reason"] = f"{self._fit.failure} {finished.reason}"
         self._group.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
         self._group.recorder.send(Close(outcome, packed, segments))
-        closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
+        # A disk may stall at the end of a record for as long as within it.
+        stall_s = self._order.profile.limits.recorder_lag_s
+        closed = self._ask_recorder(Closed, stall_s + 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
-        whole = closed if closed.path is not None else finished
-        ended, reason = whole.outcome, whole.reason
+        ended, reason = finished.outcome, outcome["reason"]
+        if closed.path is not None:
+            ended, reason = closed.outcome, closed.reason
         return SessionResult(
             path=closed.path,
             outcome=ended,
@@ -550,7 +561,7 @@ class Session:
             stale_wrenches=counts["stale_wrenches"],
             fault=finished.fault
             or ended == "fault"
-            or (self._fit is not None and self._fit.ended_session),
+            or (self._fit is not None and bool(self._fit.failure)),
             live_dropped=self._board[Word.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
             fit=fit,

@@ -11,7 +11,18 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import PROCESSES, SUPERVISOR, TOPICS, Observer, Phase, Pulse, Ring, Word
+from rigd.engine import (
+    PROCESSES,
+    SUPERVISOR,
+    TOPICS,
+    Activity,
+    Observer,
+    Phase,
+    Pulse,
+    Ring,
+    Word,
+    activity,
+)
 from rigd.live import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session import decode_samples
@@ -147,6 +158,8 @@ class RigStatus:
 
     phase: Phase
     """Where the session is."""
+    activity: Activity
+    """State of the session for its operator."""
     angle_rad: float
     """Angle from the rig's zero."""
     coupling_torque_nm: float
@@ -202,6 +215,7 @@ class StatusWatch:
         load_ppm = board.known(Word.BUS_LOAD_PPM)
         return RigStatus(
             phase=Phase(board[Word.PHASE]),
+            activity=activity(board),
             angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
             coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
             torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,

@@ -5,7 +5,7 @@ session goes on without it if it is lost.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
 from typing import TYPE_CHECKING, Any, Final
@@ -192,7 +192,8 @@ class TouchEstimates:
         -------
         list of dict
             In the order in which they happened, as in JSON documents; of one that was not
-            estimated there is its number alone.
+            estimated there is its number alone, and ``final`` is false of a first estimate that no
+            better one followed.
         """
         deadline_s = time.monotonic() + _LAST_PATIENCE_S
 
@@ -231,10 +232,7 @@ class TouchEstimates:
     def _note(self, told: TouchTold) -> None:
         touch = _document(told.number, told)
         self._news.append(touch)
-        line = touch_line(touch)
-        if not told.final:
-            line = f"{line} (first estimate)"
-        self._events.append(Event(0, "info", line, notable=True))
+        self._events.append(Event(0, "info", touch_line(touch), notable=True))
 
     def _lose(self, why: str) -> None:
         self._lost = why
@@ -243,5 +241,7 @@ class TouchEstimates:
 
 
 def _document(number: int, told: TouchTold | None) -> dict[str, Any]:
-    found: Mapping[str, Any] = {} if told is None else told.document
-    return {"number": number, **found}
+    if told is None:
+        return {"number": number}
+    # The better estimate that a first one announces may never come.
+    return {"number": number, **told.document, **({} if told.final else {"final": False})}

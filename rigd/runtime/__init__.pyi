@@ -14,6 +14,7 @@ from ._background import begin_background as begin_background
 from ._background import end_with as end_with
 from ._background import give_way as give_way
 from ._background import killed_first as killed_first
+from ._background import processor_use as processor_use
 from ._background import use_one_thread as use_one_thread
 from ._locks import HeldError as HeldError
 from ._locks import HeldFile as HeldFile

@@ -60,6 +60,30 @@ def give_way(pid: int = 0) -> None:
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
 
+def processor_use(pid: int) -> tuple[bool, float] | None:
+    """Return how a process stands with the processors.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+
+    Returns
+    -------
+    tuple of bool and float, or None
+        Whether it runs or waits for a processor, rather than for anything else; and the processor
+        time that it has used, in s. None if that is not known: it has ended, or is not on Linux.
+    """
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+        # After the program's name, which may hold anything: state, and from there on numbers.
+        fields = stat.rpartition(")")[2].split()
+        ticks = int(fields[11]) + int(fields[12])
+    except (OSError, ValueError, IndexError):
+        return None
+    return fields[0] == "R", ticks / os.sysconf("SC_CLK_TCK")
+
+
 def end_with(parent: int) -> None:
     """Have this process end with the one that started it, however that ends.
 

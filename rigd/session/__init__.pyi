@@ -48,9 +48,11 @@ from ._reader import read_controls as read_controls
 from ._reader import read_session as read_session
 from ._reader import read_timings as read_timings
 from ._reader import read_touches as read_touches
+from ._record_limits import MAX_SAMPLES as MAX_SAMPLES
 from ._recovery import Recovery as Recovery
 from ._recovery import holds_samples as holds_samples
 from ._recovery import recover as recover
+from ._sample_digests import sample_digests as sample_digests
 from ._schema import EVENT_TOPIC as EVENT_TOPIC
 from ._schema import SAMPLE_SCHEMA as SAMPLE_SCHEMA
 from ._schema import SAMPLE_TOPIC as SAMPLE_TOPIC

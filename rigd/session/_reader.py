@@ -30,6 +30,7 @@ from rigd.session._message_decoder import (
     decoded_message,
     quoted,
 )
+from rigd.session._record_limits import MAX_SAMPLES
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
 from rigd.units import unit_of
@@ -37,12 +38,11 @@ from rigd.units import unit_of
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-MAX_SAMPLES: Final = 2_400_000
-"""Most samples that are read into memory: 40 minutes at 1 kHz, 0.27 GB."""
 SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
 """Fields that tell how many samples there are, whether they are in order, and their flags."""
 MAX_SURVEYED: Final = 7_200_000
-"""Most samples of which only that is read: two hours at 1 kHz, the longest of `rigd run`."""
+"""Most samples of which only that is read: two hours at 1 kHz, the longest that an earlier version
+recorded."""
 MAX_EVENTS: Final = 100_000
 """Most lines of a session's log that are read."""
 MAX_EVENT_BYTES: Final = 1 << 20

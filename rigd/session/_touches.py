@@ -43,7 +43,8 @@ def _touch(told: Mapping[str, Any]) -> dict[str, Any]:
         "number": number if isinstance(number, int) and 0 < number < 10**9 else 0,
         **{name: _estimated(told.get(name)) for name in _TOLD},
     }
-    return touch | {"kind": kind[:_MOST_CHARACTERS] if isinstance(kind, str) else ""}
+    first = {"final": False} if told.get("final") is False else {}
+    return touch | {"kind": kind[:_MOST_CHARACTERS] if isinstance(kind, str) else ""} | first
 
 
 def _estimated(told: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
@@ -76,7 +77,8 @@ def touch_line(touch: Mapping[str, Any]) -> str:
     kind = touch.get("kind", "")
     parts.append("kind: cannot tell" if kind == "unknown" else kind)
     what = ", ".join(part for part in parts if part) or "not estimated"
-    return f"Touch {touch['number']}: {what}"
+    first = "" if touch.get("final", True) else " (first estimate)"
+    return f"Touch {touch['number']}: {what}{first}"
 
 
 def packed_touches(touches: Sequence[tuple[int, Mapping[str, Any]]], rate_hz: float) -> bytes:

@@ -18,7 +18,13 @@ from typing import IO, TypeVar, cast
 import numpy as np
 
 from rigd.beam import check_order
-from rigd.devices import Encounter, ObstacleError, describe_obstacle, with_obstacles
+from rigd.devices import (
+    Encounter,
+    ObstacleError,
+    describe_obstacle,
+    fresh_seed,
+    with_obstacles,
+)
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
@@ -58,8 +64,15 @@ class Stuck:
 def open_simulated_rig(rig: RigParameters) -> Devices:
     """Make the devices of a simulated rig; a seed gives the same noise again."""
     simulated = SimulatedRig(rig)
+    sensor = simulated.sensor
+
+    def renew_noise(seed: int | None) -> int:
+        chosen = fresh_seed() if seed is None else seed
+        sensor.renew_noise(chosen)
+        return chosen
+
     return Devices(
-        drive=SimulatedDrive(simulated, rig.rate_hz), sensor=simulated.sensor, simulated=True
+        SimulatedDrive(simulated, rig.rate_hz), sensor, simulated=True, renew_noise=renew_noise
     )
 
 
@@ -328,7 +341,7 @@ class SimulatedSensor:
             for axis in range(6)
             if per_torque[axis] != 0.0 or per_shear[axis] != 0.0
         ]
-        self._rows = chain.from_iterable(self._noise())
+        self._rows = chain.from_iterable(self._noise(simulation.seed))
         self._hum_nm = simulation.hum_nm
         self._hum_turn = simulation.hum_hz / rate_hz
         self._hum_turns = 0.0
@@ -370,6 +383,11 @@ class SimulatedSensor:
         """Report that there is no line, and no fault."""
         return LineHealth(status=0)
 
+    def renew_noise(self, seed: int) -> None:
+        """Begin the noise anew from a seed."""
+        self._rows = chain.from_iterable(self._noise(seed))
+        self.records.clear()
+
     def sample(self) -> None:
         """Take a reading into the filter."""
         self.records.append(self.measure())
@@ -403,10 +421,10 @@ class SimulatedSensor:
     def close(self) -> None:
         """Nothing to release."""
 
-    def _noise(self) -> Iterator[list[list[float]]]:
-        """Yield blocks of rows, each an unloaded wrench."""
+    def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
+        """Yield blocks of rows, each an unloaded wrench; without a seed no others are alike."""
         simulation = self._simulation
-        generator = np.random.default_rng(simulation.seed)
+        generator = np.random.default_rng(seed)
         scale = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
         offset = np.array(simulation.offset)
         limit = np.array(self._sensor.range)

@@ -1,3 +1,4 @@
+from ._banner import FINISHING as FINISHING
 from ._banner import RETURNING as RETURNING
 from ._banner import RUNNING as RUNNING
 from ._banner import STOPPING as STOPPING

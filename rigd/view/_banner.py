@@ -45,6 +45,7 @@ class State:
 RUNNING: Final = State("RUNNING", GREEN)
 STOPPING: Final = State("STOPPING", ORANGE)
 RETURNING: Final = State("RETURNING", ORANGE, "The record is over.")
+FINISHING: Final = State("FINISHING", ORANGE, "The record is over and the torque is off.")
 SUPERVISOR_SILENT: Final = State(
     "SUPERVISOR NOT RESPONDING",
     RED,

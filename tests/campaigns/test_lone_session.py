@@ -54,6 +54,19 @@ def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     assert (tmp_path / "r" / "figures" / "welch_frf.png").exists()
 
 
+def test_samples_that_two_files_have_in_common_count_once(
+    run_here, make_file, short_sessions, tmp_path
+):
+    """Another name, identity and time do not make another session of the same noise."""
+    shutil.copy(short_sessions[0], tmp_path / "whole.mcap")
+    make_file(tmp_path / "again.mcap", 0, id="another", start_utc_ns="1800000000000000000")
+    result = run_here("whole.mcap", "again.mcap", "--method", "welch", "--report", "r")
+    assert result.returncode == 1
+    (error,) = errors(result)
+    assert error.startswith("Error: again.mcap: it has samples of whole.mcap, noise included")
+    assert "whole.mcap is reported alone" in result.stderr
+
+
 def test_one_whole_record_of_several_sessions_is_ranked_by_itself(make_estimate, make_session):
     """The others' could not be used; with nothing to share, BIC is the session's own."""
     one = make_estimate(

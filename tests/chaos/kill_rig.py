@@ -30,10 +30,10 @@ from typing import Any
 
 import numpy as np
 
+from rigd.devices import ask_simulator
 from rigd.devices._simulator import find_simulator
 from rigd.safety._limits import OVERLOADED
 from rigd.session import Status, read_session
-from rigd.sim.wire._simulator import ask
 
 BIN = Path(sys.executable).parent
 PROFILES = Path(__file__).parents[2] / "hw_profiles"
@@ -345,7 +345,7 @@ class Scene:
         assert address is not None
         origins = []
         for _ in range(20):  # an idle one looks at its clock every 10 ms
-            there_s = ask(address, {"status": True})["time_s"]
+            there_s = ask_simulator(address, {"status": True})["time_s"]
             origins.append(there_s - time.monotonic())
             time.sleep(0.003)
         return max(origins)

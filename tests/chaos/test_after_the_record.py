@@ -5,6 +5,7 @@ import signal
 from dataclasses import replace
 
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.engine._messages import FileHeader
 from rigd.engine._ring import shared_memory_fd
@@ -12,7 +13,6 @@ from rigd.engine._shared_state import Phase, Word
 from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.engine.recorder import Recorder
 from rigd.excitation import hold
-from rigd.profile import load_profile
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
 from rigd.runtime._stop_signals import StopRequest
@@ -57,7 +57,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
 
 
 def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_path):
-    profile = load_profile("sim")
+    profile = load_shipped("sim")
     # A virtual machine that is short of processor time stands still for 0.1 s at a time.
     limits = replace(profile.limits, missed_ticks_in_a_row=1000, missed_percent=100.0)
     profile = replace(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.contracts import DeviceError, Devices, LineHealth
 from rigd.profile import load_profile
 
 
@@ -82,6 +82,7 @@ class StandInSensor:
 
     def __init__(self, calls):
         self.calls = calls
+        self.cause = ""
         self.fails_at = {}
         self.wrench_stale = False
         self.wrench_saturated = False
@@ -110,6 +111,9 @@ class StandInSensor:
 
     def connect(self):
         self._called("connect")
+
+    def health(self):
+        return LineHealth(cause=self.cause)
 
     def calibration(self):
         return self.found

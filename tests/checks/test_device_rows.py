@@ -154,9 +154,12 @@ def test_rate_of_a_stream(serial_profile, stand_ins, key, value, verdict):
         "longest_gap_s": 2e-4,
         key: value,
     }
+    stand_ins.sensor.cause = "The adapter holds records back."
     rows = [row for row in inspect_devices(serial_profile) if row.group == "sensor"]
     worst = [row.verdict for row in rows if row.verdict is not Verdict.OK]
     assert worst == ([] if verdict is Verdict.OK else [verdict])
+    named = [row.what for row in rows if row.detail == stand_ins.sensor.cause]
+    assert named == (["longest gap"] if key == "longest_gap_s" else [])
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
 
 
 def test_a_prediction_without_the_memory_is_refused(profile):
-    job = background.PredictionJob(profile, "chirp", {"duration_s": 7000.0}, False, "")
+    job = background.PredictionJob(profile, "chirp", {"duration_s": 2300.0}, False, "")
     told = subprocess.run(
         [sys.executable, "-c", LITTLE_MEMORY],
         input=pickle.dumps(job),

@@ -5,6 +5,7 @@ import asyncio
 import pytest
 from cases import further
 
+from rigd.cli.status_view import _rows
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._states import Peer, State
@@ -518,7 +519,7 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     operated.ask("start", **SHORT)
     (status,) = seen
     assert status["state"] == "running"
-    assert status["progress"]["phase"] == "running"
+    assert status["progress"]["phase"] == status["progress"]["activity"] == "running"
     assert 0 < status["progress"]["tick"] < status["progress"]["total"] == 300
     signals, health = status["rig"]["signals"], status["rig"]["health"]
     assert signals["rate_hz"] == 1000.0
@@ -534,6 +535,23 @@ def test_status_tells_of_progress_processes_and_topics(operated):
         ("idle", "ready"), ("ready", "running"),
     ]  # fmt: skip
     assert any(event["event"] == "progress" for event in operated.events)
+
+
+def test_while_the_drive_is_off_a_session_is_not_said_to_run(operated):
+    seen = []
+
+    def look(drive):
+        assert not drive.enabled
+        operated.service.look()
+        seen.append(operated.service.status())
+
+    operated.world.countdown, operated.world.then = 100, look
+    operated.ask("start", **SHORT)
+    (status,) = seen
+    assert (status["state"], status["progress"]["phase"]) == ("running", "taring")
+    assert status["progress"]["activity"] == "preparing"
+    (line,) = (text.plain for name, text in _rows(status) if name == "state")
+    assert line.startswith("preparing since ")
 
 
 def test_a_refused_start_leaves_the_last_series_as_it_was(operated):

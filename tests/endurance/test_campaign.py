@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.engine._ipc import CONTROL
 from rigd.excitation import hold
-from rigd.profile import load_profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
@@ -33,7 +33,7 @@ def campaign():
 
 @pytest.mark.further  # at length
 def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
-    profile = load_profile("sim")
+    profile = load_shipped("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
     group = ProcessGroup(live=False)
     control = group[CONTROL].pid

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
@@ -15,7 +16,6 @@ from rigd.engine._timing import VirtualClock
 from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.engine.control_process import attend
 from rigd.excitation import chirp
-from rigd.profile import load_profile
 from rigd.runtime._stop_signals import StopRequest
 from rigd.session._format import decode_controls, decode_samples
 
@@ -132,7 +132,7 @@ class Session:
     """
 
     def __init__(self, clock=None, profile=None, excitation=None):
-        self.profile = profile or strict(load_profile("sim"))
+        self.profile = profile or strict(load_shipped("sim"))
         self.excitation = excitation or chirp(
             rate_hz=self.profile.rig.rate_hz,
             duration_s=4.0,
@@ -149,18 +149,18 @@ class Session:
         self.obtained = {}
         devices = open_devices(self.profile.rig)
         self.drive = WatchedDrive(devices.drive)
-        self.devices = Devices(self.drive, devices.sensor, simulated=True)
+        self.devices = Devices(self.drive, devices.sensor, True, devices.renew_noise)
         self.clock = clock or VirtualClock()
         self.board[Word.GO] = 1
 
     def run(self):
         return self.obey(self.order())
 
-    def order(self, excitation=None):
+    def order(self, excitation=None, seed=1):
         """Order a session: this one's, or one with another excitation."""
         reference_rad = (excitation or self.excitation).reference_rad
         reference = put_reference(shared_memory_fd(), reference_rad)
-        return SessionJob(self.profile, reference)
+        return SessionJob(self.profile, reference, seed=seed)
 
     def obey(self, *orders):
         """Attend to the rig from connecting to closing, with these orders in between."""
@@ -220,7 +220,7 @@ def make_session():
 @pytest.fixture
 def quiet_profile():
     """The simulated rig without noise, friction and quantisation."""
-    profile = load_profile("sim")
+    profile = load_shipped("sim")
     rig = profile.rig
     simulation = replace(rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0)
     return replace(

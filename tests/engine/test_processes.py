@@ -13,8 +13,8 @@ from rigd.engine._ipc import Child, ChildError
 from rigd.engine._messages import Ended, MessageReader, Ready, SessionJob, encode
 from rigd.engine._reference import map_reference, put_reference
 from rigd.engine._ring import shared_memory_fd
-from rigd.excitation._signals import MAX_TICKS
 from rigd.profile import load_profile
+from rigd.session import MAX_SAMPLES
 
 PIPE_BYTES = 65_536
 
@@ -36,7 +36,7 @@ def test_a_reference_is_found_where_it_was_placed(memory):
 
 
 def test_a_loop_takes_the_longest_session_without_waiting_for_its_bytes(memory):
-    job = SessionJob(load_profile("sim"), put_reference(memory, np.zeros(MAX_TICKS)))
+    job = SessionJob(load_profile("sim"), put_reference(memory, np.zeros(MAX_SAMPLES)))
     assert len(encode(job)) < PIPE_BYTES
 
 

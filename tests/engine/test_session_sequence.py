@@ -14,6 +14,7 @@ from rigd.engine._messages import Connected, Finished, Ready
 from rigd.engine._shared_state import Phase, Stop, Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import hold
+from rigd.session import MAX_SAMPLES
 from rigd.session._format import Status, decode_samples
 
 
@@ -99,10 +100,22 @@ def test_the_same_seed_gives_the_same_samples_and_another_one_does_not(make_sess
     first = make_session().run().samples
     again = make_session().run().samples
     assert np.array_equal(first, again)
-    profile = make_session().profile
-    simulation = replace(profile.rig.simulation, seed=2)
-    other = replace(profile, rig=replace(profile.rig, simulation=simulation))
-    assert not np.array_equal(first, make_session(profile=other).run().samples)
+    other = make_session()
+    other.obey(other.order(seed=2))
+    assert not np.array_equal(first, other.samples)
+
+
+def test_without_a_seed_each_session_has_a_fresh_one_and_states_it(make_session):
+    session = make_session()
+    session.obey(session.order(seed=None), session.order(seed=None))
+    first, second = (int(ready.tare["simulation_seed"]) for ready in session.parent.said(Ready))
+    assert first != second
+    samples = session.samples
+    here, there = np.split(samples["coupling_torque_nm"], 2)
+    assert not np.array_equal(here, there)
+    again = make_session()
+    again.obey(again.order(seed=first))
+    assert np.array_equal(samples[: samples.size // 2], again.samples)
 
 
 class StopAt(VirtualClock):
@@ -367,7 +380,8 @@ class WorkingClock(VirtualClock):
 
 def test_a_long_record_starts_without_a_gap(make_session):
     rate_hz = make_session().profile.rig.rate_hz
-    session = make_session(excitation=hold(rate_hz=rate_hz, duration_s=3600.0, rest_s=0.0))
+    longest = hold(rate_hz=rate_hz, duration_s=MAX_SAMPLES / rate_hz, rest_s=0.0, ring_down_s=0.0)
+    session = make_session(excitation=longest)
     session.clock = WorkingClock(3_000_000_000, session.stop.request)
     session.run()
     assert session.finished.outcome == "stopped"
@@ -601,13 +615,29 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
 
     def doubtful():
         late = session.board[Word.SCHEDULED] > 1000 or session.parent.said(Finished)
-        return replace(health(), doubt="Records are late." if late else "")
+        count = f"Late so far: {session.board[Word.SCHEDULED]}." if late else ""
+        return replace(health(), doubt="Records are late." if late else "", doubt_count=count)
 
     session.devices.sensor.health = doubtful
     short = hold(rate_hz=1000.0, duration_s=2.0, rest_s=0.2, ring_down_s=0.0)
     session.obey(session.order(short), session.order(short))
-    told = [event for event in session.events if event.message == "Records are late."]
+    events = session.events
+    told = [event for event in events if event.message == "Records are late."]
     assert [event.level for event in told] == ["warning", "warning"]
     assert told[0].t_ns > 1_000_000_000
     assert told[1].t_ns == 0, "in its tare"
+    counts = [event.message for event in events if event.message.startswith("Late so far")]
+    assert counts == ["Late so far: 2200."] * 2
     assert [m.outcome for m in session.parent.said(Finished)] == ["complete"] * 2
+
+
+def test_what_the_sensor_knows_of_the_cause_is_the_remedy(make_session):
+    session = make_session()
+    sensor = session.devices.sensor
+    health = sensor.health
+    sensor.health = lambda: replace(health(), cause="Set the latency timer to 1 ms.")
+    sensor.wrench_stale = True
+    finished = session.run().finished
+    assert finished.outcome == "fault"
+    assert finished.reason.endswith("(limits.stale_ticks_in_a_row). Set the latency timer to 1 ms.")
+    session.assert_safe()

@@ -1,5 +1,6 @@
 """The references: what they ask of the rig, and that their passes are where the layout says."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
+from rigd.identification import _records
+from rigd.identification._estimate import EstimateError
 from rigd.identification._experiments import (
     Pass,
     lay_out_passes,
@@ -15,6 +18,7 @@ from rigd.identification._experiments import (
     speeds_session,
     trial_session,
 )
+from rigd.identification._records import read_recording
 from rigd.runner._planning import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
@@ -117,3 +121,12 @@ def test_other_metadata_hold_no_layout(profile, change):
     assert read_layout(metadata) is not None
     changed = {k: v for k, v in (metadata | change).items() if v is not None}
     assert read_layout(changed) is None
+
+
+def test_a_session_counts_once(short_chirps, tmp_path, monkeypatch):
+    monkeypatch.setattr(_records, "_passes", lambda *_: ([], 0))
+    copied = tmp_path / "copied.mcap"
+    shutil.copy(short_chirps[0], copied)
+    named = rf"copied\.mcap: it has samples of .*{short_chirps[0].name}"
+    with pytest.raises(EstimateError, match=named):
+        read_recording([short_chirps[0], short_chirps[1], copied], 0.0)

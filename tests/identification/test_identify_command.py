@@ -27,7 +27,18 @@ def pasted(text, toml):
 
 @pytest.mark.further  # as test_identified_motors.py, without processes
 def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
-    done = rigd("identify", "motor", "--profile", "sim", "--fast", "--json", "--output", "out")
+    done = rigd(
+        "identify",
+        "motor",
+        "--profile",
+        "sim",
+        "--fast",
+        "--seed",
+        "1",
+        "--json",
+        "--output",
+        "out",
+    )
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     names = sorted(path.name.split("-", 2)[2] for path in (tmp_path / "out").iterdir())

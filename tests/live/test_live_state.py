@@ -15,6 +15,7 @@ from rigd.engine._topics import DESCRIPTORS
 from rigd.live._ring_reader import LiveSession
 from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
 from rigd.view import (
+    FINISHING,
     RETURNING,
     RUNNING,
     STOPPING,
@@ -49,7 +50,7 @@ def test_the_board_tells_every_state_of_a_session(channels):
     assert state(PHASE=Phase.RUNNING) == RUNNING
     assert state(STOP=Stop.OPERATOR) == STOPPING
     assert state(STOP=Stop.NO, PHASE=Phase.RETURNING) == RETURNING
-    assert state(PHASE=Phase.OFF) == RETURNING
+    assert state(PHASE=Phase.OFF) == FINISHING
 
 
 def test_a_supervisor_that_hangs_is_told_within_a_second(channels):

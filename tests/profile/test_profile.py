@@ -74,7 +74,8 @@ def test_profile_is_frozen_and_can_be_sent_to_another_process(profile):
         profile.name = "other"
 
 
-def test_a_path_and_a_name_find_the_same_profile(profile):
+def test_a_path_and_a_name_find_the_same_profile():
+    profile = load_profile("sim")
     assert load_profile(profile.path) == profile
     assert load_profile(str(profile.path)).rig == profile.rig
 
@@ -448,3 +449,19 @@ def test_limits_that_can_only_just_be_exceeded_are_taken(sim_toml, tmp_path, old
     path = tmp_path / "rig.toml"
     path.write_text(sim_toml.replace(old, new), encoding="utf-8")
     load_profile(path)
+
+
+def test_a_seed_of_the_noise_is_optional_and_a_whole_number(sim_toml, tmp_path):
+    path = tmp_path / "sim.toml"
+    commented = next(line for line in sim_toml.splitlines() if line.startswith("# seed = "))
+    for value, refused in (("5", ""), ("-1", "-1"), ("1.5", "1.5"), ('"a"', '"a"')):
+        line = commented.removeprefix("# ").replace("value = 1", f"value = {value}")
+        path.write_text(sim_toml.replace(commented, line), encoding="utf-8")
+        if not refused:
+            assert load_profile(path).rig.simulation.seed == int(value)
+            continue
+        with pytest.raises(ProfileError) as told:
+            load_profile(path)
+        assert "simulation.seed" in str(told.value)
+        assert refused in str(told.value)
+        assert len(str(told.value).splitlines()) == 1, str(told.value)

@@ -156,7 +156,7 @@ def test_keys_that_may_be_left_out(tmp_path):
     text = load_profile("antenna_can").text
     plain = load_profile("antenna_can").rig.cia402
     assert (plain.eds, plain.set_objects, plain.accept_without) == ("", (), ())
-    assert (plain.sync_gaps, plain.follows_target_bit) == (True, True)
+    assert (plain.sync_gaps, plain.follows_target_bit) == (False, True)
     assert (plain.own_watchdog_s, plain.torque_response_s) == (0, 0)
     (tmp_path / "drive.eds").write_text("")
     path = tmp_path / "other.toml"
@@ -165,7 +165,7 @@ def test_keys_that_may_be_left_out(tmp_path):
         'set_objects = ["3001:2 u32 2500", "0x2005 i16 -3"]',
         'accept_without = ["torque_limit"]',
         'own_watchdog_s = { value = 0.1, source = "datasheet" }',
-        "sync_gaps = false",
+        "sync_gaps = true",
         'torque_response_s = { value = 0.0032, source = "measured" }',
         "follows_target_bit = false",
     )
@@ -175,5 +175,5 @@ def test_keys_that_may_be_left_out(tmp_path):
     assert told.eds == str(tmp_path.resolve() / "drive.eds")
     assert told.set_objects == ("3001:2 u32 2500", "0x2005 i16 -3")
     assert told.accept_without == ("torque_limit",)
-    assert (told.sync_gaps, told.follows_target_bit) == (False, False)
+    assert (told.sync_gaps, told.follows_target_bit) == (True, False)
     assert profile.sources["cia402.torque_response_s"] == "measured"

@@ -5,7 +5,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from rigd.engine import FitTold, SearchEnded
+from rigd.engine import ChildError, FitTold, SearchEnded, Stop, Word
 from rigd.excitation import parse_target
 from rigd.runner._online_fit import OnlineFit
 
@@ -13,7 +13,7 @@ REACHED = SearchEnded(True, "Reached: damping of mode 1 0.009, standard deviatio
 NOT_REACHED = SearchEnded(False, "Not reached within 20 s (--at-most).", {})
 
 
-def of_whole_record(std: float) -> FitTold:
+def of_whole_record(std: float, *, final: bool = True) -> FitTold:
     damping = {"value": 0.01, "std": std, "flag": None, "std_any_rig": None}
     mode = {
         "mode": 1,
@@ -21,7 +21,7 @@ def of_whole_record(std: float) -> FitTold:
         "damping_ratio": damping,
         "shown": True,
     }
-    return FitTold({"modes": [mode], "parameters": {}, "text": []}, final=True)
+    return FitTold({"modes": [mode], "parameters": {}, "text": []}, final=final)
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,50 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     fit = OnlineFit(group, MagicMock(), MagicMock(), search)
     fit.begin(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
-    assert found["reached"] == reached
+    assert found["reached"] is reached
     assert found["reason"].startswith(reason)
     assert (fit.shortcoming == "") == reached
+
+
+STOPPED = {Word.STOP: Stop.OPERATOR}
+ON_THE_WAY = of_whole_record(0.9e-4, final=False)
+FAILED = FitTold({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
+NOT_A_NUMBER = of_whole_record(float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("told", "board", "reached", "words"),
+    [
+        ((REACHED, ON_THE_WAY), STOPPED, None,
+         ("Reached on the way. Not known", "A stop skipped the fit", "Last estimate: damping of")),
+        ((ON_THE_WAY,), STOPPED, None, ("Not known", "A stop skipped", "Last estimate: damping")),
+        ((REACHED,), STOPPED, None, ("Reached on the way. Not known", "A stop skipped")),
+        ((REACHED, ON_THE_WAY, ChildError("The fit process was killed.")), {}, None,
+         ("Reached on the way. Not known", "was killed.", "Last estimate: damping of mode 1")),
+        ((ON_THE_WAY, ChildError("The fit process was killed.")), {}, None,
+         ("Not known", "was killed.", "Last estimate")),
+        ((REACHED, FAILED), {}, None, ("Reached on the way. Not known", "The sensor stands still")),
+        ((REACHED, NOT_A_NUMBER), {}, False, ("not by the whole record. So far: damping of mode",)),
+    ],
+)  # fmt: skip
+def test_no_answer_of_the_whole_record_is_not_a_no(told, board, reached, words, monkeypatch):
+    monkeypatch.setattr("rigd.runner._online_fit._STOP_PATIENCE_S", 0.0)
+    group = MagicMock()
+    group.channels.board.__getitem__.side_effect = lambda word: board.get(word, 0)
+
+    def messages(_):
+        for message in told:
+            if isinstance(message, ChildError):
+                raise message
+            yield message
+
+    group.__getitem__().messages.side_effect = messages
+    search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
+    fit = OnlineFit(group, MagicMock(), MagicMock(), search)
+    fit.begin(MagicMock())
+    found = fit.finish(9000, lambda: None)["search"]
+    assert found["reached"] is reached
+    assert found["reason"] == fit.shortcoming
+    assert all(each in fit.shortcoming for each in words), fit.shortcoming
+    assert "So far: ." not in fit.shortcoming
+    assert fit.shortcoming.count("was killed.") <= 1

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -15,6 +16,7 @@ from processes import children, eventually, state_of
 from rigd.runner import _quick_looks as quick_looks
 from rigd.runner._quick_looks import QuickLook, QuickLooks
 from rigd.runner._session import SessionResult
+from rigd.runtime import processor_use
 from rigd.session import look_path
 
 PROGRAM = """
@@ -65,6 +67,11 @@ def done(looks):
 
     assert eventually(idle)
     return looks.told
+
+
+def spent_s(looks):
+    looks.attend()
+    return looks.spent_s
 
 
 def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
@@ -121,6 +128,33 @@ def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_p
     assert told.error == "it took longer than 0.4 s."
 
 
+def test_the_wait_for_a_processor_does_not_count(looks, tmp_path, monkeypatch):
+    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
+    used_s = 0.0
+    monkeypatch.setattr(quick_looks, "processor_use", lambda _: (True, used_s))
+    looks.begin(tmp_path / "waits.mcap")
+    for _ in range(3):
+        time.sleep(0.05)
+        looks.attend()
+    assert (looks.busy, looks.told, looks.spent_s) == (True, [], 0.0)
+    used_s = 0.06
+    time.sleep(0.06)
+    looks.attend()
+    (told,) = done(looks)
+    assert told.error == "it took longer than 0.05 s."
+
+
+def test_what_a_process_does_with_the_processors():
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as busy:
+        assert eventually(lambda: processor_use(busy.pid)[1] > 0.02)
+        assert processor_use(busy.pid)[0]
+        busy.kill()
+    assert processor_use(busy.pid) is None
+    with subprocess.Popen(["sleep", "600"]) as idle:
+        assert eventually(lambda: not processor_use(idle.pid)[0])
+        idle.kill()
+
+
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.05)
     monkeypatch.setattr(quick_looks, "_END_S", 0.05)
@@ -131,7 +165,7 @@ def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeyp
         process = looks._process
         late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
         late.start()
-        time.sleep(0.1)
+        assert eventually(lambda: spent_s(looks) >= 0.05)
         end()
         assert looks.told == []
         assert process.poll() is None

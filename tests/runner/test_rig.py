@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from processes import children
+from shipped_profile import load_shipped
 
 from rigd.engine._shared_state import Phase
 from rigd.excitation import hold
-from rigd.profile import load_profile
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig, RigError
 from rigd.runtime._stop_signals import StopRequest
@@ -20,7 +20,7 @@ from rigd.session import read_session
 
 @pytest.fixture
 def profile():
-    return load_profile("sim")
+    return load_shipped("sim")
 
 
 @pytest.fixture

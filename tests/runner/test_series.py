@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.engine import Phase
 from rigd.excitation import hold
@@ -47,7 +48,7 @@ class Watcher:
 
 @pytest.fixture
 def make_series(tmp_path):
-    profile = load_profile("sim")
+    profile = load_shipped("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
 
     def make(**options):
@@ -82,6 +83,22 @@ def test_a_lone_session_is_not_numbered(make_series):
     assert dict(order.predicted)["limit_angle_rad"] == "1.57"
     assert float(dict(order.predicted)["predicted_peak_velocity_rad_s"]) >= 0.0
     assert order.path.stem.endswith("-hold")
+
+
+def test_the_sessions_of_a_series_derive_their_seeds_from_the_stated_one(make_series):
+    def seeds():
+        rig = Rig(*[WELL] * 3)
+        make_series(repeat=3).run(rig, StopRequest(), Watcher(), live=False)
+        return [order.seed for order in rig.orders]
+
+    assert seeds()[0] == 1
+    assert len(set(seeds())) == 3
+    assert seeds() == seeds()
+
+
+def test_no_shipped_profile_states_a_seed():
+    for name in ("sim", "antenna_can", "antenna_serial"):
+        assert load_profile(name).rig.simulation.seed is None
 
 
 def test_after_a_stop_no_session_begins(make_series):
@@ -160,7 +177,7 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
 
 
 def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):
-    profile, watcher = load_profile("sim"), Watcher()
+    profile, watcher = load_shipped("sim"), Watcher()
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
     recorded, looks = replace(WELL, path=Path("a.mcap")), Looks(watcher.told)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")

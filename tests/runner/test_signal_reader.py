@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.engine import Phase, Word, shared_memory_fd
 from rigd.engine._ring import Ring
-from rigd.profile import load_profile
 from rigd.runner import _signal_blocks
 from rigd.runner._signal_blocks import SignalReader
 from rigd.session._format import SAMPLE_SIZE, pack_sample_into
@@ -32,7 +32,7 @@ def clock(monkeypatch):
 
 @pytest.fixture(scope="module")
 def profile():
-    return load_profile("sim")
+    return load_shipped("sim")
 
 
 @pytest.fixture

@@ -1,12 +1,14 @@
 """Estimates of touches: what a session does while the touch process prepares."""
 
+import json
 import time
 from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine import TouchReady
+from rigd.engine import TouchReady, TouchTold
 from rigd.runner._touch_search import TouchEstimates
+from rigd.session import touch_line, touches_of
 
 
 class Group(dict):
@@ -47,3 +49,18 @@ def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, word
     told = [event.message for event in touches.attend()]
     assert len(told) == len(words)
     assert all(each in text for each, text in zip(words, told, strict=True))
+
+
+def test_a_first_estimate_that_no_better_one_followed_is_called_that(monkeypatch):
+    monkeypatch.setattr("rigd.runner._touch_search._LAST_PATIENCE_S", 0.0)
+    x = {"value": 0.6, "std": 0.01, "interval_95": [0.58, 0.62]}
+    told = [TouchTold(1, 900, True, {"x_m": x}), TouchTold(2, 2900, False, {"x_m": x})]
+    touches = estimates(lambda _: told)
+    touches.attend()
+    found = touches.finish(3, lambda: None)
+    assert [touch.get("final") for touch in found] == [None, False, None]
+    for each in (found, touches_of({"touches": json.dumps(found)})):
+        sure, first, without = map(touch_line, each)
+        assert "first estimate" not in sure + without
+        assert first.endswith("(first estimate)")
+        assert without == "Touch 3: not estimated"

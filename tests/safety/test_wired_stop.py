@@ -4,10 +4,10 @@ import struct
 from dataclasses import replace
 
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import DeviceError
-from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
 
@@ -16,7 +16,7 @@ HOST, NODE = 127, 1
 
 @pytest.fixture
 def direct():
-    devices = open_devices(load_profile("sim").rig)
+    devices = open_devices(load_shipped("sim").rig)
     devices.drive.connect()
     devices.drive.enable()
     devices.drive.latch(0)
@@ -50,7 +50,7 @@ class Node:
     """The simulated drive on a bench, brought to operation enabled by hand."""
 
     def __init__(self, sto_error_code):
-        rig = load_profile("antenna_can").rig
+        rig = load_shipped("antenna_can").rig
         rig = replace(rig, cia402=replace(rig.cia402, sto_error_code=sto_error_code))
         simulated = SimulatedRig(rig)
         self.plant = simulated.plant

@@ -30,7 +30,8 @@ from rigd.session._mcap_limits import (
     MAX_TOTAL_BYTES,
 )
 from rigd.session._message_decoder import MAX_CHANNELS, MAX_SINGLE_MESSAGES
-from rigd.session._reader import MAX_SAMPLES, MAX_SURVEYED
+from rigd.session._reader import MAX_SURVEYED
+from rigd.session._record_limits import MAX_SAMPLES
 from rigd.session._schema import MAX_SCHEMA_BYTES
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "session_format.md").read_text("utf-8")
@@ -83,7 +84,7 @@ def test_the_limits_are_those_of_the_code():
     assert f"more than {MAX_STEPS // 10**6} million runs" in DOCUMENT
     assert f"more than {MAX_SINGLE_MESSAGES // 1000} 000 samples" in DOCUMENT
     assert f"up to {MAX_SURVEYED / 1e6:g} million samples" in DOCUMENT
-    assert f"up to {MAX_SAMPLES / 1e6:g} million (" in DOCUMENT
+    assert f"up to {MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 
 
 def test_the_example_writes_a_session(tmp_path):

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from analysis.identify import Measurement, Plant
 from analysis.identify._comparison import Comparison
 from analysis.identify._drag_torque import DragLaw, DragResponse
 from rigd.beam import Damping, PointForceGrid
-from rigd.profile import load_profile
 from rigd.sim._plant import SimulatedPlant
 
 DRAG_M = 2.3e-3
@@ -18,7 +18,7 @@ TICKS = 25_000
 
 
 def rig(drag_m, damping, coulomb_nm=0.0, delay_s=0.0):
-    parameters = load_profile("sim").rig
+    parameters = load_shipped("sim").rig
     assert parameters.simulation is not None
     return replace(
         parameters,

@@ -13,14 +13,14 @@ from cases import further
 from hypothesis import given
 from hypothesis import strategies as st
 from resting_beams import pressing_force_n
+from shipped_profile import load_shipped
 
 from rigd.beam import Damping, PointForceGrid
 from rigd.devices import ObstacleError
-from rigd.profile import load_profile
 from rigd.sim._obstacle import _Wall
 from rigd.sim._plant import SimulatedPlant
 
-RIG = load_profile("sim").rig
+RIG = load_shipped("sim").rig
 BEAM, DAMPING = RIG.beam, RIG.damping
 PERIOD_S = 1e-3
 FINE_S = 2e-6

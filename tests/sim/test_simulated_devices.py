@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Selection
-from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
 
 PERIOD_NS = 1_000_000
@@ -16,7 +16,7 @@ PERIOD_NS = 1_000_000
 
 @pytest.fixture
 def rig():
-    return load_profile("sim").rig
+    return load_shipped("sim").rig
 
 
 def watch(rig, ticks, torque_nm):
@@ -164,7 +164,7 @@ def test_a_hum_goes_on_through_missed_periods(quiet):
 
 
 def test_a_hum_is_sampled_with_every_record_of_a_stream(quiet):
-    serial = load_profile("antenna_serial").rig.ati_serial
+    serial = load_shipped("antenna_serial").rig.ati_serial
     rig = replace(
         quiet,
         ati_serial=replace(serial, filter="mean", stream_hz=3000.0),
@@ -195,7 +195,7 @@ def test_a_profile_without_a_simulation_section_is_refused(rig):
 @pytest.fixture
 def streaming():
     """A rig whose sensor streams seven records a tick, simulated directly and without noise."""
-    rig = load_profile("antenna_serial").rig
+    rig = load_shipped("antenna_serial").rig
     quiet = replace(rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0, offset=(0.0,) * 6)
     sensor = replace(rig.sensor, resolution=(0.0,) * 6)
     return replace(

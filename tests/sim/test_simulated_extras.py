@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.beam import LoadedBeam, PointForceGrid
-from rigd.profile import load_profile
 from rigd.sim._plant import OtherClock, SimulatedPlant
 
 TICKS = 12_000
@@ -15,7 +15,7 @@ RATE_HZ = 1000.0
 
 @pytest.fixture(scope="module")
 def rig():
-    rig = load_profile("sim").rig
+    rig = load_shipped("sim").rig
     return replace(rig, motor=replace(rig.motor, coulomb_nm=0.0))
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from cases import further
 from scipy.integrate import solve_ivp
+from shipped_profile import load_shipped
 
 from rigd.beam import Beam, Damping, RealisationError, clamped_free_eigenvalues, realise
-from rigd.profile import load_profile
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._stiffness_drift import MOST_DRIFT
 
@@ -22,7 +22,7 @@ STATE = (
 
 @pytest.fixture(scope="module")
 def rig():
-    rig = load_profile("sim").rig
+    rig = load_shipped("sim").rig
     return replace(rig, motor=replace(rig.motor, coulomb_nm=0.0))
 
 

@@ -43,7 +43,7 @@ FULL_DISK = "Free space on the session's disk 12 MB below limit 50 MB."
 @pytest.mark.parametrize(
     ("message", "word", "reason", "tone"),
     [
-        (change("ready", "running", "chirp was started"), "RUNNING", "Chirp was", "running"),
+        (change("ready", "running", "chirp was started"), "PREPARING", "Chirp was", "stopping"),
         further(
             change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"
         ),
@@ -72,12 +72,20 @@ def test_a_lost_server_is_told_and_found_again(server, page):
     assert page.is_enabled("#start-button")
 
 
+@pytest.mark.further  # as tests/daemon/test_service.py has it of the status
+def test_a_session_that_is_prepared_does_not_run_yet(server, page):
+    server.tell(status("running"), progress(0.0, activity="preparing"))
+    says(page, "#state-word", "PREPARING")
+    server.tell(progress(0.1, activity="running"))
+    says(page, "#state-word", "RUNNING")
+
+
 @pytest.mark.further
 def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
     server.tell(status("running"), progress(0.1))
     says(page, "#state-word", "RUNNING")
     expect(page.locator("#state-word")).to_have_text("OFFLINE")
-    server.tell(progress(0.2), status("running"))
+    server.tell(status("running"), progress(0.2))
     says(page, "#state-word", "RUNNING")
 
 

@@ -5,6 +5,7 @@ the calibration are one matrix, applied to the newest records in one product.
 """
 
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from struct import Struct
@@ -14,13 +15,19 @@ import numpy as np
 from rigd.devices import DeviceError, LineHealth, RigParameters, SimulatorAddress, Wrench
 from rigd.devices.ati._calibration import SERIAL_CRITICAL, CalibrationBlock, serial_status
 from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
-from rigd.devices.ati._serial_setup import SILENCE_S, SerialLine, SerialSetup
+from rigd.devices.ati._serial_setup import SILENCE_S, SerialLine, SerialSetup, held_back
 
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 # The error bit is not covered by the checksum; one flipped bit must not end a session.
 _ERRORS_IN_A_ROW = 7
 # Unread for longer than this, the kernel's 4 kB may overflow at 91 kB/s and what is left is old.
 _IDLE_NS = 20_000_000
+_GAP_PERIODS = 2.5
+"""Periods without a byte that are a gap: the stream brings several records in each."""
+_GAPS, _FEWEST_GAPS = 8, 4
+_EVEN = 1.5
+"""Ratio of a gap to the middle one up to which they are even."""
+_RECENT_NS = 500_000_000
 _STEADY_TICKS = 3
 """Ticks that bring their own records after which what is still missing counts as lost."""
 
@@ -91,6 +98,8 @@ class AtiSerialSensor:
         self._errors_in_a_row = 0
         self._arrived = 0
         self._arrived_ns = 0
+        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS)
+        """When the latest blocks came after a gap, and how long it was."""
         # How many bytes should have come by this tick; a record or two less is not a lag.
         self._due = 0
         self._tick_ns: int | None = None
@@ -224,20 +233,41 @@ class AtiSerialSensor:
             bit_rate_bit_s=self._settings.baud,
             errors=self.stream.checksum_errors,
             status=self._status_word,
-            doubt=self._doubt(),
+            doubt=self._doubt,
+            doubt_count=self._doubt_count(),
+            cause=self._cause(),
         )
 
+    @property
     def _doubt(self) -> str:
+        if not self._missing_records:
+            return ""
+        return (
+            f"{self._name}: records did not arrive, or all have been delayed since; the line does "
+            "not show which: the wrench may be older than the file states. Check cable and "
+            "adapter; reconnecting (rigd reset, or another rigd run) ends it."
+        )
+
+    def _doubt_count(self) -> str:
         missing = self._missing_records
         if not missing:
             return ""
         late_ms = 1e3 * missing / self._settings.stream_hz
         return (
-            f"{self._name}: {missing} records did not arrive, or all have been delayed by "
-            f"{late_ms:.2g} ms since; the line does not show which: the wrench may be older than "
-            "the file states. Check cable and adapter; reconnecting (rigd reset, or another rigd "
-            "run) ends it."
+            f"{self._name}: records that did not arrive since it was connected: {missing}; or the "
+            f"wrench is late by {late_ms:.2g} ms."
         )
+
+    def _cause(self) -> str:
+        """Say that the adapter holds records back, where the latest came in even blocks."""
+        now_ns = time.monotonic_ns()
+        gaps_ns = sorted(gap for came_ns, gap in self._gaps if now_ns - came_ns < _RECENT_NS)
+        if len(gaps_ns) < _FEWEST_GAPS:
+            return ""
+        middle_ns = gaps_ns[len(gaps_ns) // 2]
+        if not 1 / _EVEN < gaps_ns[0] / middle_ns <= gaps_ns[-1] / middle_ns < _EVEN:
+            return ""
+        return held_back(middle_ns * 1e-9, self._port)
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Watch the stream for a while, between `connect` and the first tick.
@@ -299,8 +329,12 @@ class AtiSerialSensor:
         """Sort what has arrived into records; return the new ones."""
         if not data:
             return data
+        now_ns = time.monotonic_ns()
+        gap_ns = now_ns - self._arrived_ns
+        if self._arrived_ns and gap_ns > _GAP_PERIODS * self._period_ns:
+            self._gaps.append((now_ns, gap_ns))
         self._arrived += len(data)
-        self._arrived_ns = time.monotonic_ns()
+        self._arrived_ns = now_ns
         new = self.stream.feed(data)
         if new:
             if max(new[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:

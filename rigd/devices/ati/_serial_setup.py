@@ -10,6 +10,7 @@ import termios
 import time
 from contextlib import suppress
 from itertools import chain
+from pathlib import Path
 
 import serial
 
@@ -24,6 +25,26 @@ from rigd.devices.ati._calibration import (
 )
 
 _READ_SIZE = 65_536
+
+
+def held_back(gap_s: float, port: str) -> str:
+    """Say that an adapter holds records back, and the remedy.
+
+    Parameters
+    ----------
+    gap_s
+        Time between two blocks of records.
+    port
+        File name of the port.
+    """
+    name = Path(os.path.realpath(port)).name
+    if not name.startswith("ttyUSB"):
+        name = "ttyUSB…"
+    return (
+        f"The records arrive in blocks every {1e3 * gap_s:.2g} ms: the latency timer of the USB "
+        "adapter holds them back. Set it to 1 ms (setserial low_latency, or write 1 to "
+        f"/sys/bus/usb-serial/devices/{name}/latency_timer), or use an adapter without one."
+    )
 
 
 class SerialLine:

@@ -313,15 +313,18 @@ class Cia402Drive:
         exchange = self._node.exchange
         pairing = self._node.pairing
         unproven = pairing.unproven
-        how = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
-        doubt = (
-            f"{self._name}: {unproven} of its TPDOs did not arrive, or all have been delayed by as "
-            f"many periods since, which is unknown {how}: angles may be older than the file states."
-            if unproven
-            else ""
-        )
+        doubt = count = ""
+        if unproven:
+            how = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
+            doubt = (
+                f"{self._name}: a TPDO did not arrive, or all have been delayed by a period since, "
+                f"which is unknown {how}: angles may be older than the file states."
+            )
+            count = f"{self._name}: TPDOs that did not arrive since it was connected: {unproven}."
         errors = exchange.error_frames + pairing.lost + self._inbox.malformed
-        return LineHealth(exchange.bits, self._bit_rate_bit_s, errors, doubt=doubt)
+        return LineHealth(
+            exchange.bits, self._bit_rate_bit_s, errors, doubt=doubt, doubt_count=count
+        )
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises.

@@ -20,7 +20,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigd.devices import SimulatorAddress, announce, described, find_simulator, forget
+from rigd.devices import (
+    SimulatorAddress,
+    announce,
+    ask_simulator,
+    described,
+    find_simulator,
+    forget,
+    fresh_seed,
+    session_seed,
+)
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.runtime import runtime_folder
@@ -116,7 +125,6 @@ Answer = Callable[[dict[str, Any]], dict[str, Any]]
 """Answers a request."""
 
 _LONGEST_LINE = 65_536
-_TIMEOUT_S = 2.0
 
 
 class ControlSocket:
@@ -184,30 +192,6 @@ class ControlSocket:
         del self._links[link]
         del self._handlers[link.fileno()]
         link.close()
-
-
-def ask(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
-    """Ask a running simulator, and return its reply.
-
-    Raises
-    ------
-    DeviceError
-        If it does not answer, or refuses; then with its own words.
-    """
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-            link.settimeout(_TIMEOUT_S)
-            link.connect(address.control_socket)
-            link.sendall(json.dumps(request).encode() + b"\n")
-            with link.makefile("rb") as lines:
-                reply = json.loads(lines.readline(_LONGEST_LINE))
-    except (OSError, ValueError) as error:
-        raise DeviceError(
-            f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
-        ) from None
-    if not isinstance(reply, dict) or "error" in reply:
-        raise DeviceError(str(reply["error"] if isinstance(reply, dict) else reply))
-    return reply
 
 
 # The process
@@ -319,10 +303,12 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
         )
     faults = [parse_fault(spec) for spec in specs]  # all of them, before the first one happens
     if not specs:
-        return [f"{name}: {value}" for name, value in ask(address, {"status": True}).items()]
+        return [
+            f"{name}: {value}" for name, value in ask_simulator(address, {"status": True}).items()
+        ]
     lines = []
     for fault, spec in zip(faults, specs, strict=True):
-        injected = str(ask(address, {"inject": spec})["injected"])
+        injected = str(ask_simulator(address, {"inject": spec})["injected"])
         end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
         lines.append(f"{injected}; it lasts until: {end}" if fault.stands else injected)
     return lines
@@ -362,6 +348,9 @@ class _Process:
         if rig.ati_serial is not None:
             self._line = PtyLine(self._handlers, self._on_bytes, self._on_port)
             stack.callback(self._line.close)
+        stated = None if rig.simulation is None else rig.simulation.seed
+        self._seed = fresh_seed() if stated is None else stated
+        self._sessions = 0
         self._world = self._make_world()
         control = ControlSocket(folder / f"{rig.name}.control", self._handlers, self._answer)
         stack.callback(control.close)
@@ -427,7 +416,7 @@ class _Process:
         from rigd.sim.wire._drive_node import DriveNode
 
         rig = self._rig
-        simulated = SimulatedRig(without_transport(rig))
+        simulated = self._simulated = SimulatedRig(without_transport(rig))
         line = self._line
         world = BusSimulation(
             rig,
@@ -528,6 +517,11 @@ class _Process:
             except (FaultError, DeviceError) as error:
                 return {"error": str(error)}
             return {"injected": str(fault)}
+        if "renew_noise" in request:
+            seed = request["renew_noise"]
+            if seed is not None and not (type(seed) is int and seed >= 0):
+                return {"error": "The seed has to be a whole number from 0 on, or null."}
+            return {"seed": self._renew_noise(seed)}
         if "status" in request:
             return {
                 "rig": self._rig.name,
@@ -541,7 +535,15 @@ class _Process:
                 "lost_bytes": 0 if self._line is None else self._line.lost,
                 "disturbed": self._world.disturbed,
             }
-        return {"error": "A request has to be 'inject' or 'status'."}
+        return {"error": "A request has to be 'inject', 'status' or 'renew_noise'."}
+
+    def _renew_noise(self, seed: int | None) -> int:
+        """Begin the noise of a session; without a seed that of the next one on this rig."""
+        if seed is None:
+            self._sessions += 1
+            seed = session_seed(self._seed, self._sessions)
+        self._simulated.sensor.renew_noise(seed)
+        return seed
 
 
 def _nowhere(data: bytes) -> None:

@@ -6,6 +6,7 @@ import { digits, minutes } from "./format.js";
 const SILENT_MS = 2000;
 const TONES = {
   READY: "ready", RUNNING: "running", STOPPING: "stopping", FAULT: "alarm",
+  PREPARING: "stopping", RETURNING: "stopping", FINISHING: "stopping",
 };
 /** Names of the phases of a session, as on the terminal. */
 const PHASES = {
@@ -94,7 +95,10 @@ export class Bar {
   #word() {
     if (this.#gone) return this.#connected ? "OFFLINE" : "CONNECTING";
     if (this.#status === null || this.#status.doing === "connecting") return "CONNECTING";
-    return this.#status.state.toUpperCase();
+    const { state } = this.#status;
+    // What a session does, in the words of the live view.
+    if (state !== "running") return state.toUpperCase();
+    return (this.#progress ? this.#progress.activity ?? state : "preparing").toUpperCase();
   }
 
   #reason(word) {

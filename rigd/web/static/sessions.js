@@ -217,6 +217,6 @@ export class Sessions {
   }
 }
 
-const samples = ({ scheduled, missed, late, lost }) =>
-  `${whole(scheduled - missed - (lost ?? 0))} of ${whole(scheduled)}, `
+const samples = ({ recorded, scheduled, missed, late, lost }) =>
+  `${whole(recorded)} of ${whole(scheduled)}, `
   + `${whole(missed)} missed, ${whole(late)} late, ${whole(lost)} lost`;

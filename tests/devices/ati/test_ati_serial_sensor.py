@@ -7,6 +7,7 @@ import random
 import time
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -231,6 +232,7 @@ def follow(open_sensor, digital_ft, fakes, settled):
         sensor.connect()
         settled(sensor)
         number, shown = 0, []
+        run.doubts = []
         for index, count in enumerate(counts):
             sensor.request(due_ns(index + 1))
             if index in lost:
@@ -242,7 +244,8 @@ def follow(open_sensor, digital_ft, fakes, settled):
             wrench = sensor.read_wrench()
             newest = wrench[0] / wrench_of(fakes, (1, 0, 0, 0, 0, 0))[0] + 3
             shown.append("stale" if sensor.wrench_stale else round(newest))
-        run.doubt = sensor.health().doubt
+            run.doubts.append(sensor.health().doubt)
+        run.doubt, run.count = sensor.health().doubt, sensor.health().doubt_count
         return shown
 
     return run
@@ -257,7 +260,44 @@ def test_records_that_are_late_are_not_taken_for_those_of_the_tick(follow):
 def test_records_that_stay_late_cannot_be_told_from_lost_ones_and_that_is_said(follow):
     shown = follow([7, 0, 0, 0, 7, 7, 7, 7])
     assert shown[1:6] == ["stale"] * 5
-    assert "21 records did not arrive, or all have been delayed by 3 ms since" in follow.doubt
+    assert "records did not arrive, or all have been delayed since" in follow.doubt
+    assert follow.count.endswith("since it was connected: 21; or the wrench is late by 3 ms.")
+
+
+def test_more_records_that_stay_late_are_no_other_warning(follow):
+    follow([7, 0, 0, 0, 7, 7, 7, 7, 0, 0, 7, 7, 7, 7])
+    assert len({doubt for doubt in follow.doubts if doubt}) == 1
+    assert ": 35; or" in follow.count
+
+
+def test_an_adapter_that_holds_records_back_is_named(
+    open_sensor, digital_ft, fakes, settled, monkeypatch
+):
+    now_ns = 0
+    monkeypatch.setattr(
+        "rigd.devices.ati._serial_sensor.time", SimpleNamespace(monotonic_ns=lambda: now_ns)
+    )
+    sensor = open_sensor(deadline_us=0.0)
+    sensor.connect()
+    settled(sensor)
+
+    def block(gap_ms):
+        nonlocal now_ns
+        now_ns += round(1e6 * gap_ms)
+        records = sensor.stream.records + 112
+        emitted(fakes, digital_ft, [(1, 2, 3, 4, 5, 6)] * 112)
+        while sensor.stream.records < records:
+            tick(sensor)
+        return sensor.health().cause
+
+    assert block(1.0) == ""
+    causes = [block(16.0) for _ in range(5)]
+    assert causes[:2] == ["", ""]
+    assert "arrive in blocks every 16 ms: the latency timer of the USB adapter" in causes[-1]
+    assert "latency_timer" in causes[-1]
+    now_ns += 10**9
+    assert sensor.health().cause == "", "what was long ago is not the cause of what is missing now"
+    assert [block(gap_ms) for gap_ms in (3.0, 40.0, 7.0, 90.0, 3.0)][-1] == ""
 
 
 def test_what_was_lost_with_a_torn_record_is_no_doubt(follow):

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.devices.parameters import AtiCan, AtiSerial
-from rigd.profile import load_profile
 from rigd.sim.wire._ati_can_node import AtiCanNode
 from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
@@ -171,7 +171,7 @@ def load():
 @pytest.fixture(scope="session")
 def rig():
     return replace(
-        load_profile("sim").rig,
+        load_shipped("sim").rig,
         ati_can=AtiCan(base_id=0x11, calibration=3, serial_number="", saturation_counts=32000),
         ati_serial=AtiSerial(
             port="/dev/ttyUSB0",

@@ -5,9 +5,9 @@ from dataclasses import replace
 from functools import cache
 
 import pytest
+from shipped_profile import load_shipped
 
 from rigd.devices.parameters import ServoDrive
-from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
 
@@ -37,7 +37,7 @@ SERVO = ServoDrive(
 
 @cache
 def sim_rig():
-    return load_profile("sim").rig
+    return load_shipped("sim").rig
 
 
 def make_rig(**changes):

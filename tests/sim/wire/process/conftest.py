@@ -3,8 +3,8 @@
 import struct
 
 import pytest
+from shipped_profile import load_shipped
 
-from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog
@@ -183,7 +183,7 @@ class Events(EventLog):
 
 @pytest.fixture
 def sim_rig():
-    return load_profile("sim").rig
+    return load_shipped("sim").rig
 
 
 @pytest.fixture
@@ -191,7 +191,7 @@ def make_world(sim_rig):
     def make(*, lock_step=False, serial=False):
         rig = sim_rig
         if serial:
-            rig = load_profile("antenna_serial").rig
+            rig = load_shipped("antenna_serial").rig
         return Recording(rig, lock_step=lock_step, serial=serial, log=Events())
 
     return make

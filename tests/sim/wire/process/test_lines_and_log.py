@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
+from rigd.devices._simulator import SimulatorAddress, ask_simulator
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
 from rigd.sim.wire._faults import EventLog
 from rigd.sim.wire._links import PtyLine, without_transport
-from rigd.sim.wire._simulator import ControlSocket, ask
+from rigd.sim.wire._simulator import ControlSocket
 
 # The serial line
 
@@ -171,7 +171,7 @@ def test_who_only_looks_whether_it_runs_does_no_harm(control):
 def test_a_simulator_that_is_gone_is_told(tmp_path):
     address = SimulatorAddress(pid=4711, control_socket=str(tmp_path / "gone"))
     with pytest.raises(DeviceError, match="process 4711"):
-        ask(address, {"status": True})
+        ask_simulator(address, {"status": True})
 
 
 # The log

@@ -14,7 +14,8 @@ import pytest
 import serial
 from cases import further
 
-from rigd.devices._simulator import find_simulator
+from rigd.devices import DeviceError
+from rigd.devices._simulator import ask_simulator, find_simulator
 
 RUN = (
     "import typer\n"
@@ -240,7 +241,7 @@ def test_a_host_drives_the_motor(simulate, connect):
 def test_in_lock_step_everything_can_be_repeated(simulate, connect):
     logs, replies = [], []
     for pause_s in (0.0, 0.002):
-        simulator = simulate("antenna_can", "--lock-step")
+        simulator = simulate("antenna_can", "--lock-step", "--seed", "1")
         host = connect(simulator)
         host.set_up()
         host.enable()
@@ -446,3 +447,20 @@ def test_the_help_names_every_fault(rigd_here):
 
     shown = rigd_here("inject", "--help").stdout
     assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in KINDS)
+
+
+def test_its_noise_differs_from_run_to_run_and_session_to_session_unless_a_seed_is_stated(simulate):
+    def seeds(*options):
+        simulator = simulate("antenna_can", "--lock-step", *options)
+        found = [
+            ask_simulator(simulator.address, {"renew_noise": seed})["seed"]
+            for seed in (None, None, 12)
+        ]
+        with pytest.raises(DeviceError, match="whole number"):
+            ask_simulator(simulator.address, {"renew_noise": "12"})
+        assert simulator.end()[0] == 0
+        return found
+
+    stated, fresh = seeds("--seed", "7"), seeds()
+    assert (stated[0], stated[2]) == (7, 12)
+    assert len({*stated, *fresh}) == 5

@@ -16,18 +16,17 @@ import pytest
 from cases import further
 
 from rigd.devices._registry import open_devices
-from rigd.devices._simulator import find_simulator
+from rigd.devices._simulator import ask_simulator, find_simulator
 from rigd.devices.canbus._budget import bus_load
 from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
-from rigd.sim.wire._simulator import ask
 
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
-AND_AN_OBSTACLE = '1, source = "assumed" }\nobstacles = ["x=0.6,angle=0.01,stiffness=3000"]  # '
-AND_A_HUM = '1, source = "assumed" }\nhum_nm = { value = 0.02, source = "assumed" }  # '
+AND_AN_OBSTACLE = '0.0, source = "assumed" }\nobstacles = ["x=0.6,angle=0.01,stiffness=3000"]  # '
+AND_A_HUM = '0.0, source = "assumed" }\nhum_nm = { value = 0.02, source = "assumed" }  # '
 AND_A_DRIFT = (
-    '1, source = "assumed" }\nstiffness_drift_per_s = { value = -1e-3, source = "assumed" }  # '
+    '0.0, source = "assumed" }\nstiffness_drift_per_s = { value = -1e-3, source = "assumed" }  # '
 )
 RUN = (
     "import sys\n"
@@ -96,8 +95,8 @@ def over_the_wire(rig, ticks):
             drive.command(torque_nm(tick) if tick >= 0 else 0.0)
             # Replies that are taken a tick later have come by then, as they have in real time; the
             # simulator serves one after the other, so its second answer is behind all of this.
-            ask(address, {"status": True})
-            ask(address, {"status": True})
+            ask_simulator(address, {"status": True})
+            ask_simulator(address, {"status": True})
             if tick >= 0:
                 assert not drive.angle_stale
                 assert not sensor.wrench_stale
@@ -173,10 +172,10 @@ def bare(rig, ticks):
         ),
         further("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
         ("antenna_serial", {}),
-        ("antenna_can", {"seed": AND_AN_OBSTACLE}),
-        ("antenna_serial", {"seed": AND_AN_OBSTACLE}),
-        further("antenna_can", {"seed": AND_A_DRIFT}),
-        further("antenna_serial", {"seed": AND_A_DRIFT}),
+        ("antenna_can", {"force_noise_n": AND_AN_OBSTACLE}),
+        ("antenna_serial", {"force_noise_n": AND_AN_OBSTACLE}),
+        further("antenna_can", {"force_noise_n": AND_A_DRIFT}),
+        further("antenna_serial", {"force_noise_n": AND_A_DRIFT}),
     ],
 )
 def test_the_wire_changes_nothing(simulated_profile, name, changes):
@@ -196,7 +195,7 @@ def test_the_wire_changes_nothing(simulated_profile, name, changes):
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
 def test_a_hum_comes_over_the_wire(simulated_profile, name):
-    rig = simulated_profile(name, {"seed": AND_A_HUM})
+    rig = simulated_profile(name, {"force_noise_n": AND_A_HUM})
     ticks = 120
     alone = replace(rig, simulation=replace(rig.simulation, hum_nm=0.0))
     torque = np.array([wrench[5] for _, wrench in over_the_wire(rig, ticks)])

@@ -1,0 +1,88 @@
+"""How a session ends for its operator, once the loop has finished."""
+
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import pytest
+from shipped_profile import load_shipped
+
+from rigd.engine import Closed, Connected, Finished
+from rigd.excitation import hold
+from rigd.runner._request import Order
+from rigd.runner._session import Session, SessionFailedError, always
+
+KILLED = "The fit process was killed by signal 9."
+STOPPED = "Stopped by the operator."
+COUNTS = {"scheduled": 1200, "missed": 0, "late": 0, "stale_angles": 0, "stale_wrenches": 0}
+
+
+@pytest.fixture
+def close():
+    """Close a session whose fit process failed, or did not; with a file, or without."""
+
+    def closed(finished, failure, shortcoming="", *, recorded=True, slow=lambda poll: poll):
+        profile = load_shipped("sim")
+        order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
+        group = MagicMock()
+        group.channels.board.__getitem__.return_value = 0
+        group.channels.events = MagicMock(
+            oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
+        )
+        connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
+        session = Session(order, group, connected, None, lambda *_: None, always)
+        session._fit = MagicMock(failure=failure, shortcoming=shortcoming, segments={})
+        session._fit.finish.return_value = {}
+        session._fit.attend.return_value = []
+
+        def poll(_):
+            (message,) = group.recorder.send.call_args.args
+            outcome = message.outcome
+            if not recorded:
+                return Closed()
+            return Closed(order.path, COUNTS, outcome["outcome"], outcome["reason"])
+
+        group.recorder.poll.side_effect = slow(poll)
+        return session._close(finished)
+
+    return closed
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_stop_does_not_hide_why_the_session_was_ending(close, recorded):
+    stopped = Finished("stopped", STOPPED, fault=False, counts=COUNTS)
+    result = close(stopped, KILLED, recorded=recorded)
+    assert (result.outcome, result.fault) == ("stopped", True)
+    assert result.reason == f"{KILLED} {STOPPED}"
+    plain = close(stopped, "", recorded=recorded)
+    assert (plain.reason, plain.fault) == (STOPPED, False)
+
+
+def test_a_complete_record_says_what_it_lacks_once(close):
+    complete = Finished("complete", "", fault=False, counts=COUNTS)
+    result = close(complete, KILLED, f"Not known whether the whole record has it: {KILLED}")
+    assert result.reason.count(KILLED) == 1
+    later = replace(complete, reason="After the record: The tare drifted.", fault=True)
+    result = close(later, KILLED, "unused")
+    assert result.reason == f"{KILLED} After the record: The tare drifted."
+
+
+@pytest.mark.parametrize(("stall_s", "whole"), [(11.9, True), (60.0, False)])
+def test_the_disk_may_stall_at_the_end_as_long_as_in_the_record(close, monkeypatch, stall_s, whole):
+    now_s = 0.0
+
+    def poll(answer):
+        def polled(patience_s):
+            nonlocal now_s
+            now_s += 10 * patience_s
+            return answer(patience_s) if now_s > stall_s else None
+
+        return polled
+
+    monkeypatch.setattr("rigd.runner._session.time.monotonic", lambda: now_s)
+    complete = Finished("complete", "", fault=False, counts=COUNTS)
+    if whole:
+        assert close(complete, "", slow=poll).outcome == "complete"
+    else:
+        with pytest.raises(SessionFailedError, match="does not answer within 22 s"):
+            close(complete, "", slow=poll)
