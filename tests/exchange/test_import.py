@@ -163,8 +163,15 @@ def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path
     source = csv_of(**{"Angle [deg]": ANGLE, "torque": TORQUE})
     with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated"):
         import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:rad"))
+    with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated.*'#1:deg'"):
+        import_record(source, tmp_path / "a.mcap", make_plan(angle="#1:rad"))
     import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:deg"))
-    import_record(source, tmp_path / "b.mcap", make_plan(angle="#1:rad"))
+    plan = make_plan(angle="Angle [deg]:rad", ignore_file_metadata=True)
+    done = import_record(source, tmp_path / "b.mcap", plan)
+    assert "Ignored as requested: the file says that 'Angle [deg]' is in deg" in done.warnings[0]
+    session = read_session(done.path)
+    assert "is in deg, and rad was stated" in session.metadata["import_ignored"]
+    np.testing.assert_array_equal(session.samples["angle_rad"], ANGLE)
 
 
 def test_a_name_that_sounds_like_another_unit_is_told(csv_of, make_plan, tmp_path):

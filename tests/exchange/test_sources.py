@@ -119,16 +119,18 @@ def test_an_empty_cell_is_not_a_number(text):
         ("a,b\n1,2\n", "a", ("1 samples",)),
         ("a,b\n1,2\n1,2\n", "c", ("no channel 'c'", "'a', 'b'")),
         ("a,a\n1,2\n1,2\n", "a", ("2 columns", "#1")),
-        ("a,b\n1,2\n3\n", "b", ("sample 2 of the column 'b'", "1 columns")),
-        ("a,b\n1,2\n3,x\n", "b", ("sample 2 of the column 'b'", "'x'", "not a number")),
-        ("a,b\ns,deg\n1,2\n", "b", ("sample 1", "'deg'", "below the line with the names")),
-        ("a;b\n1;2,5\n3;4.5\n", "b", ("sample 2 of the column 'b' is '4.5'", "decimal commas")),
-        ("a;b\n1;2.5\n3;4,5\n", "b", ("sample 1 of the column 'b' is '2.5'", "decimal commas")),
+        ("a,b\n1,2\n3\n", "b", ("line 3 has 1 cell", "line 1 has 2 titles")),
+        ("a,b\n1,2\n3,4,5\n", "b", ("line 3 has 3 cells", "line 1 has 2 titles", "decimal commas")),
+        ("a,b\n1,2\n3,4,\n5,6,7\n", "b", ("line 4 has 3 cells",)),
+        ("a,b\n1,2\n3,x\n", "b", ("line 3: 'b'", "'x'", "not a number")),
+        ("a,b\nfirst,deg it\n1,2\n", "b", ("line 2: 'b'", "'deg it'", "one line of units")),
+        ("a;b\n1;2,5\n3;4.5\n", "b", ("line 3: 'b'", "'4.5'", "decimal commas")),
+        ("a;b\n1;2.5\n3;4,5\n", "b", ("line 2: 'b'", "'2.5'", "decimal commas")),
         ("a;b\n1;2,5\n3;1.234,5\n", "b", ("'1.234,5'", "not a number")),
         ("a;b\n1;2,5\n3;1,234,5\n", "b", ("'1,234,5'", "not a number")),
-        ("a b\n1 2\n3\n", "b", ("sample 2 of the column 'b'", "1 columns")),
-        ("my a b\n1 2\n3 4\n", "b", ("no channel 'b'", "'#1', '#2'")),
-        ('a,b\n1,"2\n' + "3,4\n" * 40_000, "b", ("not a CSV file",)),
+        ("a b\n1 2\n3\n", "b", ("line 3 has 1 cell", "line 1 has 2 titles")),
+        ("my a b\n1 2\n3 4\n", "b", ("line 2 has 2 cells", "line 1 has 3 titles")),
+        ('a,b\n1,"2\n' + "3,4\n" * 40_000, "b", ("line 2: 'b'", "not a number")),
         ("a" * 70_000 + ",b\n1,2\n", "b", ("a line of more than 65536",)),
     ],
 )
@@ -138,8 +140,10 @@ def test_what_is_no_table_of_numbers_is_refused(text, content, name, words):
         assert word in message
 
 
-def test_another_encoding_is_refused(text):
-    assert "UTF-8" in refused(text("Zeit,Ausschlag°\n1,2\n", encoding="latin-1"), "Zeit")
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16", "utf-16-le", "utf-32"])
+def test_encodings_are_recognised(text, encoding):
+    path = text("Zeit;Ausschlag [°]\n0;1,5\n1;2,5\n", encoding=encoding)
+    assert values(path, "Ausschlag [°]").tolist() == [1.5, 2.5]
 
 
 @settings(max_examples=25)
@@ -292,7 +296,6 @@ def test_what_is_no_channel_of_numbers_in_tdms_is_refused(tdms, tmp_path):
         writer.write_segment([tdms.ChannelObject("Rig", "Torque", np.arange(6.0))])
         writer.write_segment([tdms.ChannelObject("Rig", "Note", ["a", "b"])])
     assert "'Rig/Angle'" in refused(path, "Angle")
-    assert "Rig/Angle 5, Rig/Torque 6" in refused(path, "Rig/Angle", "Rig/Torque")
     assert "real numbers" in refused(path, "Rig/Note")
     path.write_bytes(b"TDSx" + b"\0" * 100)
     assert "not a TDMS file" in refused(path, "Rig/Angle")
@@ -334,7 +337,7 @@ def test_uff_that_another_program_wrote(folder, numbers, binary):
     np.testing.assert_allclose(channels["#1"].values, numbers, rtol=tolerance, atol=1e-300)
     np.testing.assert_allclose(channels["#2"].values, 2 * numbers, rtol=1e-11, atol=1e-300)
     np.testing.assert_array_equal(channels["Torque"].values, numbers)
-    assert (channels["#1"].unit_label, channels["#2"].unit_label) == ("deg", "NONE")
+    assert (channels["#1"].unit_label, channels["#2"].unit_label) == ("deg", "")
     assert channels["#1"].rate_hz == pytest.approx(1000)
     assert channels["Torque"].rate_hz is None
     np.testing.assert_array_equal(values(path, "Torque", "abscissa")[1], x + 1e-9 * (x > 0))
@@ -350,7 +353,6 @@ def test_what_is_no_function_of_time_is_refused(tmp_path):
         tmp_path / "a.uff", ("G", x, x + 1j, {}), ("a", x, x, {}), ("b", x[:3], x[:3], {})
     )
     assert "frequency response" in refused(path, "G")
-    assert "a 4, b 3" in refused(path, "a", "b")
     path.write_bytes(path.read_bytes().replace(b"         4         4", b"         4         9"))
     assert "has 4 values and states 9" in refused(path, "a")
     path.write_bytes(b"    -1\n    58\nx\n    -1\n")
