@@ -51,9 +51,7 @@ _JITTER_SHOWN: Final = 0.01
 """Shift between channels, in periods, below which it is not worth a warning."""
 
 
-def place_samples(
-    path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]
-) -> Timebase:
+def place_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
     """Place the samples in time, by the channel of times or by the rate stated."""
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
@@ -127,7 +125,7 @@ class FileStatements:
                 self.contradict(
                     f"the values of '{name}' are raw, and the file asks for a scale that is not "
                     f"known here ({printable(channel.unapplied_scale, 60)})",
-                    "export scaled values, or state what one raw unit is, as a number and a unit",
+                    "export scaled values",
                 )
 
     def timebase(self, channels: Mapping[str, SourceChannel]) -> Timebase:
@@ -157,10 +155,13 @@ class FileStatements:
         is_default = own_hz == _DEFAULT_RATE_HZ
         ratio = max(own_hz / rate_hz, rate_hz / own_hz)
         wrong_unit = any(abs(ratio / each - 1) < _RATE_TOLERANCE for each in _THOUSANDS)
-        if is_default or (time is not None and (time.channel == name or not wrong_unit)):
-            source = "stated" if time is None else f"the times in '{time.channel}' show"
-            why = ", as programs write where no rate was given" if is_default else ""
-            self.warnings.append(f"T{statement[1:]}{why}; {rate_hz:.6g} Hz was used, as {source}.")
+        if is_default:
+            statement += ", which programs write where no rate was given"
+        if time is not None and (time.channel == name or is_default or not wrong_unit):
+            self.warnings.append(
+                f"T{statement[1:]}; {rate_hz:.6g} Hz was used, as the times in '{time.channel}' "
+                "show."
+            )
         elif time is not None:
             self.contradict(
                 f"{statement}, and the times in '{time.channel}' as {time.unit} show "
@@ -170,7 +171,9 @@ class FileStatements:
         else:
             self.contradict(
                 f"{statement}, and {rate_hz:.6g} Hz was stated",
-                f"state --rate-hz {own_hz:.6g}, or give the channel of times with --time",
+                "give the channel of times with --time"
+                if is_default
+                else f"state --rate-hz {own_hz:.6g}, or give the channel of times with --time",
             )
 
     def _check_times(self, times: FileTimes, rate_hz: float) -> None:
@@ -319,4 +322,3 @@ def _instant(time_ns: int) -> str:
     if abs(time_ns) < _ABSOLUTE_NS:
         return f"{time_ns / 1e9:.9g} s"
     return str(np.datetime64(time_ns, "ns")).rstrip("0").rstrip(".")
-

@@ -196,7 +196,7 @@ _LATEST_NS: Final = 2**63 - 1
 def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
     """Return when the file was changed last, or now with a warning if no session can have that."""
     changed_ns = source.stat().st_mtime_ns
-    if 0 <= changed_ns and changed_ns + duration_s * 1e9 < _LATEST_NS:
+    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_NS:
         return changed_ns, ""
     year = 1970 + changed_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (

@@ -54,7 +54,7 @@ def from_csv(
         ticks = len(angles)
         sweep = angles
     else:
-        check_ticks("The file", (times[-1] - times[0]) * rate_hz, rate_hz)
+        check_ticks("The file", (float(times[-1]) - float(times[0])) * rate_hz, rate_hz)
         time_s = times - times[0]
         # The last row is reached exactly; rounding must not lose its tick.
         ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
@@ -102,8 +102,8 @@ def _read_columns(
             raise ExcitationError(
                 f"{path}: line {table.lines[row]}: {name} is not a finite number."
             )
-    if times is not None and (np.diff(times.values) <= 0.0).any():
-        row = int(np.argmax(np.diff(times.values) <= 0.0)) + 1
+    if times is not None and (late := times.values[1:] <= times.values[:-1]).any():
+        row = int(np.argmax(late)) + 1
         raise ExcitationError(
             f"{path}: line {table.lines[row]}: {TIME} does not come after the one before it; times "
             "must increase."

@@ -59,10 +59,7 @@ TIME_UNITS_S: Final = {
 """Spellings of units of time, in seconds."""
 
 _OTHER_UNITS: Final = frozenset(
-    "rad mrad urad deg degree degrees radian radians arcmin arcsec rev grad ° "
-    "nm mnm unm ncm nmm knm newtonmeter newtonmetre lbfin ozfin n mn kn lbf "
-    "v mv volt volts a ma amp mm m cm g kg hz khz rpm 1/min % count counts digit digits "
-    "m/s m/s² m/s^2 m/s2 rad/s rad/s² rad/s^2 deg/s °/s °c degc k pa bar pu w".split()
+    ["rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec", "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre", "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm", "m", "cm", "g", "kg", "hz", "khz", "rpm", "1/min", "%", "count", "counts", "digit", "digits", "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc", "k", "pa", "bar", "pu", "w"]
 )
 """Other units that a row of units may have, in small letters and without signs of a product."""
 

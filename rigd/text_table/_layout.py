@@ -135,9 +135,7 @@ def wrong_width(line: int, cells: int, layout_width: int, titles_line: int, sepa
         )
         remedy = "save the file with another separator or with decimal points, or name each column"
     else:
-        cause = (
-            "a value is missing, a quotation does not end, or the line is not part of the table"
-        )
+        cause = "a value is missing, a quotation does not end, or the line is not part of the table"
         remedy = "repair or remove the line; an unknown value is an empty cell"
     return (
         f"line {line} has {_counted(cells, 'cell')} between {between}, and {table}: {cause}; "
@@ -165,7 +163,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
         If there is no such table.
     """
     if not any(line.strip() for line in lines):
-        raise TableError("is empty.")
+        raise TableError("is empty; export the record again.")
     stated = stated_separator(lines[0])
     if stated:
         lines = ["\n", *lines[1:]]
@@ -319,7 +317,8 @@ def _below_titles(
             continue
         raise _UnlikelyError(_TITLES, _not_data(row, cells, columns, names, head, width, separator))
     raise _UnlikelyError(
-        _TITLES, TableError(f"has 0 samples: no line of numbers below the titles in line {head.line}.")
+        _TITLES,
+        TableError(f"has 0 samples: no line of numbers below the titles in line {head.line}."),
     )
 
 
@@ -432,9 +431,7 @@ def _with_numbers(
         if separator != BLANKS:
             raise _UnlikelyError(
                 _TITLES,
-                TableError(
-                    wrong_width(row.line, len(cells), len(titles), titles_line, separator)
-                ),
+                TableError(wrong_width(row.line, len(cells), len(titles), titles_line, separator)),
             )
         titles, titles_line = (), 0  # several words each: nothing says which belong together
     width = len(titles) if titles else len(cells)
@@ -462,8 +459,12 @@ def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
         return False
     counted = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
     below = rows[1 : 1 + _NUMBERING_LINES]
-    return counted and bool(below) and not any(
-        all(cell.lstrip("+-").isdecimal() for cell in row.cells if cell) for row in below
+    return (
+        counted
+        and bool(below)
+        and not any(
+            all(cell.lstrip("+-").isdecimal() for cell in row.cells if cell) for row in below
+        )
     )
 
 
@@ -479,7 +480,11 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
         name = next(each for each in names if each not in titles and each not in best.cells)
         return _UnlikelyError(_SOME_TITLES, MissingColumnError(name, titles, best.line))
     place = next(
-        (place for place, row in enumerate(rows) if all(map(is_any_number, filter(None, row.cells)))),
+        (
+            place
+            for place, row in enumerate(rows)
+            if all(map(is_any_number, filter(None, row.cells)))
+        ),
         None,
     )
     if place is None:
@@ -489,7 +494,11 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
     width = len(rows[place].cells)
     above = [row for row in rows[:place] if len(_plain_titles(row)) == width]
     if above:
-        best = above[-2] if len(above) > 1 and is_row_of_units(above[-1].cells, range(width)) else above[-1]
+        best = (
+            above[-2]
+            if len(above) > 1 and is_row_of_units(above[-1].cells, range(width))
+            else above[-1]
+        )
         titles, line = _plain_titles(best), best.line
     else:
         titles, line = [f"#{number}" for number in range(1, width + 1)], 0

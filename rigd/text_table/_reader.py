@@ -118,7 +118,7 @@ class TextTable:
 
 
 def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> TextTable:
-    """Read some columns of a text file.
+    r"""Read some columns of a text file.
 
     The separator is a tab, a semicolon, a comma, a bar or blanks; the decimal sign a point or a
     comma, one of them in the whole file. The titles are the first line that has all names and as
@@ -147,7 +147,7 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     --------
     >>> from io import BytesIO
     >>> from rigd.text_table import read_table
-    >>> table = read_table(BytesIO(b"t;angle\\ns;rad\\n0;0,5\\n1;0,7\\n"), ["angle"], most_rows=10)
+    >>> table = read_table(BytesIO(b"t;angle\ns;rad\n0;0,5\n1;0,7\n"), ["angle"], most_rows=10)
     >>> table.columns["angle"].values.tolist(), table.columns["angle"].unit
     ([0.5, 0.7], 'rad')
     """
@@ -351,7 +351,9 @@ def _columns(
     empty: list[int] = []
     blank_line = 0
     with _lines(stream, encoding) as lines:
-        for line, row in islice(rows_of(_without_statement(lines), layout.separator), layout.skip, None):
+        for line, row in islice(
+            rows_of(_without_statement(lines), layout.separator), layout.skip, None
+        ):
             if len(row) != layout.width:
                 if not any(cell.strip() for cell in row) and len(row) < 2:
                     blank_line = blank_line or line
@@ -474,5 +476,3 @@ def _table(
         title = layout.titles[times] if layout.titles else f"#{times + 1}"
         found = TableTimes(title, stamps, _time_unit_s(layout, times))
     return TextTable(columns, lines, layout.width, found, _remark(rows))
-
-
