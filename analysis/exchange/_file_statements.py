@@ -181,6 +181,14 @@ class FileStatements:
         values = times.values[np.isfinite(times.values)]
         if len(values) < 2:
             return
+        if len(values) < len(times.values):
+            place = int(np.argmin(np.isfinite(times.values))) + 1
+            self.contradict(
+                f"the times '{printable(times.name, 60)}' are missing from sample {place} on, in "
+                f"{len(times.values) - len(values)} samples, so that these may be none",
+                "repair or remove their lines",
+            )
+            return
         units_s = _UNITS_OF_TIME_S if times.unit_s is None else (times.unit_s,)
         steps = np.diff(values)
         name = f"'{printable(times.name, 60)}'"
@@ -193,13 +201,21 @@ class FileStatements:
                 "cut one record out of the file",
             )
             return
+        usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+        if (steps == 0.0).any() and any(
+            abs(rate_hz * usual * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
+        ):
+            self.contradict(
+                f"the time {name} of sample {int(np.argmax(steps == 0.0)) + 2} is that of the one "
+                "before it",
+                "remove what stands twice",
+            )
+            return
         step = float(values[-1] - values[0]) / (len(values) - 1)
         if step == 0.0 or (times.name == "#1" and step == 1.0):
             return  # no times, or the numbers of the samples
         unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * step * unit)))
-        tolerance = _COARSE_TOLERANCE + 2 * float(np.median(steps[steps > 0])) / float(
-            values[-1] - values[0]
-        )
+        tolerance = _COARSE_TOLERANCE + 2 * usual / float(values[-1] - values[0])
         missing = 0
         own_hz = 1 / (step * unit_s)
         try:

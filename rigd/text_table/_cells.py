@@ -21,7 +21,8 @@ _GROUPED: Final = {
 }
 _UP_TO_THREE_DIGITS: Final = re.compile(r"[-+]?\d{1,3}")
 _DATE: Final = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([ T_].*)?|(.*\d)?\d:\d\d(:\d.*)?")
-_LEADING_ZERO: Final = re.compile(r"0\d+")
+_DECIMALS: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
+_LEADING_ZERO: Final = re.compile(r"0\d+.*")
 _WHOLE: Final = re.compile(r"[-+]?\d+")
 _COMMENT: Final = re.compile(r"\s*[#%]\s*")
 _IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
@@ -58,9 +59,14 @@ TIME_UNITS_S: Final = {
 }
 """Spellings of units of time, in seconds."""
 
-_OTHER_UNITS: Final = frozenset(
-    ["rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec", "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre", "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm", "m", "cm", "g", "kg", "hz", "khz", "rpm", "1/min", "%", "count", "counts", "digit", "digits", "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc", "k", "pa", "bar", "pu", "w"]
-)
+_OTHER_UNITS: Final = (
+    "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",
+    "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre",
+    "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm",
+    "m", "cm", "g", "kg", "hz", "khz", "rpm", "1/min", "%", "count", "counts", "digit", "digits",
+    "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc",
+    "k", "pa", "bar", "pu", "w",
+)  # fmt: skip
 """Other units that a row of units may have, in small letters and without signs of a product."""
 
 
@@ -133,13 +139,13 @@ class ThousandsWatch:
 def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
     """Whether cells between commas are halves of numbers with decimal commas: 0,025 as 0 and 025.
 
-    In every line there is an even number of cells, all of them whole numbers, the second of each
-    pair without a sign and somewhere with a leading zero, which no whole number is written with.
+    In every line there is an even number of cells without a decimal sign, the second of each pair
+    without a sign and somewhere with a leading zero, which no whole number is written with.
     """
     zeros = False
     for row in rows:
         second = [cell.strip() for cell in row[1::2]]
-        if not row or len(row) % 2 or not all(cell.isdecimal() for cell in second):
+        if not row or len(row) % 2 or not all(map(_DECIMALS.fullmatch, second)):
             return False
         if not all(_WHOLE.fullmatch(cell.strip()) for cell in row[::2]):
             return False
@@ -162,7 +168,7 @@ def is_comment(row: Sequence[str]) -> bool:
 
 
 def stated_unit_of(title: str) -> str:
-    """Return what a title states of the unit, "" if nothing: ``Angle [deg]``, ``t/ms``, ``M in Nm``.
+    """Return what a title states of the unit, "" if nothing: ``Angle [deg]``, ``t/ms``.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ def encodings(head: bytes) -> tuple[str, ...]:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark, which is left out.
+    r"""Decode text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark, which is left out.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def decode_text(data: bytes) -> str:
     Examples
     --------
     >>> from rigd.text_table import decode_text
-    >>> decode_text(b"\\xef\\xbb\\xbfname = 1")
+    >>> decode_text(b"\xef\xbb\xbfname = 1")
     'name = 1'
     """
     return data.decode(_marked(data[:_LONGEST_MARK]) or "utf-8")

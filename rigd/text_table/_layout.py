@@ -172,7 +172,8 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
         stated = labview.separator
     present = [mark for mark in _SEPARATORS if any(mark in line for line in lines)]
     candidates = [stated] if stated else [*present, BLANKS]
-    failures: list[tuple[int, TableError]] = []
+    failures: list[_UnlikelyError] = []
+    found: Layout | None = None
     for separator in candidates:
         try:
             rows = [
@@ -180,7 +181,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
                 for index, (line, cells) in enumerate(rows_of(lines, separator))
             ]
         except csv.Error as error:
-            failures.append((0, TableError(f"is not a table of text ({error}).")))
+            failures.append(_UnlikelyError(_NO_ROWS, TableError(f"is no table ({error}).")))
             continue
         written = [row for row in rows if any(row.cells)]
         if labview is not None:
@@ -188,21 +189,34 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
         try:
             layout = _layout(written, separator, names, labview)
         except _UnlikelyError as unlikely:
-            failures.append((unlikely.rank, unlikely.error))
+            unlikely.separator = separator
+            failures.append(unlikely)
             continue
         if separator == ",":
             _check_split_decimals(rows[layout.skip :], layout)
-        return layout
-    raise max(failures, key=lambda failure: failure[0])[1]
+        if found is None or layout.skip < found.skip:
+            found = layout
+    worst = max(failures, key=lambda failure: failure.rank, default=None)
+    # What is a table from a late line on only, though an earlier one nearly was one, is none.
+    early = any(
+        each.rank == _TITLES and found and each.index < found.skip and each.separator != BLANKS
+        for each in failures
+    )
+    if found is None or early:
+        assert worst is not None
+        raise worst.error
+    return found
 
 
 class _UnlikelyError(Exception):
     """A separator with which the text is not the table asked for, and how near it comes."""
 
-    def __init__(self, rank: int, error: TableError) -> None:
+    def __init__(self, rank: int, error: TableError, index: int = HEAD_LINES) -> None:
         super().__init__()
         self.rank = rank
         self.error = error
+        self.index = index
+        self.separator = ""
 
 
 _NO_ROWS, _NO_TITLES, _SOME_TITLES, _TITLES = range(4)
@@ -230,6 +244,8 @@ def _layout(
             if found is not None:
                 return found
         except _UnlikelyError as unlikely:
+            if unlikely.index == HEAD_LINES:
+                unlikely.index = row.index
             failure = failure or unlikely
     if failure is not None:
         raise failure
@@ -315,7 +331,8 @@ def _below_titles(
             continue
         if is_comment(cells):
             continue
-        raise _UnlikelyError(_TITLES, _not_data(row, cells, columns, names, head, width, separator))
+        error = _not_data(row, cells, columns, names, head, width, separator)
+        raise _UnlikelyError(_TITLES, error, row.index)
     raise _UnlikelyError(
         _TITLES,
         TableError(f"has 0 samples: no line of numbers below the titles in line {head.line}."),
@@ -401,6 +418,8 @@ def _with_numbers(
     """Return the layout if this row is the first of numbers, by the columns' numbers alone."""
     row, above = rows[place], list(takewhile(lambda each: each.index < rows[place].index, rows))
     columns = [number - 1 for number in numbers]
+    if is_comment(row.cells):
+        return None
     if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, place):
         partly = [c for c in columns if c < len(row.cells) and row.cells[c]]
         known = [c for c in partly if is_any_number(row.cells[c])]
@@ -453,7 +472,7 @@ def _with_numbers(
 
 
 def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
-    """Whether a first row of numbers is 0, 1, 2 … as titles: no row below has whole numbers only."""
+    """Whether the first row numbers the columns: no row below has whole numbers only."""
     cells = [cell for cell in rows[place].cells if cell]
     if place or len(cells) < 2:
         return False
