@@ -141,6 +141,7 @@ _SPELLINGS: Final = {_bare(name): name for names in UNITS.values() for name in n
 _WORDS: Final = {
     "degree": "deg",
     "degrees": "deg",
+    "grad": "deg",
     "radian": "rad",
     "radians": "rad",
     "sec": "s",

@@ -260,7 +260,14 @@ class FileStatements:
         measured = {choice.channel for choice in plan.channels.values()}
         if len(set(starts.values())) < 2:
             unknown = sorted(measured - set(starts))
-            if starts and unknown:
+            start_ns = next(iter(starts.values()), 0)
+            if unknown and start_ns and abs(start_ns) < _ABSOLUTE_NS:
+                self.contradict(
+                    f"the file says that '{next(iter(starts))}' begins at {_instant(start_ns)}, and "
+                    f"does not say when '{unknown[0]}' begins",
+                    "give channels that begin together, or cut them to the same samples",
+                )
+            elif starts and unknown:
                 self.warnings.append(
                     f"The file states when '{next(iter(starts))}' begins, but not "
                     f"'{unknown[0]}'; they were taken to begin together."

@@ -145,7 +145,7 @@ def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
     begun_ns = 0
     if isinstance(begun, np.datetime64) and begun >= _EARLIEST:
         begun_ns = int(begun.astype("datetime64[ns]").astype(np.int64))
-    elif offset is None:
+    elif offset is None and "wf_increment" not in properties:
         return None
     if not isinstance(offset, int | float) or not math.isfinite(offset):
         offset = 0.0

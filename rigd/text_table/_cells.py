@@ -173,8 +173,8 @@ def stated_unit_of(title: str) -> str:
     Parameters
     ----------
     title : str
-        Title of a column. What stands in brackets, or behind a slash, a comma or the word "in",
-        counts if it is known as a unit.
+        Title of a column. What stands in square brackets counts; in round ones, or behind a slash,
+        a comma or the word "in", only what is known as a unit.
 
     Examples
     --------
@@ -183,7 +183,10 @@ def stated_unit_of(title: str) -> str:
     ('deg', 'ms', '')
     """
     found = _IN_BRACKETS.search(title) or _AFTER_SLASH.search(title)
-    return found[1].strip() if found and is_unit(found[1]) else ""
+    if found is None:
+        return ""
+    is_stated = is_unit(found[1]) or found[0].startswith("[")
+    return found[1].strip() if is_stated else ""
 
 
 def is_unit(cell: str) -> bool:

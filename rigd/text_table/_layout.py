@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Final
 
@@ -17,6 +17,7 @@ from rigd.text_table._cells import (
     without_comment_mark,
 )
 from rigd.text_table._errors import MissingColumnError, TableError
+from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
 
 HEAD_LINES: Final = 500
@@ -76,6 +77,8 @@ class Layout:
         Cells of the first row of numbers.
     labview : LabviewHead or None
         Head of a LabVIEW measurement file.
+    rate_hz : float or None
+        Rate that another head states.
     """
 
     separator: str
@@ -87,7 +90,8 @@ class Layout:
     skip: int
     columns: tuple[int, ...]
     first: tuple[str, ...]
-    labview: "_labview.LabviewHead | None" = field(default=None)
+    labview: "_labview.LabviewHead | None" = None
+    rate_hz: float | None = None
 
 
 def stated_separator(first_line: str) -> str | None:
@@ -205,6 +209,8 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
     if found is None or early:
         assert worst is not None
         raise worst.error
+    if labview is None:
+        return replace(found, rate_hz=stated_rate_hz(lines[: found.skip]))
     return found
 
 
@@ -246,6 +252,8 @@ def _layout(
         except _UnlikelyError as unlikely:
             if unlikely.index == HEAD_LINES:
                 unlikely.index = row.index
+            if not titled:
+                raise
             failure = failure or unlikely
     if failure is not None:
         raise failure
@@ -309,6 +317,9 @@ def _below_titles(
             raise _UnlikelyError(_TITLES, MissingColumnError(name, titles, head.line))
     optional = int(labview is not None and titles[-1] == _labview.COMMENT)
     units: Sequence[str] = ()
+    above = rows[place - 1].cells if place else []
+    if len(fitted(above, width)) == width and is_row_of_units(above, columns):
+        units = above
     for row in rows[place + 1 : place + 2 + _BETWEEN]:
         cells = fitted(row.cells, width)
         fits = width - optional <= len(cells) <= width
@@ -447,7 +458,7 @@ def _with_numbers(
         optional = int(labview is not None and titles[-1:] == [_labview.COMMENT])
     cells = fitted(row.cells, len(titles)) if titles else row.cells
     if titles and not len(titles) - optional <= len(cells) <= len(titles):
-        if separator != BLANKS:
+        if separator != BLANKS or len(cells) > len(titles):
             raise _UnlikelyError(
                 _TITLES,
                 TableError(wrong_width(row.line, len(cells), len(titles), titles_line, separator)),

@@ -167,7 +167,8 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
 def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int) -> TextTable:
     with _lines(stream, encoding) as lines:
         layout = find_layout(_head(lines), names)
-    mark = COMMA if any(COMMA in layout.first[column] for column in layout.columns) else POINT
+    first = [layout.first[column] for column in layout.columns]
+    mark = COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first) else POINT
     try:
         return _columns(stream, encoding, layout, names, most_rows, mark)
     except _DecimalCommaError:
@@ -468,7 +469,7 @@ def _table(
             values=np.frombuffer(values[column]),
             title=layout.titles[column] if layout.titles else "",
             unit=_unit(layout, column),
-            rate_hz=1 / period_s if period_s and period_s > 0 else None,
+            rate_hz=1 / period_s if period_s and period_s > 0 else layout.rate_hz,
             start_ns=start_ns,
         )
     found = None

@@ -212,6 +212,35 @@ def _units_row(made: EverydayFile, table: _Table, rng: np.random.Generator) -> N
         table.encoding = "utf-16"
 
 
+def _units_above(made: EverydayFile, table: _Table, rng: np.random.Generator) -> None:
+    table.head = [table.separator.join(_pick(rng, ["s", "rad", "Nm"], ["s", "deg", "Nm"]))]
+    if "deg" in table.head[0]:
+        made.must, made.names = "refuse", ("angle", "#2")
+        if "#2" in made.plan["angle"]:
+            made.must, made.names = "either", ("#2", "line ")
+
+
+def _rate_in_head(made: EverydayFile, table: _Table, rng: np.random.Generator) -> None:
+    stated = made.rate_hz * _pick(rng, 1, 2)
+    table.head = [
+        "Rig 4",
+        _pick(
+            rng, f"Sampling rate: {stated:g} Hz", f"Sample rate [Hz]\t{stated:g}",
+            f"# dt = {1e3 / stated:.9g} ms", f"Delta: {1 / stated:.9g} sec.",
+            f"Abtastrate: {stated / 1e3:g} kHz", f"Sampling frequency;{stated:g}",
+        ),
+    ]  # fmt: skip
+    if stated != made.rate_hz:
+        made.must = "either" if "time" in made.plan else "refuse"
+    elif "#2" in made.plan["angle"]:
+        made.must = "either"
+    made.names = ("angle", "torque", "#2", "#3", "line ")
+    if "time" not in made.plan:  # nothing else in the file has the time
+        table.titles[0] = "u"
+        for cells in table.rows:
+            cells[0] = f"1{table.mark}5"
+
+
 def _another_units_row(made: EverydayFile, table: _Table, rng: np.random.Generator) -> None:
     table.units = _pick(rng, ["s", "deg", "Nm"], ["s", "rad", "mNm"], ["[s]", "[mrad]", "[Nm]"])
     made.must, made.names = "refuse", ("angle", "torque", "#2", "#3")
@@ -535,6 +564,7 @@ _TEXT_MISTAKES: tuple[Callable[[EverydayFile, _Table, np.random.Generator], None
     _swapped_lines, _doubled_line, _another_rate, _another_rate, _stamps, _later_start,
     _coarse_times, _excel, _quotes, _open_quote, _comment_titles, _comment_within, _same_titles,
     _numbered_titles, _text_column, _no_titles, _other_separator_in_a_line, _commas_in_titles,
+    _units_above, _rate_in_head,
 )  # fmt: skip
 
 
@@ -701,7 +731,7 @@ def _uff(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
         elif rng.random() < 0.5:
             made.plan["ignore_file_metadata"] = True
         else:
-            made.must, made.names = "refuse", names
+            made.must, made.names = ("refuse" if even else "either"), names
     elif mistake == "spectrum":
         common |= {"func": int(_pick(rng, 2, 3, 4, 6)), "axis": int(_pick(rng, 17, 18))}
         common |= {"label": "Frequency", "xunit": "Hz"}
