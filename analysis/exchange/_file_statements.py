@@ -263,8 +263,8 @@ class FileStatements:
             start_ns = next(iter(starts.values()), 0)
             if unknown and start_ns and abs(start_ns) < _ABSOLUTE_NS:
                 self.contradict(
-                    f"the file says that '{next(iter(starts))}' begins at {_instant(start_ns)}, and "
-                    f"does not say when '{unknown[0]}' begins",
+                    f"the file says that '{next(iter(starts))}' begins at {_instant(start_ns)}, "
+                    f"and does not say when '{unknown[0]}' begins",
                     "give channels that begin together, or cut them to the same samples",
                 )
             elif starts and unknown:
@@ -295,8 +295,10 @@ class FileStatements:
         if common < 2:
             self.contradict(f"{statement}, so that they have no time in common", cut)
         angle = plan.channels["angle_rad"].channel
-        origin_ns = starts[angle] + skips[angle] * period_ns
-        delays_s = {n: (origin_ns - starts[n] - skips[n] * period_ns) / 1e9 for n in channels}
+        delays_s = {
+            n: (starts[angle] - starts[n] + (skips[angle] - skips[n]) * period_ns) / 1e9
+            for n in channels
+        }
         self._note_shift(statement, skips, delays_s, base.rate_hz)
         found = {
             n: replace(channel, values=channel.values[skips[n] : skips[n] + common])

@@ -14,6 +14,7 @@ from rigd.text_table._cells import (
     is_comment,
     is_date,
     is_row_of_units,
+    is_unit,
     without_comment_mark,
 )
 from rigd.text_table._errors import MissingColumnError, TableError
@@ -318,7 +319,7 @@ def _below_titles(
     optional = int(labview is not None and titles[-1] == _labview.COMMENT)
     units: Sequence[str] = ()
     above = rows[place - 1].cells if place else []
-    if len(fitted(above, width)) == width and is_row_of_units(above, columns):
+    if len(fitted(above, width)) == width and all(is_unit(cell) for cell in above if cell):
         units = above
     for row in rows[place + 1 : place + 2 + _BETWEEN]:
         cells = fitted(row.cells, width)
@@ -448,7 +449,8 @@ def _with_numbers(
             )
         return None
     units: Sequence[str] = ()
-    if above and is_row_of_units(above[-1].cells, columns):
+    last = [fitted(each.cells, 0) for each in above[-2:]]
+    if len(last) == 2 and len(last[0]) == len(last[1]) and is_row_of_units(last[1], columns):
         units = above.pop().cells
     titles: Sequence[str] = ()
     titles_line = 0
@@ -456,6 +458,8 @@ def _with_numbers(
     if above and (len(_plain_titles(above[-1])) > 1 or len(row.cells) == 1):
         titles, titles_line = _plain_titles(above[-1]), above[-1].line
         optional = int(labview is not None and titles[-1:] == [_labview.COMMENT])
+    if titles and not units and all(is_unit(title) for title in titles if title):
+        units = titles
     cells = fitted(row.cells, len(titles)) if titles else row.cells
     if titles and not len(titles) - optional <= len(cells) <= len(titles):
         if separator != BLANKS or len(cells) > len(titles):

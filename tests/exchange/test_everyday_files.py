@@ -11,7 +11,7 @@ pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
 pytest.importorskip("pyuff", reason="UFF58 needs pyuff")
 pytest.importorskip("h5py", reason="MATLAB 7.3 is read if h5py is there")
 
-SAMPLE = range(0, 28)
+SAMPLE = range(28)
 ALL = range(28, 308)
 
 

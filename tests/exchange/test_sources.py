@@ -167,6 +167,40 @@ def test_matlab_variables_fields_and_columns(folder, numbers, as_row, compressed
     np.testing.assert_array_equal(values(path, "m#2"), 2.0 * np.arange(len(numbers)))
 
 
+def test_matlab_elements_of_struct_arrays(tmp_path):
+    path = tmp_path / "a.mat"
+    runs = np.empty((1, 2), dtype=[("t", "O"), ("q", "O")])
+    runs[0, 0], runs[0, 1] = (np.arange(3.0), np.ones(3)), (np.arange(4.0), np.full(4, 2.0))
+    scipy.io.savemat(path, {"log": runs, "wide": np.ones((3, 9))})
+    assert values(path, "log(2).q").tolist() == [2, 2, 2, 2]
+    assert "struct array of 1×2" in refused(path, "log.q")
+    assert "log(1).q" in refused(path, "log.q")
+    assert "has 2 elements" in refused(path, "log(3).q")
+    assert "transposed" in refused(path, "wide#1")
+
+
+def test_matlab_states_times_and_units(tmp_path):
+    path = tmp_path / "a.mat"
+    series = {"Time": np.arange(4.0), "Data": np.ones(4), "TimeInfo": {"Units": "milliseconds"}}
+    scipy.io.savemat(path, {"q": series, "Fs": 250.0, "a": np.ones(4)})
+    _, channels = read_source(path, ["q.Data", "q.Time", "a"])
+    assert channels["q.Time"].unit_label == "milliseconds"
+    assert channels["a"].rate_hz == 250.0
+    _, channels = read_source(path, ["q.Data"])
+    assert channels["q.Data"].times.name == "q.Time"
+
+
+def test_matlab_7_3_texts_and_objects_are_no_numbers(tmp_path):
+    def write(file):
+        for name, kind in (("text", "char"), ("series", "timeseries")):
+            file[name] = np.arange(6, dtype=np.uint32)[:, None]
+            file[name].attrs["MATLAB_class"] = np.bytes_(kind)
+
+    path = hdf5_of_matlab(tmp_path / "a.mat", write)
+    for name, kind in (("text", "char"), ("series", "timeseries")):
+        assert f"MATLAB's class {kind}" in refused(path, name)
+
+
 def test_matlab_integers_are_numbers(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"a": np.array([1, -2, 3], dtype=np.int16)})
     assert values(tmp_path / "a.mat", "a").tolist() == [1.0, -2.0, 3.0]
@@ -345,6 +379,25 @@ def test_uff_that_another_program_wrote(folder, numbers, binary):
     assert "'#3 Torque'" in refused(path, "#4")
     assert "other times" in refused(path, "#1", "Torque", "abscissa")
     assert "no channel but 'abscissa'" in refused(path, "abscissa")
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "unit", "words"),
+    [
+        (2, 17, "s", "auto spectrum"),
+        (6, 18, "Hz", "coherence"),
+        (1, 18, "Hz", "frequency"),
+        (0, 0, "Hz", "abscissa is 'Hz'"),
+    ],
+)
+def test_real_functions_of_frequency_are_refused(tmp_path, kind, axis, unit, words):
+    x = np.arange(4) * 1e-3
+    path = uff_of(tmp_path / "a.uff", ("a", x, x, {}))
+    lines = path.read_text().splitlines(keepends=True)
+    lines[7] = f"{kind:5d}{lines[7][5:]}"
+    lines[9] = f"{axis:10d}{lines[9][10:47]}{unit:20}\n"
+    path.write_text("".join(lines))
+    assert words in refused(path, "a")
 
 
 def test_what_is_no_function_of_time_is_refused(tmp_path):

@@ -84,11 +84,9 @@ class _Table:
         return len(self.head) + bool(self.titles) + (self.units is not None) + row + 1
 
     def write(self, path: Path) -> None:
-        lines = list(self.head)
-        for cells in (self.titles, self.units, *self.rows):
-            if cells:
-                lines.append(self.separator.join(cells))
-        lines += self.tail
+        rows = (self.titles or None, self.units, *self.rows)
+        cells = [self.separator.join(row) for row in rows if row is not None]
+        lines = [*self.head, *cells, *self.tail]
         path.write_bytes((self.ending.join(lines) + self.ending).encode(self.encoding))
 
 
@@ -384,7 +382,7 @@ def _trailing_cells(made: EverydayFile, table: _Table, rng: np.random.Generator)
     if table.separator == " ":
         return
     for cells in table.rows[:: int(rng.integers(1, 4))]:
-        cells += [""] * int(rng.integers(1, 3))
+        cells.extend([""] * int(rng.integers(1, 3)))
 
 
 def _trailing_lines(made: EverydayFile, table: _Table, rng: np.random.Generator) -> None:
@@ -763,8 +761,8 @@ def _uff(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
     elif mistake == "uneven":
         even = 0
     made.story = f"uff, {mistake}, even {even}, binary {binary}, {made.plan}"
-    _write_uff(made.path, [(each, common, values) for each, values in zip(sets, (angle, torque), strict=True)],
-               step, even, binary)  # fmt: skip
+    columns = zip(sets, (angle, torque), strict=True)
+    _write_uff(made.path, [(own, common, values) for own, values in columns], step, even, binary)
 
 
 def _write_uff(path: Path, sets: list[Any], step: float, even: int, binary: int) -> None:
@@ -820,8 +818,9 @@ def _mat(made: EverydayFile, folder: Path, rng: np.random.Generator) -> None:
         made.plan["time"] = "t:s"
     contents: dict[str, Any] = {"t": time_s, "angle": angle[None, :], "torque": torque[:, None]}
     mistake = _pick(
-        rng, "plain", "struct", "struct array", "struct array unnamed", "matrix", "rows of a matrix",
-        "other rate by t", "other rate by Fs", "dt", "t in ms", "timeseries", "timeseries in ms",
+        rng, "plain", "struct", "struct array", "struct array unnamed", "matrix",
+        "rows of a matrix", "other rate by t", "other rate by Fs", "dt", "t in ms", "timeseries",
+        "timeseries in ms",
         "simulink", "text", "complex", "single", "gaps", "backward", "nested t", "lengths",
     )  # fmt: skip
     if mistake == "struct":
