@@ -245,7 +245,7 @@ class FileStatements:
         Returns
         -------
         channels : mapping of str to SourceChannel
-            Of one length.
+            Channels of one length.
         delays_s : mapping of str to float
             Channel → how much older its values are than those of the angle in the same place: what
             whole samples leave.
