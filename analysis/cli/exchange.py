@@ -61,7 +61,8 @@ def import_command(
         typer.Argument(
             metavar="SOURCE",
             readable=False,
-            help="File of measurements: .csv, .txt, .dat, .mat, .tdms, .uff, .unv, .uf58.",
+            help="File of measurements: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff, "
+            ".unv, .uf58.",
         ),
     ],
     session: Annotated[
@@ -73,7 +74,9 @@ def import_command(
         Path,
         typer.Option(metavar="FILE", readable=False, help="TOML with [beam] and the tool inertia."),
     ],
-    time: Annotated[str | None, _channel("Time of the samples; s, ms, us, ns.")] = None,
+    time: Annotated[
+        str | None, _channel("Time of the samples; s, ms, us, ns. Times of day are read in s.")
+    ] = None,
     rate_hz: Annotated[
         float | None,
         typer.Option(metavar="HZ", help="Instead of --time: samples per second, without gaps."),
@@ -109,6 +112,13 @@ def import_command(
         bool,
         typer.Option("--reverse-torque", help="The torque is the reaction: change its sign."),
     ] = False,
+    ignore_file_metadata: Annotated[
+        bool,
+        typer.Option(
+            "--ignore-file-metadata",
+            help="Your options count where the file states another rate, start, unit or scale.",
+        ),
+    ] = False,
     operator: Annotated[
         str, typer.Option(metavar="TEXT", help="Operator name, stored in the session file.")
     ] = "",
@@ -123,8 +133,12 @@ def import_command(
     """Convert a record of another program to a session file.
 
     Channels and units are stated, never guessed. A channel is named as the file names it (its
-    title in CSV and UFF58, Group/Channel in TDMS, struct.field or matrix#column in MATLAB), or #3
-    for the third of a CSV or UFF58 file.
+    title in text and UFF58, Group/Channel in TDMS, struct.field or matrix#column in MATLAB), or #3
+    for the third of a text or UFF58 file. In text, lines above the titles and a line of units below
+    them are found; any other line that does not fit the table is refused with its number.
+
+    What the file states of units, rate, times, start times and scales is used or compared with what
+    you state, and a contradiction is refused; --ignore-file-metadata lets you insist.
     """
     from analysis.exchange import QUANTITIES, ImportPlan, import_record, read_specimen
 
@@ -179,6 +193,7 @@ def import_command(
             note,
             specimen,
             operator,
+            ignore_file_metadata,
         )
         done = import_record(source, session, plan)
         for warning in done.warnings:

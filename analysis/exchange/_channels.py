@@ -71,9 +71,11 @@ _IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 def canonical_unit(text: str) -> str | None:
     """Return the table's spelling of a unit (``Nm``, ``N·m`` and ``N*m`` are ``N.m``), or None.
 
+    Words such as ``degrees`` and ``msec``, as programs write them, are known too.
     Capitals matter: ``mN.m`` is a thousandth of a newton metre and ``nm`` no torque at all.
     """
-    return _SPELLINGS.get(_bare(text))
+    bare = _bare(text)
+    return _SPELLINGS.get(bare) or _WORDS.get(bare.lower())
 
 
 def factor(quantity: str, unit: str) -> float:
@@ -130,11 +132,34 @@ def _scaled(unit: str) -> tuple[float, str]:
 
 def _bare(text: str) -> str:
     return re.sub(
-        r"[\s.·⋅*]", "", text.strip().replace("µ", "u").replace("μ", "u").replace("°", "deg")
+        r"[\s.·⋅*-]", "", text.strip().replace("µ", "u").replace("μ", "u").replace("°", "deg")
     )
 
 
 _SPELLINGS: Final = {_bare(name): name for names in UNITS.values() for name in names}
+
+_WORDS: Final = {
+    "degree": "deg",
+    "degrees": "deg",
+    "grad": "deg",
+    "radian": "rad",
+    "radians": "rad",
+    "sec": "s",
+    "secs": "s",
+    "second": "s",
+    "seconds": "s",
+    "sekunden": "s",
+    "msec": "ms",
+    "millisecond": "ms",
+    "milliseconds": "ms",
+    "usec": "us",
+    "microsecond": "us",
+    "microseconds": "us",
+    "newtonmeter": "N.m",
+    "newtonmetre": "N.m",
+    "newton": "N",
+}
+"""Words for units, in any case of letters."""
 
 
 # Fields

@@ -9,23 +9,17 @@ session format.
 from __future__ import annotations
 
 import hashlib
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 import rigd
-from analysis.exchange._channels import (
-    canonical_unit,
-    from_time_stamps,
-    uniform,
-    unit_in_brackets,
-    unit_in_suffix,
-)
+from analysis.exchange._file_statements import FileStatements, place_samples
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
-from rigd.printable import printable
 from rigd.session import SessionWriter, Status, encode_samples
 
 if TYPE_CHECKING:
@@ -67,6 +61,8 @@ class ImportPlan:
         Whether the coupling torque counts against the angle's sense, as a reaction does.
     note, label, operator : str
         From the operator; the label is what they call the specimen.
+    ignore_file_metadata : bool
+        Whether the plan counts where the file states another rate, time, start, unit or scale.
     """
 
     channels: Mapping[str, ChannelChoice]
@@ -80,6 +76,7 @@ class ImportPlan:
     note: str = ""
     label: str = ""
     operator: str = ""
+    ignore_file_metadata: bool = False
 
     def __post_init__(self) -> None:
         if any(name not in self.channels for name in REQUIRED):
@@ -144,8 +141,13 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     names = list(dict.fromkeys(choice.channel for choice in plan.choices))
     file_format, channels = read_source(source, names)
     remarks = dict.fromkeys(channel.remark for channel in channels.values() if channel.remark)
-    warnings = [*remarks, *check_units(source, plan, channels)]
-    base = timebase(source, plan, channels)
+    statements = FileStatements(source, plan, [*remarks])
+    statements.check_scales(channels)
+    statements.check_units(channels)
+    base = statements.timebase(channels)
+    channels, delays_s = statements.align(channels, base)
+    base = place_samples(source, plan, channels)
+    warnings = statements.warnings
     warnings += _check_rate(source, plan, base)
     segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
     columns = _columns(plan, channels)
@@ -167,26 +169,50 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     )
     warnings += [odd] if odd else []
     status[after_gap] |= np.uint32(Status.AFTER_LOST)
+    start_utc_ns, doubt = _start_utc_ns(source, int(ticks[-1]) / base.rate_hz)
+    warnings += [doubt] if doubt else []
+    metadata = _metadata(source, target, file_format, plan, base.rate_hz)
+    for key, field_name in (("angle_delay_s", REQUIRED[0]), ("torque_delay_s", REQUIRED[1])):
+        found_s = delays_s.get(plan.channels[field_name].channel, 0.0)
+        metadata[key] = repr(float(metadata[key]) + found_s)
+    if statements.ignored:
+        metadata["import_ignored"] = "; ".join(statements.ignored)
     write_session(
         target,
         {**columns, "tick": ticks, "status": status},
         base.rate_hz,
-        max(source.stat().st_mtime_ns, 0),
-        _metadata(source, target, file_format, plan, base.rate_hz),
+        start_utc_ns,
+        metadata,
         segments,
         warnings,
     )
     return ImportedRecord(target, len(ticks), base.rate_hz, segments, tuple(warnings))
 
 
+_LATEST_NS: Final = 2**63 - 1
+"""Latest time that a session file can have, in the year 2262."""
+
+
+def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
+    """Return when the file was changed last, or now with a warning if no session can have that."""
+    changed_ns = source.stat().st_mtime_ns
+    if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_NS:
+        return changed_ns, ""
+    year = 1970 + changed_ns / (365.2425 * 86_400e9)
+    return time.time_ns(), (
+        f"By its time stamp the file was changed about the year {year:.0f}, which a session cannot "
+        "state; the time of this import stands as the session's start."
+    )
+
+
 def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
     """Refuse a rate at which no record shows the beam; warn of a time next to none."""
-    beam, time = plan.specimen.beam, plan.time
+    beam, times = plan.specimen.beam, plan.time
     first_hz, duration_s = first_mode_hz(beam), (int(base.ticks[-1]) + 1) / base.rate_hz
     remedy = (
-        f"state the unit of '{time.channel}', which was taken to be {time.unit}, with --time "
-        f"{time.channel}:UNIT (s, ms, us, ns)"
-        if time
+        f"state the unit of '{times.channel}', which was taken to be {times.unit}, with --time "
+        f"{times.channel}:UNIT (s, ms, us, ns)"
+        if times
         else "state the true rate with --rate-hz"
     )
     if first_hz >= base.rate_hz / 2:
@@ -372,74 +398,6 @@ def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.flo
     return values[last_good]
 
 
-# Units and time base
-
-_RATE_TOLERANCE: Final = 2e-5
-"""Largest relative difference between the rate stated and the file's own, of which UFF58 has six
-digits."""
-
-_NO_UNIT: Final = ("", "NONE", "none", "-")
-
-
-def check_units(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> list[str]:
-    """Compare the units stated with those that the file has beside its channels.
-
-    Returns
-    -------
-    list of str
-        Warnings, where the file says something that is not understood.
-
-    Raises
-    ------
-    ExchangeError
-        If the file clearly says another unit.
-    """
-    warnings = []
-    for choice in plan.choices:
-        label = channels[choice.channel].unit_label.strip()
-        said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
-        if said is not None and said != choice.unit:
-            raise ExchangeError(
-                f"{path}: the file says that '{choice.channel}' is in {said}, and {choice.unit} "
-                f"was stated; state '{choice.channel}:{said}', or correct the file."
-            )
-        if said is None and label not in _NO_UNIT:
-            warnings.append(
-                f"The file states '{printable(label, 20)}' for '{choice.channel}'; {choice.unit} "
-                "was used as stated."
-            )
-        suffix = unit_in_suffix(choice.channel)
-        if said is None and suffix not in (None, choice.unit):
-            warnings.append(
-                f"The name '{choice.channel}' suggests {suffix}; {choice.unit} was used as stated."
-            )
-    return warnings
-
-
-def timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
-    """Place the samples in time, by the channel of times or by the rate stated.
-
-    Raises
-    ------
-    ExchangeError
-        If the times are not a time base, or the file has another rate than was stated.
-    """
-    if plan.time is not None:
-        time_s = channels[plan.time.channel].values * plan.time.factor
-        found = from_time_stamps(path, plan.time.channel, time_s)
-    else:
-        samples = len(next(iter(channels.values())).values)
-        found = uniform(path, samples, plan.rate_hz or 0.0)
-    for name, channel in channels.items():
-        own_hz = channel.rate_hz
-        if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
-            raise ExchangeError(
-                f"{path}: the file says that '{name}' was sampled at {own_hz:.6g} Hz, and "
-                f"{found.rate_hz:.6g} Hz was stated; state the true rate with --rate-hz."
-            )
-    return found
-
-
 # Plausibility of the torque
 
 _BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
@@ -569,6 +527,8 @@ def write_session(
         writer.close({name: str(count) for name, count in counts.items()})
     except BaseException:
         # Unlike a recording, the source is still there: an incomplete copy of it is useless.
-        writer.abandon()
-        writer.part.unlink(missing_ok=True)
+        try:
+            writer.abandon()
+        finally:
+            writer.part.unlink(missing_ok=True)
         raise

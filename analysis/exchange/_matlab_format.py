@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from analysis.exchange._matlab_times import stated_times, states_time
 from analysis.exchange._source import (
+    MAX_SAMPLES,
     ExchangeError,
     SourceChannel,
     as_column,
@@ -38,8 +40,8 @@ _HDF5_AT: Final = (0, 512)  # MATLAB puts its own header of 512 bytes before it
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors of a MATLAB file, as `analysis.exchange._source.read_source` asks for.
 
-    A channel is a variable ``angle``, a field of a struct ``log.angle``, or a column of a matrix
-    ``data#2``, counted from 1 as MATLAB does.
+    A channel is a variable ``angle``, a field of a struct ``log.angle``, of one element of a struct
+    array ``log(2).angle``, or a column of a matrix ``data#2``, counted from 1 as MATLAB does.
     """
     with path.open("rb") as stream:
         head = stream.read(max(_HDF5_AT) + len(_HDF5_MAGIC))
@@ -71,13 +73,49 @@ def _vectors(
 ) -> dict[str, SourceChannel]:
     """Load the variables that are asked for, once their sizes as listed have been looked at."""
     shapes = {name: shape for name, shape, _ in listed}
-    variables = {name: _split(name, shapes)[0] for name in names}
+    variables = {name: _element(_split(name, shapes)[0])[0] for name in names}
     for name, variable in variables.items():
         if variable not in shapes:
             raise no_such_channel(path, name, shapes)
         check_samples(path, f"The variable '{variable}'", max(shapes[variable], default=0))
-    contents = load(path, variable_names=sorted(set(variables.values())))
-    return {name: SourceChannel(_vector(path, name, contents)) for name in names}
+    beside = {n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES}
+    contents = load(path, variable_names=sorted(beside | set(variables.values())))
+    known = {name: contents[name] for name in shapes if name in contents}
+
+    def fields(parent: str) -> Sequence[str]:
+        if not parent:
+            return list(known)
+        value = _value_of(path, parent, known)
+        return getattr(getattr(value, "dtype", None), "names", None) or ()
+
+    channels = {}
+    for name in names:
+        values = _vector(path, name, known)
+        label = _label(path, name, known)
+        rate_hz, times = stated_times(
+            name, names, len(values), fields, partial(_vector_of, path, known)
+        )
+        channels[name] = SourceChannel(values, unit_label=label, rate_hz=rate_hz, times=times)
+    return channels
+
+
+def _vector_of(path: Path, contents: Mapping[str, Any], name: str) -> NDArray[Any]:
+    return _vector(path, name, contents)
+
+
+_OF_TIMESERIES: Final = {"Time": "TimeInfo", "Data": "DataInfo"}
+
+
+def _label(path: Path, name: str, contents: Mapping[str, Any]) -> str:
+    """Return the unit that a struct with the fields of a timeseries states, "" if none."""
+    parent, _, field = name.rpartition(".")
+    if field not in _OF_TIMESERIES:
+        return ""
+    try:
+        value = _value_of(path, f"{parent}.{_OF_TIMESERIES[field]}.Units", contents)
+    except ExchangeError:
+        return ""
+    return str(value.reshape(-1)[0]) if value.dtype.kind == "U" and value.size == 1 else ""
 
 
 def _split(name: str, variables: Container[str]) -> tuple[str, list[str], int | None]:
@@ -91,23 +129,67 @@ def _split(name: str, variables: Container[str]) -> tuple[str, list[str], int | 
     return variable, fields, column
 
 
+_INDEXED: Final = re.compile(r"(.+)\((\d+)\)")
+
+
+def _element(text: str) -> tuple[str, int | None]:
+    """Take ``log(2)`` apart into the name and the element's place from 0 on, None without one."""
+    found = _INDEXED.fullmatch(text)
+    return (found[1], int(found[2]) - 1) if found else (text, None)
+
+
 def _vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[Any]:
-    variable, fields, column = _split(name, contents)
-    value = contents[variable]
-    for field in fields:
-        found = getattr(value, "dtype", None)
-        if found is None or found.names is None or value.size != 1:
-            raise ExchangeError(
-                f"{path}: '{name}' asks for a field '{field}', but its parent is not one struct."
-            )
-        if field not in found.names:
-            raise no_such_channel(path, name, (f"{variable}.{each}" for each in found.names))
-        value = value.reshape(-1)[0][field]
-    return _column(path, name, value, column)
+    return _column(path, name, _value_of(path, name, contents), _split(name, contents)[2])
+
+
+def _value_of(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return a variable, or a field of a struct or of one element of a struct array."""
+    first, fields, _ = _split(name, contents)
+    value: Any = None
+    shown = ""
+    for depth, part in enumerate((first, *fields)):
+        key, place = _element(part)
+        if depth:
+            found = getattr(value, "dtype", None)
+            if found is None or found.names is None:
+                raise ExchangeError(
+                    f"{path}: '{name}' asks for a field '{key}', but its parent '{shown}' is not "
+                    "one struct."
+                )
+            if value.size != 1:
+                size = "×".join(map(str, value.shape))
+                raise ExchangeError(
+                    f"{path}: '{shown}' is a struct array of {size}, not one struct; name one of "
+                    f"its elements, such as {shown}(1).{key}, or save [{shown}.{key}] as a vector."
+                )
+            if key not in found.names:
+                raise no_such_channel(path, name, (f"{shown}.{each}" for each in found.names))
+            value = value.reshape(-1)[0][key]
+        elif key not in contents:
+            raise no_such_channel(path, name, contents)
+        else:
+            value = contents[key]
+        shown = f"{shown}.{part}" if depth else part
+        if place is not None:
+            count = getattr(value, "size", 0)
+            if not 0 <= place < count:
+                raise ExchangeError(
+                    f"{path}: '{shown}' is not there; '{key}' has {count} elements."
+                )
+            value = value.reshape(-1, order="F")[place : place + 1]
+    return value
+
+
+_OBJECTS: Final = ("MatlabOpaque", "MatlabObject", "MatlabFunction")
 
 
 def _column(path: Path, name: str, value: Any, column: int | None) -> NDArray[Any]:  # noqa: ANN401
     shape = getattr(value, "shape", None)
+    if type(value).__name__ in _OBJECTS:
+        raise ExchangeError(
+            f"{path}: '{name}' is an object of MATLAB (timeseries, table, datetime or the like); "
+            "save its values as vectors, such as t = x.Time; angle = x.Data."
+        )
     names = getattr(getattr(value, "dtype", None), "names", None)
     if names:
         listed = ", ".join(f"{name}.{each}" for each in names[:12])
@@ -126,6 +208,11 @@ def _column(path: Path, name: str, value: Any, column: int | None) -> NDArray[An
     if value.ndim != 2 or column >= value.shape[1]:
         size = "×".join(map(str, shape))
         raise ExchangeError(f"{path}: '{name}' is not a column of it, its size is {size}.")
+    if value.shape[0] < value.shape[1]:
+        raise ExchangeError(
+            f"{path}: '{name}' has {value.shape[0]} values, fewer than there are columns "
+            f"({value.shape[1]}); channels are columns: save the matrix transposed."
+        )
     return as_column(path, name, value[:, column])
 
 
@@ -139,7 +226,7 @@ def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         ) from error
     try:
         with bounded_memory(), h5py.File(path, "r") as file:
-            return {name: SourceChannel(_hdf5_vector(path, file, name, h5py)) for name in names}
+            return {name: _hdf5_channel(path, file, name, names, h5py) for name in names}
     except (ExchangeError, MemoryError):
         raise
     except Exception as error:  # h5py lets through whatever a damaged file provokes
@@ -147,6 +234,30 @@ def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             f"{path}: cannot be read as a MATLAB file of version 7.3 ({error}); save it with "
             "save('-v7', …)."
         ) from error
+
+
+_NUMERIC: Final = (
+    "double", "single", "logical",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+)  # fmt: skip
+
+
+def _hdf5_channel(
+    path: Path,
+    file: Any,  # noqa: ANN401
+    name: str,
+    names: Sequence[str],
+    h5py: Any,  # noqa: ANN401
+) -> SourceChannel:
+    def fields(parent: str) -> Sequence[str]:
+        group = file[parent.replace(".", "/")] if parent else file
+        return list(group) if isinstance(group, h5py.Group) else ()
+
+    values = _hdf5_vector(path, file, name, h5py)
+    rate_hz, times = stated_times(
+        name, names, len(values), fields, lambda other: _hdf5_vector(path, file, other, h5py)
+    )
+    return SourceChannel(values, rate_hz=rate_hz, times=times)
 
 
 def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
@@ -159,6 +270,13 @@ def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  
         listed = ", ".join(f"{name}.{each}" for each in list(dataset)[:12])
         raise ExchangeError(f"{path}: '{name}' is a struct; choose one of its fields: {listed}.")
     check_samples(path, f"'{name}'", max(dataset.shape, default=0))
+    kind = dataset.attrs.get("MATLAB_class", b"double")
+    kind = kind.decode("ascii", "replace") if isinstance(kind, bytes) else str(kind)
+    if kind not in _NUMERIC or dataset.dtype.kind == "O" or "MATLAB_empty" in dataset.attrs:
+        raise ExchangeError(
+            f"{path}: '{name}' holds no numbers but is of MATLAB's class {kind}, a struct array or "
+            "empty; save the values of one record as vectors, such as angle = log(1).angle."
+        )
     # MATLAB's columns are the rows of HDF5, which counts its dimensions from the other end.
     return _column(path, name, dataset[()].T, column)
 

@@ -32,6 +32,25 @@ class TargetError(ExchangeError):
 
 
 @dataclass(frozen=True, slots=True)
+class FileTimes:
+    """Times that a file has of its samples.
+
+    Attributes
+    ----------
+    name : str
+        Name of the channel that has them.
+    values : ndarray of float, shape (n,)
+        As they stand in the file.
+    unit_s : float or None
+        Size of their unit in seconds, None if the file does not state it.
+    """
+
+    name: str
+    values: NDArray[np.float64]
+    unit_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class SourceChannel:
     """One channel as it stands in the file.
 
@@ -45,12 +64,22 @@ class SourceChannel:
         Samples per second by the file's own word, None if it says nothing.
     remark : str
         What the user should know of the file, "" if nothing.
+    start_ns : int or None
+        Time of the first sample by the file's own word, ns from any instant that all channels of
+        the file have in common, None if it says nothing.
+    times : FileTimes or None
+        Times that the file has of these samples besides.
+    unapplied_scale : str
+        Scale that the file asks for and that the values do not have, "" if none.
     """
 
     values: NDArray[np.float64]
     unit_label: str = ""
     rate_hz: float | None = None
     remark: str = ""
+    start_ns: int | None = None
+    times: FileTimes | None = None
+    unapplied_scale: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +98,9 @@ _FORMATS: Final = {
     ".csv": _Format("CSV", "_csv_format", 512 * _MB),
     ".txt": _Format("CSV", "_csv_format", 512 * _MB),
     ".dat": _Format("CSV", "_csv_format", 512 * _MB),
+    ".tsv": _Format("CSV", "_csv_format", 512 * _MB),
+    ".asc": _Format("CSV", "_csv_format", 512 * _MB),
+    ".lvm": _Format("CSV", "_csv_format", 512 * _MB),
     ".mat": _Format("MATLAB", "_matlab_format", 512 * _MB),
     ".tdms": _Format("TDMS", "_tdms_format", 512 * _MB),
     ".uff": _Format("UFF58", "_uff_format", 128 * _MB),
@@ -83,7 +115,8 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
     Parameters
     ----------
     path : Path
-        Its ending says what it is: .csv, .txt, .dat, .mat, .tdms, .uff, .unv or .uf58.
+        Its ending says what it is: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff, .unv or
+        .uf58.
     names : sequence of str
         The channels, as the format has them (docs/exchange.md).
 
@@ -91,7 +124,7 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
     -------
     format_name : str
     channels : mapping
-        Each name with its channel, all of the same length.
+        Each name with its channel; all have at least two samples.
 
     Raises
     ------
@@ -116,7 +149,11 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
             f"{path}: would take more than {MAX_MEMORY / _MB:.0f} MB of memory to read, so it is "
             "damaged or holds far more than a session; export the session's channels alone."
         ) from error
-    _check_lengths(path, channels)
+    for name, channel in channels.items():
+        length = len(channel.values)
+        if length < 2:
+            raise ExchangeError(f"{path}: '{name}' has {length} samples, too few for a record.")
+        check_samples(path, f"The channel '{name}'", length)
     return kind.name, channels
 
 
@@ -134,7 +171,8 @@ def _check_file(path: Path, kind: _Format) -> None:
         )
 
 
-def _check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
+def check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
+    """Refuse channels of different lengths."""
     lengths = {name: len(channel.values) for name, channel in channels.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
@@ -142,10 +180,6 @@ def _check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
             f"{path}: the channels have different numbers of samples ({listed}); choose channels "
             "that were sampled together, or cut them to the same samples."
         )
-    length = min(lengths.values())
-    if length < 2:
-        raise ExchangeError(f"{path}: has {length} samples, too few for a record.")
-    check_samples(path, "The file", length)
 
 
 # Bounds on memory and length

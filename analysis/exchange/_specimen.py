@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from analysis.exchange._source import ExchangeError
 from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
 from rigd.beam import Beam
+from rigd.text_table import decode_text
 from rigd.units import finite_number, unit_of
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def read_specimen(path: Path) -> Specimen:
             text = stream.read(_MOST_BYTES + 1)
         if len(text) > _MOST_BYTES:
             raise ExchangeError(f"{path}: is too large for a profile; give a TOML file.")
-        content = tomllib.loads(text.decode("utf-8"))
+        content = tomllib.loads(decode_text(text))
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:

@@ -7,12 +7,14 @@ write abscissae with six digits only.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from analysis.exchange._source import (
     ExchangeError,
+    FileTimes,
     SourceChannel,
     as_column,
     bounded_memory,
@@ -22,6 +24,7 @@ from analysis.exchange._source import (
     place_of,
 )
 from rigd.printable import printable
+from rigd.text_table import stated_unit_of, time_unit_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +45,8 @@ _MOST_SETS: Final = 10_000
 _MARK: Final = b"    -1"
 _TIME: Final = 17
 """Code of a time in the characteristics of an axis; in s, in every system of units."""
+_SAME_STEP: Final = 1e-3
+"""Largest difference between the steps of two data sets that begin at different times, in steps."""
 
 
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
@@ -79,13 +84,21 @@ def _functions(
     }
     if not numbers:
         raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was asked for.")
-    channels, times = {}, []
+    channels, times, units = {}, [], []
     for name, number in numbers.items():
         function = file.read_sets(places[number])
-        channels[name] = _channel(path, name, function)
-        times.append(np.asarray(function["x"], dtype=np.float64))
+        stamps = np.asarray(function["x"], dtype=np.float64)
+        channels[name] = _channel(path, name, function, stamps, timed=ABSCISSA in names)
+        times.append(stamps)
+        units.append(_abscissa_unit(function))
     if ABSCISSA in names:
-        channels[ABSCISSA] = SourceChannel(_common_times(path, list(numbers), times))
+        first = next(iter(channels.values()))
+        channels[ABSCISSA] = SourceChannel(
+            _common_times(path, channels, times),
+            unit_label=units[0],
+            rate_hz=None if units[0] else _even_rate_hz(function, 1.0),
+            start_ns=first.start_ns,
+        )
     return channels
 
 
@@ -97,28 +110,103 @@ def _check_marks(path: Path) -> None:
         )
 
 
-def _channel(path: Path, name: str, function: Mapping[str, Any]) -> SourceChannel:
+def _channel(
+    path: Path, name: str, function: Mapping[str, Any], stamps: NDArray[np.float64], *, timed: bool
+) -> SourceChannel:
     values = np.asarray(function["data"])
     if values.dtype.kind == "c":
         raise not_in_time(path, name)
+    unit = _abscissa_unit(function)
+    _check_time_response(path, name, function, unit)
     if len(values) != function["num_pts"]:
         raise ExchangeError(
             f"{path}: '{name}' has {len(values)} values and states {function['num_pts']}; the file "
             "is damaged or was written incorrectly; export it again."
         )
     check_samples(path, f"The data set '{name}'", len(values))
-    even = function["abscissa_spacing"] == 1 and function["abscissa_spec_data_type"] == _TIME
-    increment_s = function["abscissa_inc"] if even else 0.0
+    unit_s = time_unit_s(unit)
+    is_time = unit_s is not None or function["abscissa_spec_data_type"] == _TIME
+    even = function["abscissa_spacing"] == 1
+    start_s = float(stamps[0]) * (unit_s or 1.0) if len(stamps) else math.nan
+    label = _text(function, "ordinate_axis_units_lab")
     return SourceChannel(
         as_column(path, name, values),
-        unit_label=function.get("ordinate_axis_units_lab", ""),
-        rate_hz=1 / increment_s if increment_s > 0 else None,
+        unit_label=label or stated_unit_of(_text(function, "ordinate_axis_lab")),
+        rate_hz=_even_rate_hz(function, unit_s or 1.0) if is_time and not timed else None,
+        start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
+        times=FileTimes(ABSCISSA, stamps, unit_s) if is_time and not even and not timed else None,
     )
 
 
-def _common_times(path: Path, names: Sequence[str], times: Sequence[Any]) -> Any:  # noqa: ANN401
+def _text(function: Mapping[str, Any], key: str) -> str:
+    """Return a label of a data set, "" where it has none."""
+    text = str(function.get(key) or "").strip()
+    return "" if text.upper() == "NONE" else text
+
+
+def _abscissa_unit(function: Mapping[str, Any]) -> str:
+    """Return what a data set states of the unit of its abscissa, "" if nothing."""
+    return _text(function, "abscissa_axis_units_lab") or stated_unit_of(
+        _text(function, "abscissa_axis_lab")
+    )
+
+
+def _even_rate_hz(function: Mapping[str, Any], unit_s: float) -> float | None:
+    increment_s = function["abscissa_inc"] * unit_s if function["abscissa_spacing"] == 1 else 0.0
+    return 1 / increment_s if increment_s > 0 else None
+
+
+def _check_time_response(path: Path, name: str, function: Mapping[str, Any], unit: str) -> None:
+    """Refuse spectra and other functions that are none of time."""
+    kind, axis = function["func_type"], function["abscissa_spec_data_type"]
+    label = _text(function, "abscissa_axis_lab")
+    text = ""
+    if kind not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
+        text = f"its function type is {kind}{_named(kind, _FUNCTION_TYPES)}"
+    elif axis not in (_UNKNOWN, _GENERAL, _TIME):
+        text = f"its abscissa is of type {axis}{_named(axis, _ABSCISSA_TYPES)}"
+    elif axis != _TIME and (
+        unit.lower() in ("hz", "khz", "rpm", "rad/s") or label.lower().startswith("freq")
+    ):
+        text = f"its abscissa is '{label or unit}'"
+    if text:
+        raise ExchangeError(
+            f"{path}: '{name}' is not a function of time: {text}. A session is made of measured "
+            "samples: give angle and torque over time."
+        )
+
+
+def _named(code: int, names: Mapping[int, str]) -> str:
+    return f" ({names[code]})" if code in names else ""
+
+
+_FUNCTION_TYPES: Final = {
+    2: "auto spectrum",
+    3: "cross spectrum",
+    4: "frequency response",
+    5: "transmissibility",
+    6: "coherence",
+    7: "auto correlation",
+    8: "cross correlation",
+    9: "power spectral density",
+    10: "energy spectral density",
+    11: "probability density",
+    12: "spectrum",
+    13: "cumulative distribution",
+}
+_ABSCISSA_TYPES: Final = {18: "frequency", 19: "rpm", 20: "order"}
+
+
+def _common_times(path: Path, channels: Mapping[str, SourceChannel], times: Sequence[Any]) -> Any:  # noqa: ANN401
+    """Return the times of the first channel, which those of all others are, but for their start."""
+    names = list(channels)
     for name, each in zip(names, times, strict=True):
-        if not np.array_equal(each, times[0]):
+        begin, first_begin = channels[name].start_ns, channels[names[0]].start_ns
+        length = min(len(each), len(times[0]))
+        shifted = np.diff(each[:length]) - np.diff(times[0][:length])
+        period = np.median(np.diff(times[0])) if len(times[0]) > 1 else 0.0
+        uneven = bool(np.abs(shifted).max(initial=0.0) > _SAME_STEP * period)
+        if not np.array_equal(each, times[0]) and (uneven or begin is None or first_begin == begin):
             raise ExchangeError(
                 f"{path}: '{name}' has other times than '{names[0]}'; choose channels that were "
                 "sampled together."
@@ -135,7 +223,7 @@ format has six digits for either. In binary the abscissae themselves are the bet
 _SAME_INCREMENT: Final = 1e-10
 """Relative error of the increment at which, in binary, a short record tells its rate as well."""
 
-_TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 1, 4, 6
+_GENERAL_FUNCTION, _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 0, 1, 4, 6
 _TIME_AXIS, _FREQUENCY_AXIS, _GENERAL, _UNKNOWN = 17, 18, 1, 0
 _REAL_DOUBLE, _COMPLEX_DOUBLE = 4, 6
 

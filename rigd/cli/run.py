@@ -245,13 +245,18 @@ def file(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="CSV", readable=False, help="Columns time_s and angle_rad, or angles only."
+            metavar="FILE",
+            readable=False,
+            help="Text with columns time_s and angle_rad, or a column of angles (rad).",
         ),
     ],
     rest_s: Rest = 1.0,
     ring_down_s: RingDown = 15.0,
 ) -> "dict[str, Value]":
-    """Follow a reference from a CSV file.
+    """Follow a reference from a text file.
+
+    Columns are separated by commas, semicolons, tabs or blanks, with decimal points or, except
+    between commas, decimal commas. A line that does not fit the table is refused with its number.
 
     Example: rigd run file reference.csv
     """

@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
 _LONGEST_LINE = 65_536
 _TIMEOUT_S = 2.0
 
+
 @dataclass(frozen=True, slots=True)
 class SimulatorAddress:
     """Address of a simulated rig."""

@@ -1,13 +1,13 @@
-"""Reference signals from CSV files."""
+"""Reference signals from text files."""
 
-import csv
-from math import isfinite
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from rigd.excitation._signals import (
+    MAX_TICKS,
     Excitation,
     ExcitationError,
     assemble,
@@ -16,21 +16,28 @@ from rigd.excitation._signals import (
     within_a_turn,
 )
 from rigd.runtime import open_plain_file
+from rigd.text_table import MissingColumnError, TableError, TextTable, read_table, time_unit_s
 
 MOST_BYTES: Final = 256_000_000
+TIME: Final = "time_s"
+ANGLE: Final = "angle_rad"
+_RADIANS: Final = ("rad", "radian", "radians")
 
 
 def from_csv(
     path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
 ) -> Excitation:
-    """Read a reference from a CSV file.
+    """Read a reference from a text file.
+
+    Separator, decimal sign, head and encoding are found as `rigd.text_table.read_table` does; a
+    line that does not fit is refused.
 
     Parameters
     ----------
     path
-        Either columns ``time_s`` and ``angle_rad`` (named in the first line, more columns are
-        ignored; angles are interpolated linearly to the ticks, times counted from the first), or
-        a single column of angles in rad, one per tick, with or without the heading ``angle_rad``.
+        Either columns ``time_s`` and ``angle_rad`` (more columns are ignored; angles are
+        interpolated linearly to the ticks, times counted from the first), or a single column of
+        angles in rad, one per tick, with or without the heading ``angle_rad``.
     rate_hz
         Ticks a second.
     rest_s, ring_down_s
@@ -42,13 +49,13 @@ def from_csv(
         If the file cannot be read, or a line of it is not what it should be.
     """
     path = Path(path)
-    times, angles = _read_csv(path)
+    times, angles = _read_columns(path)
     if times is None:
         ticks = len(angles)
-        sweep = np.asarray(angles)
+        sweep = angles
     else:
-        check_ticks("The file", (times[-1] - times[0]) * rate_hz, rate_hz)
-        time_s = np.asarray(times) - times[0]
+        check_ticks("The file", (float(times[-1]) - float(times[0])) * rate_hz, rate_hz)
+        time_s = times - times[0]
         # The last row is reached exactly; rounding must not lose its tick.
         ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
         sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
@@ -65,61 +72,66 @@ def from_csv(
     return assemble("file", parameters, rate_hz, segments, sweep)
 
 
-def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
+def _read_columns(
+    path: Path,
+) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
+    """Return times in s, None if there is one angle a tick, and angles in rad."""
     try:
-        with open_plain_file(path, MOST_BYTES, newline="") as file:
-            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
+        with open_plain_file(path, MOST_BYTES) as file:
+            table = _table(file.buffer)
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error.reason}).") from error
-    except csv.Error as error:
-        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error}).") from error
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
-    if "angle_rad" in header:
-        angle_column = header.index("angle_rad")
-        time_column = header.index("time_s") if "time_s" in header else None
-        if time_column is None and len(header) > 1:
+    except TableError as error:
+        # Without its text: the daemon reads files that whoever commands it may not be allowed to.
+        raise ExcitationError(f"{path}: {error.unquoted()}") from error
+    angles = next(column for name, column in table.columns.items() if name != TIME)
+    times = table.columns.get(TIME)
+    if len(angles.values) < 2:
+        raise ExcitationError(
+            f"{path}: has {len(angles.values)} angles; a reference needs at least two."
+        )
+    if len(angles.values) > MAX_TICKS:
+        raise ExcitationError(f"{path}: has more than {MAX_TICKS} angles; shorten it.")
+    if angles.unit and angles.unit.lower() not in _RADIANS:
+        raise ExcitationError(f"{path}: states another unit than rad for {ANGLE}; write rad.")
+    if times is not None and times.unit and time_unit_s(times.unit) != 1.0:
+        raise ExcitationError(f"{path}: states another unit than s for {TIME}; write seconds.")
+    for name, column in ((ANGLE, angles), (TIME, times)):
+        if column is not None and not np.isfinite(column.values).all():
+            row = int(np.argmin(np.isfinite(column.values)))
             raise ExcitationError(
-                f"{path}: line 1 has {len(header)} columns, angle_rad among them, but no time_s; "
-                "name the column of times in seconds so, or leave angle_rad alone."
+                f"{path}: line {table.lines[row]}: {name} is not a finite number."
             )
-        rows = rows[1:]
-    elif len(header) == 1 and ";" in header[0]:
-        raise ExcitationError(f"{path}: separates its columns by semicolons; use commas.")
-    elif len(header) == 1:
-        angle_column, time_column = 0, None
-    else:
+    if times is not None and (late := times.values[1:] <= times.values[:-1]).any():
+        row = int(np.argmax(late)) + 1
         raise ExcitationError(
-            f"{path}: line 1 must name the columns time_s (s) and angle_rad (rad), or the file "
-            "must be one column of angles in rad."
+            f"{path}: line {table.lines[row]}: {TIME} does not come after the one before it; times "
+            "must increase."
         )
-    angles: list[float] = []
-    times: list[float] = []
-    for number, row in rows:
-        angles.append(_cell(path, number, row, angle_column, "angle_rad"))
-        if time_column is not None:
-            times.append(_cell(path, number, row, time_column, "time_s"))
-            if len(times) > 1 and times[-1] <= times[-2]:
-                raise ExcitationError(
-                    f"{path}: line {number}: time_s does not come after the one before it; times "
-                    "must increase."
-                )
-    if len(angles) < 2:
-        raise ExcitationError(f"{path}: has {len(angles)} angles; a reference needs at least two.")
-    return (times if time_column is not None else None), angles
+    return (None if times is None else times.values), angles.values
 
 
-def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> float:
-    if column >= len(row):
-        raise ExcitationError(f"{path}: line {line} has no value in the column {name}.")
+def _table(stream: BinaryIO) -> TextTable:
+    """Read times and angles, or a single column."""
     try:
-        value = float(row[column])
-    except ValueError:
-        value = float("nan")
-    if not isfinite(value):
-        raise ExcitationError(
-            # Not quoted: the daemon reads files that whoever commands it may not be allowed to.
-            f"{path}: line {line}: {name} is not a finite number."
+        return read_table(stream, (TIME, ANGLE), most_rows=MAX_TICKS)
+    except MissingColumnError:
+        pass
+    try:
+        table = read_table(stream, (ANGLE,), most_rows=MAX_TICKS)
+    except MissingColumnError:
+        pass
+    else:
+        if table.width > 1:
+            raise TableError(
+                f"has {table.width} columns, {ANGLE} among them, but no {TIME}; name the column of "
+                f"times in seconds so, or leave {ANGLE} alone."
+            )
+        return table
+    table = read_table(stream, ("#1",), most_rows=MAX_TICKS)
+    if table.width > 1 or table.columns["#1"].title:
+        raise TableError(
+            f"must name the columns {TIME} (s) and {ANGLE} (rad) in one line above the numbers, or "
+            "be one column of angles in rad."
         )
-    return value
+    return table

@@ -28,6 +28,7 @@ from rigd.profile._schema import (
     is_number,
     keys,
 )
+from rigd.text_table import decode_text
 
 
 class ProfileError(UserError, ValueError):
@@ -74,7 +75,7 @@ def read_text(path: Path) -> str:
         If it cannot be read, or is not text.
     """
     try:
-        return path.read_bytes().decode("utf-8")
+        return decode_text(path.read_bytes())
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
     except UnicodeDecodeError as error:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.session import Session, SessionError, Status, fit_of, touch_line, touches_of
+from rigd.text_table import decode_text
 from rigd.units import unit_of
 from rigd.view._banner import ended
 from rigd.view._layout import blueprint
@@ -112,7 +113,7 @@ _LIMITS: Final = {
 def _stated_limits(profile: bytes) -> dict[str, float]:
     """Return the limits that a profile states and that can be used; it may be of any version."""
     try:
-        table = tomllib.loads(profile.decode("utf-8"))
+        table = tomllib.loads(decode_text(profile))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
         return {}
     limits = {}
@@ -139,7 +140,7 @@ def nominal_damping(profile: bytes) -> Damping | None:
     Only these numbers are looked for: the profile of an older or of a newer program serves as well.
     """
     try:
-        table = tomllib.loads(profile.decode("utf-8"))["beam"]["damping"]
+        table = tomllib.loads(decode_text(profile))["beam"]["damping"]
         zeta, alpha, gamma, lambda_ = (
             float(table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
         )

@@ -108,8 +108,8 @@ def test_info_on_what_is_no_session_file(rigd_here, tmp_path, content):
 
 
 def test_a_plain_word_in_the_wrong_place_is_explained(rigd_here, tmp_path):
-    (tmp_path / "reference.csv").write_text("time_s;angle_rad\n0;0\n1;0.1\n")
-    assert_refused(rigd_here("run", "file", "reference.csv", "--fast"), 2, "semicolons", "commas")
+    (tmp_path / "reference.csv").write_text("time_s,angle_rad\n0,0\n1,0,1\n")
+    assert_refused(rigd_here("run", "file", "reference.csv", "--fast"), 2, "line 3 has 3 cells")
 
 
 @pytest.mark.parametrize(

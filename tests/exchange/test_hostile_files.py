@@ -49,7 +49,8 @@ def test_a_quotation_that_never_ends(tmp_path):
     path = tmp_path / "quote.csv"
     path.write_bytes(b'a,b\n"' + b"1,2\n" * 1_000_000)
     message, megabytes = refused(path, "a")
-    assert "not a CSV file" in message
+    assert "line 2 has 1 cell" in message
+    assert "a quotation does not end" in message
     assert megabytes < 100
 
 

@@ -1,12 +1,14 @@
 """What becomes of a record: numbers, flags, gaps, provenance, and doubts that are told."""
 
 import hashlib
+import os
+import time
 
 import numpy as np
 import pytest
 
 from analysis.exchange._channels import parse_choice
-from analysis.exchange._import_record import ImportPlan, import_record
+from analysis.exchange._import_record import ImportPlan, import_record, write_session
 from analysis.exchange._source import ExchangeError
 from analysis.exchange._specimen import Specimen, read_specimen
 from analysis.record import load_record
@@ -163,8 +165,15 @@ def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path
     source = csv_of(**{"Angle [deg]": ANGLE, "torque": TORQUE})
     with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated"):
         import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:rad"))
+    with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated.*'#1:deg'"):
+        import_record(source, tmp_path / "a.mcap", make_plan(angle="#1:rad"))
     import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:deg"))
-    import_record(source, tmp_path / "b.mcap", make_plan(angle="#1:rad"))
+    plan = make_plan(angle="Angle [deg]:rad", ignore_file_metadata=True)
+    done = import_record(source, tmp_path / "b.mcap", plan)
+    assert "Ignored as requested: the file says that 'Angle [deg]' is in deg" in done.warnings[0]
+    session = read_session(done.path)
+    assert "is in deg, and rad was stated" in session.metadata["import_ignored"]
+    np.testing.assert_array_equal(session.samples["angle_rad"], ANGLE)
 
 
 def test_a_name_that_sounds_like_another_unit_is_told(csv_of, make_plan, tmp_path):
@@ -311,3 +320,122 @@ def test_what_is_no_specimen_is_refused(tmp_path, text, words):
 def test_a_specimen_that_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(ExchangeError, match="cannot be read"):
         read_specimen(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_specimen_may_begin_with_a_byte_order_mark(profile, tmp_path, encoding):
+    path = tmp_path / "beam.toml"
+    path.write_text(profile.read_text("utf-8"), encoding)
+    assert read_specimen(path) == Specimen(BEAM, 0.0)
+
+
+@pytest.mark.parametrize("year", [2300, 1960])
+def test_a_time_stamp_that_no_session_can_have_does_not_matter(csv_of, make_plan, tmp_path, year):
+    source = csv_of(angle=ANGLE, torque=TORQUE)
+    seconds = (year - 1970) * 365.2425 * 86_400
+    os.utime(source, (seconds, seconds))
+    begun_ns = time.time_ns()
+    done = import_record(source, tmp_path / "a.mcap", make_plan())
+    assert f"about the year {year}" in done.warnings[-1]
+    assert begun_ns <= read_session(done.path).start_utc_ns <= time.time_ns()
+
+
+def test_nothing_is_left_where_writing_fails_at_once(tmp_path):
+    samples = {"tick": np.arange(3), "angle_rad": np.zeros(3)}
+    with pytest.raises(Exception, match=r"."):
+        write_session(tmp_path / "a.mcap", samples, 1000.0, 2**64, {}, {}, ("a warning",))
+    assert list(tmp_path.iterdir()) == []
+
+
+def tdms_of(path, *channels):
+    tdms = pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
+    with tdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment([tdms.ChannelObject("g", *each) for each in channels])
+    return path
+
+
+START = np.datetime64("2026-11-25T12:00:00.000000")
+
+
+@pytest.mark.parametrize(("micros", "skip", "delay_s"), [(8000, 8, 0.0), (8300, 8, -3e-4)])
+def test_channels_that_begin_later_are_cut_and_the_rest_is_their_delay(
+    make_plan, tmp_path, micros, skip, delay_s
+):
+    later = START + np.timedelta64(micros, "us")
+    source = tdms_of(
+        tmp_path / "a.tdms",
+        ("angle", ANGLE[:-8], {"wf_increment": 1e-3, "wf_start_time": START}),
+        ("torque", TORQUE[8:], {"wf_increment": 1e-3, "wf_start_time": later}),
+    )
+    plan = make_plan("g/angle:rad", "g/torque:N.m", torque_delay_s=1e-3)
+    done = import_record(source, tmp_path / "a.mcap", plan)
+    session = read_session(done.path)
+    np.testing.assert_array_equal(session.samples["angle_rad"], ANGLE[skip:-8])
+    np.testing.assert_array_equal(session.samples["coupling_torque_nm"], TORQUE[8 : N - skip])
+    assert float(session.metadata["torque_delay_s"]) == pytest.approx(1e-3 + delay_s, abs=1e-9)
+    assert float(session.metadata["angle_delay_s"]) == 0.0
+    for word in ("12:00:00 and", f"12:00:00.{micros // 100:04d}".rstrip("0"), "8 of 'g/angle'"):
+        assert word in done.warnings[0]
+
+
+def test_channels_without_a_common_time_or_of_other_lengths_are_refused(make_plan, tmp_path):
+    hour = START + np.timedelta64(1, "h")
+    plan = make_plan("g/angle:rad", "g/torque:N.m")
+    for torque, properties, words in (
+        (TORQUE, {"wf_start_time": hour}, "12:00:00 and 'g/torque' at 2026-11-25T13:00:00"),
+        (TORQUE[1:], {}, "g/angle 4000, g/torque 3999"),
+    ):
+        source = tdms_of(
+            tmp_path / "a.tdms",
+            ("angle", ANGLE, {"wf_start_time": START}),
+            ("torque", torque, properties),
+        )
+        with pytest.raises(ExchangeError, match=words):
+            import_record(source, tmp_path / "a.mcap", plan)
+
+
+def test_a_scale_that_is_not_known_is_refused_by_name(make_plan, tmp_path):
+    scale = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Reciprocal"}
+    source = tdms_of(tmp_path / "a.tdms", ("angle", ANGLE), ("torque", TORQUE, scale))
+    with pytest.raises(ExchangeError, match=r"'g/torque' are raw.*Reciprocal"):
+        import_record(source, tmp_path / "a.mcap", make_plan("g/angle:rad", "g/torque:N.m"))
+    plan = make_plan("g/angle:rad", "g/torque:2 N.m", ignore_file_metadata=True)
+    session = read_session(import_record(source, tmp_path / "a.mcap", plan).path)
+    np.testing.assert_array_equal(session.samples["coupling_torque_nm"], 2 * TORQUE)
+    assert "Reciprocal" in session.metadata["import_ignored"]
+
+
+def test_the_default_rate_of_labview_gives_way(make_plan, tmp_path):
+    waveform = {"wf_increment": 1.0, "wf_start_offset": 0.0}
+    source = tdms_of(
+        tmp_path / "a.tdms",
+        ("when", TIME_S),
+        ("angle", ANGLE, waveform),
+        ("torque", TORQUE, waveform),
+    )
+    names = ("g/angle:rad", "g/torque:N.m")
+    with pytest.raises(
+        ExchangeError, match=r"at 1 Hz, which programs write.*--time.*--ignore-file"
+    ):
+        import_record(source, tmp_path / "a.mcap", make_plan(*names))
+    for name, plan in (
+        ("a.mcap", make_plan(*names, time="g/when:s")),
+        ("b.mcap", make_plan(*names, ignore_file_metadata=True)),
+    ):
+        done = import_record(source, tmp_path / name, plan)
+        assert done.rate_hz == 1000.0
+        assert "at 1 Hz" in done.warnings[0]
+
+
+def test_times_of_the_file_are_compared_with_the_rate(csv_of, make_plan, tmp_path):
+    for times, words in (
+        (2 * TIME_S, "'t' show 500 Hz, and 1000 Hz was stated; give --time 't:UNIT'"),
+        (np.where(np.arange(N) < 2000, TIME_S, TIME_S + 3e-3), "gaps of 3 samples"),
+        (np.concatenate([TIME_S[:2000], TIME_S[:2000]]), "'t' go back at sample 2001"),
+        (np.sort(np.append(TIME_S[:-1], TIME_S[70])), "'t' of sample 72 is that of the one before"),
+    ):
+        source = csv_of(t=times, angle=ANGLE, torque=TORQUE)
+        with pytest.raises(ExchangeError, match=words):
+            import_record(source, tmp_path / "a.mcap", make_plan())
+    source = csv_of(t=1e3 * TIME_S + 5, angle=ANGLE, torque=TORQUE)
+    assert import_record(source, tmp_path / "a.mcap", make_plan()).warnings == ()

@@ -117,12 +117,23 @@ def test_csv_of_one_column_is_one_angle_a_tick(tmp_path, heading):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "line 1 must name the columns"),
-        ("a,b\n1,2\n", "line 1 must name the columns"),
+        ("", "is empty"),
+        ("a,b\n1,2\n", "must name the columns time_s (s) and angle_rad (rad)"),
+        ("1,2\n3,4\n", "must name the columns time_s (s) and angle_rad (rad)"),
+        ("x\n1\n2\n", "must name the columns time_s (s) and angle_rad (rad)"),
         ("t,angle_rad\n1,2\n", "no time_s"),
-        ("time_s,angle_rad\n0,0\n1,x\n", "line 3: angle_rad is not a finite number"),
+        ("time_s,angle_rad\n0,0\n1,x\n", "line 3: 'angle_rad' is not a number;"),
+        ("time_s,angle_rad\n0,0\n\n1,\n2,3\n", "line 4: angle_rad is not a finite number"),
         ("time_s,angle_rad\n0,0\n1,nan\n", "line 3: angle_rad is not a finite number"),
-        ("time_s,angle_rad\n0,0\n1\n", "line 3 has no value in the column angle_rad"),
+        ("time_s,angle_rad\n0,0\n1\n", "line 3 has 1 cell"),
+        ("angle_rad\n0,000\n0,010\n", "line 2 has 2 cells between commas, and line 1 has 1 title"),
+        ("0,000\n0,010\n", "line 1: every second cell between commas looks like the decimals"),
+        ("angle_rad\n0\n0.1\n0,2\n", "line 4 has 2 cells"),
+        ("time_s,angle_rad\n0,0,0000\n2,0,0200\n", "line 2 has 3 cells"),
+        ("time_s;angle_rad\n0;0.5\n1;0,5\n", "line 2: 'angle_rad' has a decimal point,"),
+        ("time_s;angle_rad\ns;deg\n0;0.5\n1;0.5\n", "states another unit than rad"),
+        ("time_s;angle_rad\nms;rad\n0;0.5\n1;0.5\n", "states another unit than s"),
+        ("angle_rad\n0.5\n\n0.7\n", "line 3 is empty"),
         ("time_s,angle_rad\n1,0\n1,1\n", "line 3: time_s does not come after"),
         ("time_s,angle_rad\n0,0\n1e9,1\n", "2400 s is the most"),
         ("time_s,angle_rad\n-1e308,0\n1e308,1\n", "2400 s is the most"),
@@ -135,6 +146,36 @@ def test_bad_csv_files_are_refused_with_their_line(tmp_path, text, complaint):
     with pytest.raises(ExcitationError) as caught:
         from_csv(path, rate_hz=1000.0)
     assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("time_s;angle_rad\n0;0\n0,1;0,5\n", "utf-8"),
+        ("Winkel über Zeit\n\ntime_s\tangle_rad\ns\trad\n0\t0\n0,1\t0,5\n", "cp1252"),
+        ("sep=;\r\ntime_s;angle_rad;\r\n0;0;\r\n0.1;0.5\r\n", "utf-16"),
+        ("# time_s angle_rad\n0 0\n0.1 0.5\n", "utf-8-sig"),
+    ],
+)
+def test_other_separators_heads_and_encodings_are_read(tmp_path, text, encoding):
+    path = tmp_path / "path.csv"
+    path.write_bytes(text.encode(encoding))
+    excitation = from_csv(path, rate_hz=100.0, rest_s=0.0, ring_down_s=0.0)
+    np.testing.assert_allclose(excitation.reference_rad[[0, 5, 10]], [0, 0.25, 0.5], atol=1e-12)
+
+
+def test_text_of_a_file_is_not_quoted(tmp_path):
+    path = tmp_path / "bad.csv"
+    for text in (
+        "hush:x,angle_rad\n",
+        "hush:x\n",
+        "time_s,angle_rad\n0,1\nhush:x,2\n",
+        "1\nhush:x\n",
+    ):
+        path.write_text(text)
+        with pytest.raises(ExcitationError) as caught:
+            from_csv(path, rate_hz=1000.0)
+        assert "hush" not in str(caught.value)
 
 
 def test_only_plain_files_are_read(tmp_path):

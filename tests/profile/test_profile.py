@@ -89,6 +89,13 @@ def test_a_profile_of_the_working_directory_is_found(tmp_path, monkeypatch, sim_
     assert load_profile("mine").name == "mine"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_profile_may_begin_with_a_byte_order_mark(tmp_path, sim_toml, encoding):
+    path = tmp_path / "marked.toml"
+    path.write_text(sim_toml, encoding)
+    assert load_profile(path).text == sim_toml
+
+
 def test_an_unknown_name_lists_the_known_ones():
     how = r"no profile 'simm'; known profiles are .*sim.*by 'rigd profiles copy sim simm'"
     with pytest.raises(ProfileError, match=how):

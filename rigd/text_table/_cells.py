@@ -1,0 +1,222 @@
+"""Cells of a table: numbers with a decimal point or comma, units, dates, titles of times."""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Final
+
+POINT: Final = "."
+COMMA: Final = ","
+
+_UNSIGNED: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
+_NOT_FINITE: Final = r"nan|inf|infinity"
+_NUMBERS: Final = {
+    mark: re.compile(
+        rf"[-+]?(?:{_UNSIGNED.replace('{mark}', re.escape(mark))}|{_NOT_FINITE})",
+        re.ASCII | re.IGNORECASE,
+    )
+    for mark in (POINT, COMMA)
+}
+_GROUPED: Final = {
+    mark: re.compile(rf"[-+]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in (POINT, COMMA)
+}
+_UP_TO_THREE_DIGITS: Final = re.compile(r"[-+]?\d{1,3}")
+_DATE: Final = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([ T_].*)?|(.*\d)?\d:\d\d(:\d.*)?")
+_DECIMALS: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
+_LEADING_ZERO: Final = re.compile(r"0\d+.*")
+_WHOLE: Final = re.compile(r"[-+]?\d+")
+_COMMENT: Final = re.compile(r"\s*[#%]\s*")
+_IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+_PRODUCT: Final = re.compile(r"[\s.·⋅*-]")
+_AFTER_SLASH: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
+
+_TIME_TITLE: Final = re.compile(
+    r"(?:t|time|times|zeit|temps|tiempo|tempo|x_value|timestamps?|"
+    r"(?:rel\w*|abs\w*|elapsed|sample|sampling|measurement)[ _]time)"
+    r"(?=$|[\s\[(/,:_])",
+    re.IGNORECASE,
+)
+
+TIME_UNITS_S: Final = {
+    "s": 1.0,
+    "sec": 1.0,
+    "secs": 1.0,
+    "second": 1.0,
+    "seconds": 1.0,
+    "sekunden": 1.0,
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "millisecond": 1e-3,
+    "milliseconds": 1e-3,
+    "us": 1e-6,
+    "usec": 1e-6,
+    "microsecond": 1e-6,
+    "microseconds": 1e-6,
+    "ns": 1e-9,
+    "nsec": 1e-9,
+    "min": 60.0,
+    "minutes": 60.0,
+    "h": 3600.0,
+}
+"""Spellings of units of time, in seconds."""
+
+_OTHER_UNITS: Final = (
+    "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",
+    "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre",
+    "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm",
+    "m", "cm", "g", "kg", "hz", "khz", "rpm", "1/min", "%", "count", "counts", "digit", "digits",
+    "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc",
+    "k", "pa", "bar", "pu", "w",
+)  # fmt: skip
+"""Other units that a row of units may have, in small letters and without signs of a product."""
+
+
+def is_number(cell: str, mark: str) -> bool:
+    """Whether a cell is a number with that decimal sign, or NaN or an infinity by name."""
+    return _NUMBERS[mark].fullmatch(cell.strip()) is not None
+
+
+def is_any_number(cell: str) -> bool:
+    """Whether a cell is a number with a decimal point or a decimal comma."""
+    return is_number(cell, POINT) or is_number(cell, COMMA)
+
+
+def number_of(cell: str, mark: str) -> float:
+    """Return the number of a cell; NaN where it is empty.
+
+    Raises
+    ------
+    ValueError
+        If it is not a number with that decimal sign.
+    """
+    text = cell.strip()
+    if not text:
+        return float("nan")
+    if not is_number(text, mark):
+        raise ValueError(text)
+    return float(text.replace(COMMA, POINT))
+
+
+def quick_reader(mark: str) -> Callable[[str], float]:
+    """Return the quickest function from a cell to its number; it raises ValueError if in doubt."""
+    return float if mark == POINT else _with_comma
+
+
+def _with_comma(cell: str) -> float:
+    if POINT in cell:
+        raise ValueError(cell)
+    return float(cell.replace(COMMA, POINT))
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell looks like a date or a time of day."""
+    return _DATE.fullmatch(cell.strip()) is not None
+
+
+class ThousandsWatch:
+    """Watch over one column whose decimal signs could be separators between thousands.
+
+    Every cell that has the sign has exactly three digits behind it, and none a leading zero. Such a
+    column is in doubt if other cells of it, below 1000, have no sign.
+    """
+
+    def __init__(self, mark: str) -> None:
+        self._mark = mark
+        self.grouped_line = 0
+        self.plain = False
+
+    def settles(self, cell: str, line: int) -> bool:
+        """Take a cell; return whether it shows that the sign is a decimal sign."""
+        text = cell.strip()
+        if self._mark not in text:
+            self.plain = self.plain or _UP_TO_THREE_DIGITS.fullmatch(text) is not None
+            return False
+        if not _GROUPED[self._mark].fullmatch(text):
+            return True
+        self.grouped_line = self.grouped_line or line
+        return False
+
+
+def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether cells between commas are halves of numbers with decimal commas: 0,025 as 0 and 025.
+
+    In every line there is an even number of cells without a decimal sign, the second of each pair
+    without a sign and somewhere with a leading zero, which no whole number is written with.
+    """
+    zeros = False
+    for row in rows:
+        second = [cell.strip() for cell in row[1::2]]
+        if not row or len(row) % 2 or not all(map(_DECIMALS.fullmatch, second)):
+            return False
+        if not all(_WHOLE.fullmatch(cell.strip()) for cell in row[::2]):
+            return False
+        zeros = zeros or any(_LEADING_ZERO.fullmatch(cell) for cell in second)
+    return zeros
+
+
+# Titles and units
+
+
+def without_comment_mark(cell: str) -> str:
+    """Return a title without the mark that numpy or MATLAB put in front of the line."""
+    return _COMMENT.sub("", cell, count=1) if _COMMENT.match(cell) else cell
+
+
+def is_comment(row: Sequence[str]) -> bool:
+    """Whether a line is a comment, or a rule of dashes or the like below the titles."""
+    text = "".join(row).strip()
+    return _COMMENT.match(text) is not None or set(text) <= set("-=_+|*: ")
+
+
+def stated_unit_of(title: str) -> str:
+    """Return what a title states of the unit, "" if nothing: ``Angle [deg]``, ``t/ms``.
+
+    Parameters
+    ----------
+    title : str
+        Title of a column. What stands in square brackets counts; in round ones, or behind a slash,
+        a comma or the word "in", only what is known as a unit.
+
+    Examples
+    --------
+    >>> from rigd.text_table import stated_unit_of
+    >>> stated_unit_of("Angle [deg]"), stated_unit_of("t/ms"), stated_unit_of("Rig/Angle")
+    ('deg', 'ms', '')
+    """
+    found = _IN_BRACKETS.search(title) or _AFTER_SLASH.search(title)
+    if found is None:
+        return ""
+    is_stated = is_unit(found[1]) or found[0].startswith("[")
+    return found[1].strip() if is_stated else ""
+
+
+def is_unit(cell: str) -> bool:
+    """Whether a cell of a row of units is one, with brackets or without."""
+    return _plain_unit(cell) in TIME_UNITS_S or _plain_unit(cell) in _OTHER_UNITS
+
+
+def bare_unit(cell: str) -> str:
+    """Return a unit without the brackets around it."""
+    text = cell.strip()
+    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()", "<>") else text
+
+
+def _plain_unit(cell: str) -> str:
+    return _PRODUCT.sub("", bare_unit(cell).lower().replace("µ", "u").replace("μ", "u"))
+
+
+def is_row_of_units(row: Sequence[str], columns: Sequence[int]) -> bool:
+    """Whether a line below the titles has units: one at least is known, and none is a number."""
+    cells = [cell.strip() for cell in row]
+    if any(is_any_number(cell) for cell in cells if cell and cell != "1"):
+        return False
+    return any(is_unit(row[column]) for column in columns if column < len(row))
+
+
+def is_title_of_times(title: str) -> bool:
+    """Whether a title is that of a column of times."""
+    return _TIME_TITLE.match(title.strip()) is not None
+
+
+def time_unit_s(unit: str) -> float | None:
+    """Return the size of a unit of time in seconds, None if it is not one that is known."""
+    return TIME_UNITS_S.get(_plain_unit(unit))
