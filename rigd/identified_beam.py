@@ -353,9 +353,10 @@ def _offsets(where: str, values: Mapping[str, float]) -> tuple[float, ...]:
     found = {int(n[len(_OFFSET) :]): value for n, value in values.items() if _of(n) == _OFFSET}
     modes = range(2, 2 + len(found))
     if sorted(found) != list(modes):
+        given = ", ".join(map(str, sorted(found)))
         raise IdentifiedBeamError(
-            f"{where}.parameters: {_OFFSET}… are those of modes {', '.join(map(str, sorted(found)))}"
-            f", but must be those of modes 2 to {modes[-1]}; {_REMEDY}."
+            f"{where}.parameters: {_OFFSET}… are those of modes {given}, but must be those of "
+            f"modes 2 to {modes[-1]}; {_REMEDY}."
         )
     return tuple(found[mode] for mode in modes)
 
@@ -364,18 +365,18 @@ def _mode_uncertainty(where: str, modes: object) -> tuple[float, ...]:
     """Return the relative standard uncertainty of the poles of modes 1, 2, …."""
     found: list[float] = []
     for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
-        numbers = [
-            (finite_number(of.get("value")), _of_mode(of))
+        given = entry if isinstance(entry, dict) else {}
+        hz, ratio = (
+            of if isinstance(of := given.get(name), dict) else {}
             for name in ("frequency_hz", "damping_ratio")
-            if isinstance(entry, dict) and isinstance(of := entry.get(name), dict)
-        ]
-        if len(numbers) < 2 or entry.get("mode") != number or not numbers[0][0]:
+        )
+        value_hz = finite_number(hz.get("value"))
+        if not value_hz or not ratio or given.get("mode") != number:
             raise IdentifiedBeamError(
                 f"{where}.modes[{number - 1}] is not mode {number} with frequency_hz and "
                 f"damping_ratio; {_REMEDY}."
             )
-        (hz, hz_std), (_, ratio_std) = numbers
-        found.append(hypot(hz_std / hz, ratio_std))
+        found.append(hypot(_of_mode(hz) / value_hz, _of_mode(ratio)))
     return tuple(found)
 
 

@@ -234,9 +234,7 @@ def realise(
     True
     """
     _check_passive(damping)
-    loaded = LoadedBeam(
-        beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets
-    )
+    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets)
     poles, modes = _poles(loaded, beam if modes_of is None else modes_of)
     zeros = _zeros(loaded)
     landmarks = np.concatenate([poles[poles.imag > 0], zeros])

@@ -246,12 +246,25 @@ class LoadedBeam:
 
     def tip_slope(self, s: Complex) -> Complex:
         """Slope of the tip against the root per motor angle, of the shape of `s`."""
+        return self.tip_response(s)[1]
+
+    def tip_response(self, s: Complex) -> tuple[Complex, Complex]:
+        """Displacement (m/rad) and slope of the tip per motor angle, against the root's line.
+
+        Parameters
+        ----------
+        s
+            As for `transfer`.
+        """
         self._uniform()
         grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
-        slope = grid.per_angle(tip, 1) - 1
+        displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
         if self.tip_mass_kg:
-            slope = slope + grid.per_force(tip, tip, 1) * self._push(s, grid)
-        return slope / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+            push = self._push(s, grid)
+            displacement = displacement + grid.per_force(tip, tip) * push
+            slope = slope + grid.per_force(tip, tip, 1) * push
+        root = 1 / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+        return displacement * root, slope * root
 
     def _push(self, s: Complex, grid: PointForceGrid) -> Complex:
         """Force on the tip, per angle of the root, of what accelerates the mass there."""
@@ -384,9 +397,9 @@ class LoadedBeam:
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
         found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
-        if self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0:
-            if not zeros or not offsets.any():
-                return found
+        rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if rigid and not (zeros and offsets.any()):
+            return found
         known = ~np.isnan(found[:, 0])
         # One of a conjugate pair will do; where the decay does not oscillate both have to be found.
         turning = found[known][:, 0].imag != 0
