@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import poles
+from rigd.beam import LoadedBeam, clamped_free_eigenvalues, poles
 from rigd.excitation import quintic
 from rigd.profile import Profile, load_profile
 from rigd.runner import excitation_for, plan_session
@@ -76,6 +76,15 @@ def run(profile: Path, *arguments: str) -> Path:
     return Path(json.loads(done.stdout)["sessions"][0]["path"])
 
 
+def own_poles(profile: Profile) -> NDArray[np.complex128]:
+    """Poles of the first modes of the beam that is simulated."""
+    rig = profile.rig
+    assert rig.simulation is not None
+    ends = rig.simulation.tip_mass_kg, rig.simulation.clamp_compliance_rad_per_nm
+    own = LoadedBeam(rig.beam, rig.damping, *ends)
+    return own.poles(clamped_free_eigenvalues(_MODES))[:, 0]
+
+
 def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
     """Torque of the modes left after the sweep, and the peak of the motor's torque."""
     found = read_session(session)
@@ -84,7 +93,7 @@ def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
     torque = found.samples["coupling_torque_nm"]
     first, last = (end + round(rate_hz * s) for s in _FITTED_S)
     t = np.arange(last - first) / rate_hz
-    ringing = poles(profile.rig.beam, profile.rig.damping, _MODES)[:, 0]
+    ringing = own_poles(profile)
     waves = np.exp(np.outer(t, ringing))
     slow = np.exp(-np.outer(t, _FADING_PER_S))
     columns = np.column_stack([waves.real, waves.imag, slow])
