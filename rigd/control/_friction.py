@@ -65,35 +65,32 @@ def simulate_disturbed(
     """
     realisation, settings = loop.realisation, loop.model.settings
     assert realisation is not None
-    noise = np.random.default_rng(seed)
     command, angle_cut, torque_cut = loop.cuts
-    step_rad = disturbances.encoder_step_rad
-    place_rad = step_rad * noise.uniform(-0.5, 0.5, draws)
-    # By control setting, not by disturbance: the controller compensates what it was set to.
-    speed = np.zeros(loop.b.size)
-    n = reference_rad.size
-    angle_rad = np.empty((n, draws))
-    first = 2 + 2 * np.array([np.flatnonzero(realisation.modes == k)[0] for k in range(modes)])
-    weight = np.hypot(realisation.c[first - 2], realisation.c[first - 1])[:, None]
-    amplitude = np.empty((n, modes, draws))
-    velocity, pushed = loop.c[1], loop.shaft_torque
-    per_torque = velocity @ pushed
-    x = np.zeros((loop.b.size, draws))
+    n, step_rad = reference_rad.size, disturbances.encoder_step_rad
+    random = np.random.default_rng(seed)
+    place_rad = step_rad * random.uniform(-0.5, 0.5, draws)
+    noise = random.normal(0.0, disturbances.torque_noise_nm, (n, draws))
+    actions = np.stack([loop.b, command.action, torque_cut.action, angle_cut.action], axis=1)
     rows = np.stack([loop.c[0], angle_cut.reading, loop.c[3]])
+    velocity, pushed = loop.c[1], loop.shaft_torque[:, None]
+    per_torque = float(velocity @ loop.shaft_torque)
+
+    angle_rad, inputs = np.empty((n, draws)), np.zeros((4, draws))
+    # The pairs of states of the modes follow angle and velocity.
+    pairs = slice(2, 2 + 2 * modes)
+    in_modes = np.empty((n, 2 * modes, draws))
+    x = np.zeros((loop.b.size, draws))
     for tick, reference in enumerate(reference_rad):
         angle_rad[tick], reading, speed = rows @ x
-        amplitude[tick] = weight * np.hypot(x[first], x[first + 1])
+        in_modes[tick] = x[pairs]
+        inputs[0] = reference
         speed = (speed + loop.d[3] * reference) / settings.friction_velocity_rad_s
-        compensation = settings.friction_compensation_nm * np.tanh(speed)
-        x = loop.a @ x
-        x += (loop.b * reference)[:, None]
-        x += np.outer(command.action, compensation)
-        x += np.outer(torque_cut.action, noise.normal(0.0, disturbances.torque_noise_nm, draws))
+        inputs[1] = settings.friction_compensation_nm * np.tanh(speed)
+        inputs[2] = noise[tick]
         if step_rad:
-            rounded = step_rad * np.round((reading + place_rad) / step_rad) - place_rad
-            x += np.outer(angle_cut.action, rounded - reading)
-        friction = np.clip(
-            (velocity @ x) / per_torque, -disturbances.coulomb_nm, disturbances.coulomb_nm
-        )
-        x -= np.outer(pushed, friction)
-    return DisturbedResponse(angle_rad, amplitude)
+            inputs[3] = step_rad * np.rint((reading + place_rad) / step_rad) - place_rad - reading
+        x = loop.a @ x + actions @ inputs
+        friction = (velocity @ x) / per_torque
+        x -= pushed * friction.clip(-disturbances.coulomb_nm, disturbances.coulomb_nm)
+    weight = np.hypot(*realisation.c[: 2 * modes].reshape(-1, 2).T)[:, None]
+    return DisturbedResponse(angle_rad, weight * np.hypot(in_modes[:, ::2], in_modes[:, 1::2]))

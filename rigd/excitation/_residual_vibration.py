@@ -19,9 +19,9 @@ _FOLLOWED_S: Final = 1.0
 """Time after the reference for which the motion is simulated."""
 _SEEN_FOR_S: Final = 1.0
 """Shortest ring-down for which the floor of the sensor is stated."""
-_EXCEEDED_1_IN_20: Final = 6.0
-"""Square of the amplitude that noise exceeds once in 20 times, over the variance of its cosine and
-of its sine: exp(-a²/2) = 0.05."""
+_EXCEEDED_1_IN_100: Final = 9.21
+"""Square of the amplitude that noise exceeds once in 100 times, over the variance of its cosine and
+of its sine: exp(-a²/2) = 0.01."""
 
 
 class DisturbedRig(Protocol):
@@ -53,7 +53,8 @@ class MoveEnd:
     """What follows the reference of a move.
 
     The vibration is the root of the sum of squares of the amplitudes of the modes below
-    `ROBUST_BELOW_HZ`, in the coupling torque; those above have decayed before the motor is there.
+    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference; the modes above have
+    decayed when the motor has arrived.
     """
 
     arrival_s: float | None
@@ -62,8 +63,8 @@ class MoveEnd:
     residual_nm: float
     """Vibration that is left, with friction, encoder steps and noise of the sensor."""
     floor_nm: float
-    """Vibration that the noise of the sensor alone makes one read from the ring-down, exceeded in
-    one of 20: less cannot be seen."""
+    """Vibration that the noise of the sensor alone makes one read from the ring-down after the
+    arrival, exceeded in one of 100: less cannot be seen."""
 
 
 def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
@@ -89,13 +90,13 @@ def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> M
     angle, torque = rig.disturbed(np.concatenate([[0.0], reference_rad, held]), ringing.size)
     away = np.flatnonzero((np.abs(angle - reference_rad[-1]) > ARRIVED_RAD).any(axis=1))
     arrived = int(away[-1]) + 1 if away.size else 0
-    amplitude = torque[measured] * np.exp(decay_per_s * (measured - arrived) / rate_hz)[:, None]
-    seen_s = max(ring_down_s, _SEEN_FOR_S)
+    amplitude = torque[measured] * np.exp(decay_per_s * (measured - end) / rate_hz)[:, None]
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
-    power = (1 - np.exp(-2 * decay_per_s * seen_s)) / (4 * decay_per_s) * rate_hz
-    variance = rig.torque_noise_nm**2 / power
+    first_s, last_s = max(arrived - end, 0) / rate_hz, max(ring_down_s, _SEEN_FOR_S)
+    decayed = [np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))]
+    variance = rig.torque_noise_nm**2 * 4 * decay_per_s / (decayed[0] - decayed[1]) / rate_hz
     return MoveEnd(
         arrival_s=arrived / rate_hz if arrived < angle.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_20 * variance.sum())),
+        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_100 * variance.sum())),
     )
