@@ -8,8 +8,8 @@ each. The torque of the modes left is the root sum of squares of the amplitudes 
 modes, fitted with the rig's own poles to 4 s of the ring-down, beside decaying exponentials for
 what the fractional damping remembers, which is no vibration.
 
-The controller feeds the sensor's noise forward, so that the beam vibrates a little even while the
-motor only holds: that is measured first. Each move is therefore run once more without that noise.
+The noise of the sensor alone makes one read an amplitude: what a motor that only holds shows is
+measured first, and each move is run once more without that noise.
 
 Printed per move: time, in ms and in periods of mode 1; the torque left with the sensor's noise and
 without, and that of the quintic without it, in mN·m; the ratio of the last two; the peak torque

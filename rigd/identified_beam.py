@@ -125,7 +125,7 @@ MOVE: Final = Use(
 TOUCH: Final = Use(
     "a search for touches",
     frozenset(),
-    frozenset({*_NEEDED, "tool_inertia_kg_m2", "delay_s"}),
+    frozenset(_NEEDED),
 )
 """A touch is located by the exact model of a uniform beam with a free tip on a rigid clamp."""
 

@@ -61,7 +61,7 @@ def simulate_disturbed(
     draws
         Number of realisations of the noise, and of where in a step of the encoder the motor stands.
     seed
-        Of these draws.
+        Seed of the draws.
     """
     realisation, settings = loop.realisation, loop.model.settings
     assert realisation is not None

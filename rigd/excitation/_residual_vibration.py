@@ -19,9 +19,9 @@ _FOLLOWED_S: Final = 1.0
 """Time after the reference for which the motion is simulated."""
 _SEEN_FOR_S: Final = 1.0
 """Shortest ring-down for which the floor of the sensor is stated."""
-_EXCEEDED_1_IN_100: Final = 9.21
-"""Square of the amplitude that noise exceeds once in 100 times, over the variance of its cosine and
-of its sine: exp(-a²/2) = 0.01."""
+_EXCEEDED_1_IN_1000: Final = 13.8
+"""Square of the amplitude that noise exceeds once in 1000 times, over the variance of its cosine
+and of its sine: exp(-a²/2) = 0.001."""
 
 
 class DisturbedRig(Protocol):
@@ -64,7 +64,7 @@ class MoveEnd:
     """Vibration that is left, with friction, encoder steps and noise of the sensor."""
     floor_nm: float
     """Vibration that the noise of the sensor alone makes one read from the ring-down after the
-    arrival, exceeded in one of 100: less cannot be seen."""
+    arrival, exceeded in one of 1000: less cannot be seen."""
 
 
 def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
@@ -98,5 +98,5 @@ def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> M
     return MoveEnd(
         arrival_s=arrived / rate_hz if arrived < angle.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_100 * variance.sum())),
+        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_1000 * variance.sum())),
     )
