@@ -7,7 +7,7 @@ refused by name: nothing is dropped.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot, inf
+from math import hypot, inf, pi
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,7 +77,7 @@ _PARAMETERS: Final[Mapping[str, _Parameter]] = {
     ),
     "drag": _Parameter(
         "m",
-        words="drag of the air, which damps fast motions more than slow ones",
+        words="drag of the air",
         remedy="leave --model out, and expect more vibration than stated",
     ),
 }
@@ -289,7 +289,7 @@ def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
         known = _PARAMETERS[_of(name)]
         if not known.words or not value or _of(name) in use.effects:
             continue
-        corner_hz = 0.0 if "filter" not in name else 1.0 / (6.283185307179586 * value)
+        corner_hz = 0.0 if "filter" not in name else 1.0 / (2.0 * pi * value)
         remedy = known.remedy.format(
             corner_hz=corner_hz, order=2 if name.startswith("second") else 1
         )
@@ -306,7 +306,7 @@ def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
 
 
 def _refuse_findings(where: str, named: object, use: Use) -> None:
-    """Refuse what no parameter carries and what makes the beam another one from time to time."""
+    """Refuse findings that no parameter carries and that change the beam or doubt the record."""
     for number, entry in enumerate(named if isinstance(named, list) else []):
         what = entry.get("what") if isinstance(entry, dict) else None
         if what in _WITHOUT_EFFECT or what in _IN_PARAMETERS:
@@ -329,8 +329,8 @@ def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) ->
         return any_rig
     deviation = _deviation(entry)
     # Of a move the damping is in the uncertainty of the modes.
-    needless = use is MOVE and not _PARAMETERS[_of(name)].words
-    if _of(name) not in use.certain and (deviation is not None or needless):
+    in_modes = use is MOVE and not _PARAMETERS[_of(name)].words
+    if _of(name) not in use.certain and (deviation is not None or in_modes):
         return deviation
     raise IdentifiedBeamError(
         f"{where}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
