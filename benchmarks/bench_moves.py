@@ -8,8 +8,8 @@ each. The torque of the modes left is the root sum of squares of the amplitudes 
 modes, fitted with the rig's own poles to 4 s of the ring-down, beside decaying exponentials for
 what the fractional damping remembers, which is no vibration.
 
-The controller feeds the sensor's noise forward, so that the beam vibrates a little even while the
-motor only holds: that is measured first. Each move is therefore run once more without that noise.
+The noise of the sensor alone makes one read an amplitude: what a motor that only holds shows is
+measured first, and each move is run once more without that noise.
 
 Printed per move: time, in ms and in periods of mode 1; the torque left with the sensor's noise and
 without, and that of the quintic without it, in mN·m; the ratio of the last two; the peak torque
@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import poles
+from rigd.beam import LoadedBeam, clamped_free_eigenvalues, poles
 from rigd.excitation import quintic
 from rigd.profile import Profile, load_profile
 from rigd.runner import excitation_for, plan_session
@@ -76,6 +76,15 @@ def run(profile: Path, *arguments: str) -> Path:
     return Path(json.loads(done.stdout)["sessions"][0]["path"])
 
 
+def own_poles(profile: Profile) -> NDArray[np.complex128]:
+    """Poles of the first modes of the beam that is simulated."""
+    rig = profile.rig
+    assert rig.simulation is not None
+    ends = rig.simulation.tip_mass_kg, rig.simulation.clamp_compliance_rad_per_nm
+    own = LoadedBeam(rig.beam, rig.damping, *ends)
+    return own.poles(clamped_free_eigenvalues(_MODES))[:, 0]
+
+
 def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
     """Torque of the modes left after the sweep, and the peak of the motor's torque."""
     found = read_session(session)
@@ -84,7 +93,7 @@ def left_nm(session: Path, profile: Profile) -> tuple[float, float]:
     torque = found.samples["coupling_torque_nm"]
     first, last = (end + round(rate_hz * s) for s in _FITTED_S)
     t = np.arange(last - first) / rate_hz
-    ringing = poles(profile.rig.beam, profile.rig.damping, _MODES)[:, 0]
+    ringing = own_poles(profile)
     waves = np.exp(np.outer(t, ringing))
     slow = np.exp(-np.outer(t, _FADING_PER_S))
     columns = np.column_stack([waves.real, waves.imag, slow])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rigd.control import PidController, design_pid
 from rigd.excitation import chirp, slew, still_path
+from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview
 from rigd.sim import SimulatedRig
@@ -84,7 +85,7 @@ def with_rig(profile: Profile, **changes: object) -> Profile:
 def detection(touches: int) -> None:
     """Slew into obstacles of any place and stiffness at any speed."""
     profile = load_profile("sim")
-    poles = LoopPreview(profile).move_plant().poles_rad_s
+    poles = LoopPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(1)
     delays, peaks, missed = [], [], 0
     for number in range(touches):
@@ -132,7 +133,7 @@ def detection(touches: int) -> None:
 def free_motion(hours: float) -> None:
     """Slew, move and sweep without obstacles."""
     profile = load_profile("sim")
-    poles = LoopPreview(profile).move_plant().poles_rad_s
+    poles = LoopPreview(profile).move_plant("", TOUCH).poles_rad_s
     random = np.random.default_rng(2)
     false = ticks = 0
     number = 0

@@ -1,35 +1,133 @@
-"""The beam as an analysis identified it: read from the document of ``analyze --json``."""
+"""The beam as an analysis identified it: read from the document of ``analyze --json``.
+
+Every parameter and every finding of the document is either taken into account by who reads it, or
+refused by name: nothing is dropped.
+"""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import hypot, inf, pi
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, LoadedBeam
 from rigd.errors import UserError
 from rigd.runtime import open_plain_file
 from rigd.units import finite_number
 
 _MOST_BYTES: Final = 64_000_000
 _NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-_BELOW: Final = {"zeta": 1.0, "alpha": 2.0, "lambda": 2.0}
-_UNITS: Final = {
-    "zeta": "s^alpha",
-    "gamma": "s^lambda/m⁴",
-    "density_over_stiffness": "s²/m⁴",
-    "bending_stiffness_n_m2": "N·m²",
-    "tool_inertia_kg_m2": "kg·m²",
-    "delay_s": "s",
-}
-_READ: Final = ("alpha", "lambda", *_UNITS)
 _TWO_SIDED_95: Final = 1.959964
 _REMEDY: Final = "write it with analyze session.mcap --json model.json"
 
 
+@dataclass(frozen=True, slots=True)
+class _Parameter:
+    """A parameter of the document: its unit and its range."""
+
+    unit: str = ""
+    least: float = 0.0
+    below: float = inf
+    words: str = ""
+    """What it is, where it is no property of a uniform beam and ideal channels; else empty."""
+    remedy: str = ""
+    """How to get a document without it."""
+
+
+_OFFSET: Final = "stiffness_offset_"
+_STATE_FILTER: Final = (
+    "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), "
+    "record again and analyze that session"
+)
+_PARAMETERS: Final[Mapping[str, _Parameter]] = {
+    "zeta": _Parameter("s^alpha", below=1.0),
+    "alpha": _Parameter(below=2.0),
+    "gamma": _Parameter("s^lambda/m⁴"),
+    "lambda": _Parameter(below=2.0),
+    "density_over_stiffness": _Parameter("s²/m⁴"),
+    "bending_stiffness_n_m2": _Parameter("N·m²"),
+    "tool_inertia_kg_m2": _Parameter("kg·m²"),
+    "delay_s": _Parameter("s", least=-inf),
+    "tip_mass_kg": _Parameter(
+        "kg", words="a mass at the tip", remedy="take it off, and record and analyze again"
+    ),
+    "root_compliance_rad_per_nm": _Parameter(
+        "rad/(N·m)",
+        words="an elastic clamp",
+        remedy="tighten or stiffen the clamp, and record and analyze again",
+    ),
+    _OFFSET: _Parameter(
+        least=-0.9,
+        below=10.0,
+        words="a mode whose stiffness is not that of a uniform beam",
+        remedy="look for an added mass or a section that varies, and record and analyze again",
+    ),
+    "filter_time_constant_s": _Parameter(
+        "s", words="a low-pass filter of the torque", remedy=_STATE_FILTER
+    ),
+    "second_order_filter_time_constant_s": _Parameter(
+        "s", words="a low-pass filter of the torque", remedy=_STATE_FILTER
+    ),
+    "clock_rate_difference": _Parameter(
+        least=-1.0,
+        below=1.0,
+        words="clocks of different rates",
+        remedy="sample angle and torque by one clock, and record and analyze again",
+    ),
+    "drag": _Parameter(
+        "m",
+        words="drag of the air",
+        remedy="leave --model out, and expect more vibration than stated",
+    ),
+}
+"""All parameters that a document may have. A document with another one is refused, for nobody here
+knows what it changes."""
+
+_WITHOUT_EFFECT: Final = frozenset(
+    {"hum", "sensor drift", "ringing start", "knock", "clipping", "stop"}
+)
+"""Findings on one record, which the numbers were estimated with; where they make them doubtful,
+the numbers are flagged."""
+
+_IN_PARAMETERS: Final = frozenset(
+    {
+        *("delay", "tool inertia", "beam data", "not uniform", "elastic clamp", "tip mass"),
+        *("torque filter", "clock rate difference", "air drag", "rival explanations"),
+    }
+)
+"""Findings whose size is among the parameters."""
+
+
 class IdentifiedBeamError(UserError, ValueError):
     """A document holds no beam that can be used; the message names file, key and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """What a use of an identified beam takes into account, and which numbers it relies on."""
+
+    name: str
+    """As messages call it, such as "a move"."""
+    effects: frozenset[str]
+    """Parameters beyond the uniform beam and its channels that are taken into account."""
+    certain: frozenset[str]
+    """Parameters that must not be flagged, unless another standard deviation covers the doubt."""
+
+
+MOVE: Final = Use(
+    "a move",
+    frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
+    frozenset({*_NEEDED, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
+)
+"""A move without vibration depends on the modes, hardly on how their damping is made up."""
+
+TOUCH: Final = Use(
+    "a search for touches",
+    frozenset(),
+    frozenset(_NEEDED),
+)
+"""A touch is located by the exact model of a uniform beam with a free tip on a rigid clamp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,46 +137,84 @@ class IdentifiedBeam:
     beam: Beam
     """Length as given, stiffness and density as identified."""
     damping: Damping
-    """Damping as identified; none of a kind that the structure has not."""
+    """Damping as identified; a coefficient of 0 means that the structure has no such damping."""
     tool_inertia_kg_m2: float | None
     """Inertia between sensor and beam; None: it was not identified."""
     delay_s: float | None
     """Torque's age less the angle's; None: it was not identified."""
     std: Mapping[str, float]
-    """Standard deviations by the parameters' names in the document, as far as they are known."""
+    """Standard deviations by the parameters' names in the document, those that are known."""
+    tip_mass_kg: float = 0.0
+    """Point mass at the tip."""
+    root_compliance_rad_per_nm: float = 0.0
+    """By how much the clamp turns for a torque on the beam's root."""
+    stiffness_offsets: tuple[float, ...] = ()
+    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    mode_uncertainty: tuple[float, ...] = ()
+    """Relative standard uncertainty of the pole of each mode that the document lists."""
 
     @property
-    def frequency_uncertainty(self) -> float:
-        """Relative standard uncertainty of the modes' frequencies."""
-        return 0.5 * self.std.get(_NEEDED[0], 0.0) / self.beam.density_over_stiffness
+    def loaded_beam(self) -> LoadedBeam:
+        """The beam with its damping and what is at its ends."""
+        return LoadedBeam(
+            self.beam,
+            self.damping,
+            self.tip_mass_kg,
+            self.root_compliance_rad_per_nm,
+            self.stiffness_offsets,
+        )
+
+    def pole_uncertainty(self, modes: int) -> tuple[float, ...]:
+        """Return the relative standard uncertainty of the poles of some modes.
+
+        Parameters
+        ----------
+        modes
+            Number of modes, from the first on. One that the document does not list is taken to be
+            as uncertain as the most uncertain one that it does.
+        """
+        of_beam = 0.5 * self.std.get(_NEEDED[0], 0.0) / self.beam.density_over_stiffness
+        further = max(self.mode_uncertainty, default=of_beam)
+        return (*self.mode_uncertainty, *(further,) * modes)[:modes]
 
 
-def read_identified_beam(path: str | Path, length_m: float) -> IdentifiedBeam:
+def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
     """Read the parameters that an analysis headlines: of a campaign the pooled ones.
 
     Parameters
     ----------
     path
-        Document of ``analyze session.mcap --json``: ``headlines[].parameters``.
+        Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes`` and
+        ``named``.
     length_m
         Length of the beam, which no session shows.
+    use
+        What the beam is for: `MOVE` or `TOUCH`.
 
     Raises
     ------
     IdentifiedBeamError
-        If the file cannot be read, or has no such parameters.
+        If the file cannot be read or has no such parameters, if it has an effect or a finding that
+        this use does not take into account, or if a number that it relies on is flagged.
     """
     path = Path(path)
-    parameters = _parameters(path)
-    values = {name: _value(path, name, parameters[name]) for name in _READ if name in parameters}
+    where, headline = _headline(path)
+    parameters = headline["parameters"]
+    values = {name: _value(where, name, entry) for name, entry in parameters.items()}
     for name in _NEEDED:
         if name not in values:
             raise IdentifiedBeamError(
-                f"{path}: headlines[0].parameters.{name} is missing; take the document of an "
-                "analysis that found it (analyze session.mcap --json model.json)."
+                f"{where}.parameters.{name} is missing; take the document of an analysis that "
+                "found it (analyze session.mcap --json model.json)."
             )
+    _refuse_effects(where, values, use)
+    _refuse_findings(where, headline.get("named"), use)
+    std = {}
+    for name, entry in parameters.items():
+        deviation = _deviation_for(where, name, entry, use)
+        if deviation is not None:
+            std[name] = deviation
     density_over_stiffness, stiffness = (values[name] for name in _NEEDED)
-    deviations = {name: _deviation(parameters[name]) for name in values}
     return IdentifiedBeam(
         beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
         damping=Damping(
@@ -89,11 +225,16 @@ def read_identified_beam(path: str | Path, length_m: float) -> IdentifiedBeam:
         ),
         tool_inertia_kg_m2=values.get("tool_inertia_kg_m2"),
         delay_s=values.get("delay_s"),
-        std={name: std for name, std in deviations.items() if std is not None},
+        std=std,
+        tip_mass_kg=values.get("tip_mass_kg", 0.0),
+        root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
+        stiffness_offsets=_offsets(where, values),
+        mode_uncertainty=_mode_uncertainty(where, headline.get("modes")),
     )
 
 
-def _parameters(path: Path) -> Mapping[str, Any]:
+def _headline(path: Path) -> tuple[str, Mapping[str, Any]]:
+    """Return the headline of a document, and what messages call it."""
     try:
         with open_plain_file(path, _MOST_BYTES) as file:
             document = json.load(file)
@@ -102,29 +243,98 @@ def _parameters(path: Path) -> Mapping[str, Any]:
     except (ValueError, RecursionError) as error:
         raise IdentifiedBeamError(f"{path}: is not a JSON document; {_REMEDY}.") from error
     headlines = document.get("headlines") if isinstance(document, dict) else None
-    found = [each for each in headlines or [] if isinstance(each, dict)]
-    pooled = [each for each in found if each.get("file", "") is None]
-    parameters = next(iter(pooled + found), {}).get("parameters")
-    if not isinstance(parameters, dict):
+    if not isinstance(headlines, list):
+        headlines = []
+    found = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
+    pooled = [(k, each) for k, each in found if each.get("file", "") is None]
+    index, headline = next(iter(pooled + found), (0, {}))
+    if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_REMEDY}.")
-    return parameters
+    return f"{path}: headlines[{index}]", headline
 
 
-def _value(path: Path, name: str, entry: object) -> float:
+def _of(name: str) -> str:
+    """Return the name in `_PARAMETERS` of a parameter: that of a mode's offset without its mode."""
+    return _OFFSET if name.startswith(_OFFSET) and name[len(_OFFSET) :].isdecimal() else name
+
+
+def _value(where: str, name: str, entry: object) -> float:
     """Return the value of a parameter, of a size that the exact model takes."""
+    known = _PARAMETERS.get(_of(name))
+    if known is None or name == _OFFSET:
+        raise IdentifiedBeamError(
+            f"{where}.parameters.{name[:60]!r} is not known to this version, so what it changes "
+            "cannot be taken into account; update rigd, or leave out --model."
+        )
     given = entry.get("value") if isinstance(entry, dict) else None
     value = finite_number(given)
-    below = _BELOW.get(name, inf)
-    least = -inf if name == "delay_s" else 0.0
-    if value is not None and least <= value < below and (value > 0.0 or name not in _NEEDED):
+    in_range = value is not None and known.least <= value < known.below
+    if value is not None and in_range and (value > 0.0 or name not in _NEEDED):
         return value
-    bound = "more than 0" if name in _NEEDED else "any size" if least < 0 else "0 or more"
-    if below < inf:
-        bound += f" below {below:g}"
-    unit = f" {_UNITS[name]}" if name in _UNITS else ""
+    bound = "any size"
+    if known.least > -inf:
+        bound = "more than 0" if name in _NEEDED else f"{known.least:g} or more"
+    if known.below < inf:
+        bound += f" below {known.below:g}"
+    unit = f" {known.unit}" if known.unit else ""
     raise IdentifiedBeamError(
-        f"{path}: headlines[0].parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
+        f"{where}.parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
         f"must be a number of {bound}{unit}; {_REMEDY}."
+    )
+
+
+def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
+    """Refuse what the record shows with a uniform beam and the use does not take into account."""
+    for name, value in values.items():
+        known = _PARAMETERS[_of(name)]
+        if not known.words or not value or _of(name) in use.effects:
+            continue
+        corner_hz = 0.0 if "filter" not in name else 1.0 / (2.0 * pi * value)
+        remedy = known.remedy.format(
+            corner_hz=corner_hz, order=2 if name.startswith("second") else 1
+        )
+        unit = f" {known.unit}" if known.unit else ""
+        raise IdentifiedBeamError(
+            f"{where}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
+            f"{known.words}, which {use.name} does not take into account; {remedy}."
+        )
+    if values.get("tip_mass_kg") and any(values[n] for n in values if _of(n) == _OFFSET):
+        raise IdentifiedBeamError(
+            f"{where}.parameters: tip_mass_kg and {_OFFSET}… together are not defined; take the "
+            "document of an analysis that found one of them."
+        )
+
+
+def _refuse_findings(where: str, named: object, use: Use) -> None:
+    """Refuse findings that no parameter carries and that change the beam or doubt the record."""
+    for number, entry in enumerate(named if isinstance(named, list) else []):
+        what = entry.get("what") if isinstance(entry, dict) else None
+        if what in _WITHOUT_EFFECT or what in _IN_PARAMETERS:
+            continue
+        sentence = entry.get("sentence") if isinstance(entry, dict) else None
+        raise IdentifiedBeamError(
+            f"{where}.named[{number}]: {str(what)[:60]}, which {use.name} does not take into "
+            f"account ({str(sentence)[:200]}); remove its cause, and record and analyze again, or "
+            "leave out --model."
+        )
+
+
+def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
+    """Return the standard deviation of a parameter, which covers the doubt that a flag says."""
+    flag = entry.get("flag")
+    if flag is None:
+        return _deviation(entry)
+    any_rig = finite_number(entry.get("std_any_rig"))
+    if any_rig is not None and any_rig > 0:
+        return any_rig
+    deviation = _deviation(entry)
+    # Of a move the damping is in the uncertainty of the modes.
+    in_modes = use is MOVE and not _PARAMETERS[_of(name)].words
+    if _of(name) not in use.certain and (deviation is not None or in_modes):
+        return deviation
+    raise IdentifiedBeamError(
+        f"{where}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
+        "record a session that shows more modes or is longer and analyze it, or leave out --model."
     )
 
 
@@ -136,3 +346,40 @@ def _deviation(entry: Mapping[str, Any]) -> float | None:
         if low is not None and high is not None:
             return abs(high - low) / (2 * _TWO_SIDED_95)
     return std if std is not None and std > 0 else None
+
+
+def _offsets(where: str, values: Mapping[str, float]) -> tuple[float, ...]:
+    """Return the offsets of modes 2, 3, …, which a document has for each of them up to the last."""
+    found = {int(n[len(_OFFSET) :]): value for n, value in values.items() if _of(n) == _OFFSET}
+    modes = range(2, 2 + len(found))
+    if sorted(found) != list(modes):
+        given = ", ".join(map(str, sorted(found)))
+        raise IdentifiedBeamError(
+            f"{where}.parameters: {_OFFSET}… are those of modes {given}, but must be those of "
+            f"modes 2 to {modes[-1]}; {_REMEDY}."
+        )
+    return tuple(found[mode] for mode in modes)
+
+
+def _mode_uncertainty(where: str, modes: object) -> tuple[float, ...]:
+    """Return the relative standard uncertainty of the poles of modes 1, 2, …."""
+    found: list[float] = []
+    for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
+        given = entry if isinstance(entry, dict) else {}
+        hz, ratio = (
+            of if isinstance(of := given.get(name), dict) else {}
+            for name in ("frequency_hz", "damping_ratio")
+        )
+        value_hz = finite_number(hz.get("value"))
+        if not value_hz or not ratio or given.get("mode") != number:
+            raise IdentifiedBeamError(
+                f"{where}.modes[{number - 1}] is not mode {number} with frequency_hz and "
+                f"damping_ratio; {_REMEDY}."
+            )
+        found.append(hypot(_of_mode(hz) / value_hz, _of_mode(ratio)))
+    return tuple(found)
+
+
+def _of_mode(entry: Mapping[str, Any]) -> float:
+    any_rig = finite_number(entry.get("std_any_rig"))
+    return max(any_rig or 0.0, _deviation(entry) or 0.0)

@@ -1,9 +1,14 @@
-"""The beam of an analysis, from its JSON document."""
+"""The beam of an analysis, from its JSON document: what is used, and what is refused by name."""
+
+import json
 
 import pytest
 
-from rigd.identified_beam import IdentifiedBeamError, read_identified_beam
+from rigd.identified_beam import MOVE, TOUCH, IdentifiedBeamError, read_identified_beam
 from rigd.profile import load_profile
+
+LENGTH_M = 0.98
+OFFSETS = {"stiffness_offset_2": {"value": 0.03}, "stiffness_offset_3": {"value": -0.05}}
 
 
 @pytest.fixture
@@ -11,12 +16,27 @@ def profile():
     return load_profile("sim")
 
 
+def changed(path, **more):
+    """Change the headline of a document."""
+    document = json.loads(path.read_text())
+    document["headlines"][0].update(more)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def refusal(path, use):
+    with pytest.raises(IdentifiedBeamError) as refused:
+        read_identified_beam(path, LENGTH_M, use)
+    assert str(refused.value).startswith(f"{path}: headlines[0].")
+    return str(refused.value)
+
+
 def test_the_beam_of_an_analysis_is_read(analysed, profile):
-    found = read_identified_beam(analysed(), profile.rig.beam.length_m)
+    found = read_identified_beam(analysed(), profile.rig.beam.length_m, MOVE)
     assert found.damping == profile.rig.damping
     assert found.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
-    assert found.frequency_uncertainty == pytest.approx(1e-4)
-    undamped = read_identified_beam(analysed(zeta=None, alpha=None), 0.98)
+    assert found.pole_uncertainty(2) == pytest.approx((1e-4, 1e-4))
+    undamped = read_identified_beam(analysed(zeta=None, alpha=None), LENGTH_M, TOUCH)
     assert undamped.damping.zeta == 0.0
 
 
@@ -29,11 +49,13 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
         ({"bending_stiffness_n_m2": {"value": 0, "std": 0}}, "more than 0 N·m²"),
         ({"gamma": 3}, r"gamma\.value = null"),
         ({"gamma": {"value": 10**400, "std": 0.0}}, r"gamma\.value = 1000.* must be"),
+        ({"stiffness_offset_3": {"value": 0.1}}, "of modes 3, but must be those of modes 2 to 2"),
+        ({"tip_mass_kg": {"value": 1e-4}, **OFFSETS}, "together are not defined"),
     ],
 )
 def test_what_is_wrong_with_the_document_is_said(analysed, other, says):
     with pytest.raises(IdentifiedBeamError, match=says) as refused:
-        read_identified_beam(analysed(**other), 0.98)
+        read_identified_beam(analysed(**other), LENGTH_M, MOVE)
     assert "model.json" in str(refused.value)
 
 
@@ -42,6 +64,104 @@ def test_a_file_that_is_no_document_is_refused(tmp_path, text):
     path = tmp_path / "model.json"
     path.write_text(text)
     with pytest.raises(IdentifiedBeamError, match="analyze session"):
-        read_identified_beam(path, 0.98)
+        read_identified_beam(path, LENGTH_M, MOVE)
     with pytest.raises(IdentifiedBeamError, match="cannot be read"):
-        read_identified_beam(tmp_path / "none.json", 0.98)
+        read_identified_beam(tmp_path / "none.json", LENGTH_M, MOVE)
+
+
+@pytest.mark.parametrize(
+    ("effect", "read"),
+    [
+        ({"tip_mass_kg": {"value": 3e-4}}, (3e-4, 0.0, ())),
+        ({"root_compliance_rad_per_nm": {"value": 0.2}}, (0.0, 0.2, ())),
+        (OFFSETS, (0.0, 0.0, (0.03, -0.05))),
+    ],
+)
+def test_a_move_takes_the_ends_and_the_modes_and_a_touch_refuses_them(analysed, effect, read):
+    path = analysed(**effect)
+    loaded = read_identified_beam(path, LENGTH_M, MOVE).loaded_beam
+    found = loaded.tip_mass_kg, loaded.root_compliance_rad_per_nm, loaded.stiffness_offsets
+    assert found == read
+    refused = refusal(path, TOUCH)
+    assert f"parameters.{next(iter(effect))}.value = " in refused
+    assert "a search for touches does not take into account" in refused
+
+
+@pytest.mark.parametrize("use", [MOVE, TOUCH])
+@pytest.mark.parametrize(
+    ("effect", "says"),
+    [
+        (
+            {"filter_time_constant_s": {"value": 2e-3}},
+            "state it in the profile (sensor.filter_hz = 79.58, sensor.filter_order = 1)",
+        ),
+        ({"second_order_filter_time_constant_s": {"value": 2e-3}}, "sensor.filter_order = 2)"),
+        ({"clock_rate_difference": {"value": -2e-4}}, "clock_rate_difference.value = -0.0002: "),
+        ({"drag": {"value": 2e-3}}, "drag.value = 0.002 m: the analysis found drag of the air"),
+        ({"twist_rad": {"value": 0.0}}, "parameters.'twist_rad' is not known to this version"),
+        ({"stiffness_offset_": {"value": 0.0}}, "'stiffness_offset_' is not known"),
+    ],
+)
+def test_what_neither_accounts_for_is_refused_by_name(analysed, use, effect, says):
+    assert says in refusal(analysed(**effect), use)
+
+
+def test_an_effect_of_no_size_changes_nothing(analysed):
+    none = {"drag": {"value": 0.0}, "filter_time_constant_s": {"value": 0.0}}
+    assert read_identified_beam(analysed(**none), LENGTH_M, TOUCH).loaded_beam.plain
+
+
+@pytest.mark.parametrize("use", [MOVE, TOUCH])
+@pytest.mark.parametrize(
+    ("what", "accepted"),
+    [
+        *((what, True) for what in ("hum", "beam data", "delay", "rival explanations", "knock")),
+        *((what, False) for what in ("nonlinear stiffness", "play", "drifting stiffness")),
+        *((what, False) for what in ("unexplained", "unit", "of a later version", None)),
+    ],
+)
+def test_findings_that_no_parameter_carries_are_refused(analysed, use, what, accepted):
+    finding = {"what": what, "value": None, "interval_95": None, "sentence": "It was found."}
+    path = changed(analysed(), named=[{"what": "hum"}, finding])
+    if accepted:
+        read_identified_beam(path, LENGTH_M, use)
+    else:
+        assert f"named[1]: {what}, which {use.name} does not take" in refusal(path, use)
+
+
+def flagged(value, **more):
+    return {"value": value, "std": 0.1 * value, "flag": "another explanation fits", **more}
+
+
+def test_a_flagged_number_is_refused_unless_a_deviation_covers_it(analysed):
+    for name in ("density_over_stiffness", "bending_stiffness_n_m2"):
+        path = analysed(**{name: flagged(0.05)})
+        for use in (MOVE, TOUCH):
+            refused = refusal(path, use)
+            assert f"{name} is flagged (another explanation fits), and {use.name}" in refused
+        covered = analysed(**{name: flagged(0.05, std_any_rig=0.02)})
+        assert read_identified_beam(covered, LENGTH_M, TOUCH).std[name] == 0.02
+    assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE)
+
+
+def test_of_a_flagged_damping_a_touch_takes_the_deviation_if_there_is_one(analysed):
+    path = analysed(gamma=flagged(0.05, interval_95=[0.03, 0.07]))
+    assert read_identified_beam(path, LENGTH_M, TOUCH).std["gamma"] == pytest.approx(0.0102, 1e-2)
+    path = analysed(gamma={"value": 0.05, "std": None, "flag": "not identifiable"})
+    assert "gamma is flagged" in refusal(path, TOUCH)
+    assert "gamma" not in read_identified_beam(path, LENGTH_M, MOVE).std
+
+
+def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
+    def mode(number, hz_std, ratio_std, **more):
+        hz = {"value": 10.0, "std": hz_std, **more}
+        return {
+            "mode": number,
+            "frequency_hz": hz,
+            "damping_ratio": {"value": 0.01, "std": ratio_std},
+        }
+
+    modes = [mode(1, 0.03, 0.004), mode(2, 0.001, 0.0, std_any_rig=0.1)]
+    found = read_identified_beam(changed(analysed(), modes=modes), LENGTH_M, MOVE)
+    assert found.pole_uncertainty(3) == pytest.approx((0.005, 0.01, 0.01))
+    assert "modes[0] is not mode 1" in refusal(changed(analysed(), modes=[mode(2, 0, 0)]), MOVE)

@@ -194,6 +194,7 @@ def realise(
     max_relative_error: float = 1e-3,
     tip_mass_kg: float = 0.0,
     root_compliance_rad_per_nm: float = 0.0,
+    stiffness_offsets: tuple[float, ...] = (),
     modes_of: Beam | None = None,
 ) -> Realisation:
     """Real-time realisation of the beam.
@@ -204,6 +205,8 @@ def realise(
         Parameters of the exact model.
     tip_mass_kg, root_compliance_rad_per_nm
         Point mass at its tip, and by how much its clamp turns for a torque.
+    stiffness_offsets
+        Relative differences of the stiffness of modes 2, 3, … from the uniform beam's.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
     modes_of
@@ -231,7 +234,7 @@ def realise(
     True
     """
     _check_passive(damping)
-    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
+    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets)
     poles, modes = _poles(loaded, beam if modes_of is None else modes_of)
     zeros = _zeros(loaded)
     landmarks = np.concatenate([poles[poles.imag > 0], zeros])
@@ -270,7 +273,7 @@ def _check_passive(damping: Damping) -> None:
 
 def _exact(loaded: LoadedBeam, s: Complex) -> Complex:
     """Transfer function of the beam as it is, of the shape of s."""
-    if loaded.tip_mass_kg == 0 and loaded.root_compliance_rad_per_nm == 0:
+    if loaded.plain:
         return TransferGrid(s).evaluate(loaded.beam, loaded.damping)
     return loaded.transfer(np.asarray(s, dtype=np.complex128))
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
+from rigd.beam._tip_mass import LoadedBeam
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -44,7 +45,15 @@ class TipMotion:
     """Through still air: with what the root's turning adds."""
 
 
-def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) -> TipMotion:
+def tip_motion(
+    beam: Beam,
+    damping: Damping,
+    angle_rad: Real,
+    rate_hz: float,
+    *,
+    tip_mass_kg: float = 0.0,
+    root_compliance_rad_per_nm: float = 0.0,
+) -> TipMotion:
     """Predict the largest motion of the tip.
 
     Parameters
@@ -55,6 +64,8 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
         Motor angle from rest, shape (n,).
     rate_hz
         Samples a second.
+    tip_mass_kg, root_compliance_rad_per_nm
+        Point mass at the tip, and by how much the clamp turns for a torque.
 
     Examples
     --------
@@ -70,26 +81,34 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
     padded = _quick_length(int(np.ceil(_PADDED * n)))
     # On s = sigma + j omega what wraps round has decayed.
     sigma = _DECAY * rate_hz / padded
-    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz)
+    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
     growth = np.exp(sigma * np.arange(n) / rate_hz)
     # The angle stays where it ends: a jump back would ring at the last samples.
     angle = np.full(padded, angle_rad[-1] - angle_rad[0])
     angle[:n] = angle_rad - angle_rad[0]
     turned = np.fft.rfft(angle * np.exp(-sigma * np.arange(padded) / rate_hz))
-    displaced, sloped = np.empty((2, s.size), dtype=np.complex128)
+    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
+    displaced, sloped, root = np.ones((3, s.size), dtype=np.complex128)
     for start in range(0, s.size, _BLOCK):
         some = slice(start, start + _BLOCK)
-        displaced[some], sloped[some] = tip_response(beam, damping, s[some])
+        if loaded.plain:
+            displaced[some], sloped[some] = tip_response(beam, damping, s[some])
+            displaced[some] -= beam.length_m
+            sloped[some] -= 1
+        else:
+            displaced[some], sloped[some] = loaded.tip_response(s[some])
+            root[some] -= root_compliance_rad_per_nm * loaded.transfer(s[some])
     displaced *= turned
-    sloped = (sloped - 1) * turned
+    sloped *= turned
+    root *= turned
 
     def largest(spectrum: Complex) -> float:
         return float(np.max(np.abs(np.fft.irfft(spectrum, padded)[:n] * growth)))
 
     return TipMotion(
-        deflection_m=largest(displaced - beam.length_m * turned),
+        deflection_m=largest(displaced),
         slope_rad=largest(sloped),
-        speed_m_s=largest(s * displaced),
+        speed_m_s=largest(s * (displaced + beam.length_m * root)),
     )
 
 

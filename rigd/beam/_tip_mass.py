@@ -1,4 +1,4 @@
-"""Transfer function of the beam with a point mass at its tip and an elastic clamp, and its poles.
+"""Transfer function of the beam with a tip mass, an elastic clamp, or modes of their own stiffness.
 
 With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``q = z⁴ = -L⁴ p / c`` and the
 share ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`` turns Eq. 25 into::
@@ -12,17 +12,23 @@ F and U are functions of q alone; ``q d/dq`` of them needs one more, ``B = z (co
 sin z cosh z) / (1 + cos z cosh z)``::
 
     q F' = (F + U + F²) / 4,    q U' = U/2 + z² B/2 + U F/4
+
+A link that is not quite uniform has modes whose stiffness k⁴ differs from the uniform beam's by the
+share d. Mode i of the sum that G is (`rigd.beam._modes`) is then replaced by adding, with a² its
+participation::
+
+    G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
-from rigd.beam._modes import CLOSE_BY, poles_for_eigenvalues
+from rigd.beam._modes import CLOSE_BY, clamped_free_eigenvalues, poles_for_eigenvalues
 from rigd.beam._point_force import PointForceGrid
 
 Real = NDArray[np.float64]
@@ -146,7 +152,7 @@ def differentiated_response(
 
 @dataclass(frozen=True, slots=True)
 class LoadedBeam:
-    """Beam with a tip mass on an elastic clamp.
+    """Beam with a tip mass on an elastic clamp, uniform or with modes of their own stiffness.
 
     Attributes
     ----------
@@ -154,12 +160,28 @@ class LoadedBeam:
     damping : Damping
     tip_mass_kg : float
     root_compliance_rad_per_nm : float
+    stiffness_offsets : tuple of float
+        Relative differences of the stiffness of modes 2, 3, … from the uniform beam's. With them
+        the coupling torque is defined (`transfer`, `poles`, `zeros`), but not what lies along the
+        beam, and not together with a tip mass.
     """
 
     beam: Beam
     damping: Damping
     tip_mass_kg: float = 0.0
     root_compliance_rad_per_nm: float = 0.0
+    stiffness_offsets: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.tip_mass_kg and any(self.stiffness_offsets):
+            raise ValueError("A tip mass and modes of their own stiffness exclude each other.")
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is a uniform beam with a free tip on a rigid clamp."""
+        return not (
+            self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
+        )
 
     def transfer(self, s: Complex) -> Complex:
         """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
@@ -209,8 +231,14 @@ class LoadedBeam:
                 column[:] = -by[name]() / slope
         return moved
 
+    def _uniform(self) -> None:
+        """Refuse what only a uniform beam defines."""
+        if any(self.stiffness_offsets):
+            raise ValueError("Of modes of their own stiffness only the coupling torque is known.")
+
     def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
         """Give `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
+        self._uniform()
         at, by = differentiated_response(
             np.log(s), s * s, self.beam, self.damping, self.tip_mass_kg
         )
@@ -218,11 +246,25 @@ class LoadedBeam:
 
     def tip_slope(self, s: Complex) -> Complex:
         """Slope of the tip against the root per motor angle, of the shape of `s`."""
+        return self.tip_response(s)[1]
+
+    def tip_response(self, s: Complex) -> tuple[Complex, Complex]:
+        """Displacement (m/rad) and slope of the tip per motor angle, against the root's line.
+
+        Parameters
+        ----------
+        s
+            As for `transfer`.
+        """
+        self._uniform()
         grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
-        slope = grid.per_angle(tip, 1) - 1
+        displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
         if self.tip_mass_kg:
-            slope = slope + grid.per_force(tip, tip, 1) * self._push(s, grid)
-        return slope / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+            push = self._push(s, grid)
+            displacement = displacement + grid.per_force(tip, tip) * push
+            slope = slope + grid.per_force(tip, tip, 1) * push
+        root = 1 / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+        return displacement * root, slope * root
 
     def _push(self, s: Complex, grid: PointForceGrid) -> Complex:
         """Force on the tip, per angle of the root, of what accelerates the mass there."""
@@ -232,6 +274,7 @@ class LoadedBeam:
 
     def shear(self, s: Complex) -> Complex:
         """Force of the motor on the beam per motor angle in N/rad, of the shape of `s`."""
+        self._uniform()
         grid = PointForceGrid(s, self.beam, self.damping)
         shear = grid.shear_per_angle()
         if self.tip_mass_kg:
@@ -243,7 +286,49 @@ class LoadedBeam:
     def at(self, s: Complex) -> LoadedResponse:
         """Give what the clamp, were it rigid, would have to exert, with its derivatives."""
         elastic, inertial = self.factors(s)
-        return loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+        found = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+        if not any(self.stiffness_offsets):
+            return found
+        length, stiffness = self.beam.length_m, self.beam.bending_stiffness_n_m2
+        total, by_elastic, by_inertial = np.zeros((3, *np.shape(s)), dtype=np.complex128)
+        z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))[1:]
+        for k4, offset in zip((z / length) ** 4, self.stiffness_offsets, strict=True):
+            # a² EI k⁴, with the participation a² = 4 L³ / z⁴
+            weight, stiffer = 4 * stiffness / length, 1 + offset
+            before = 1 / (elastic * k4 + inertial)
+            after = 1 / (elastic * k4 * stiffer + inertial)
+            total += weight * inertial**2 * elastic * offset * before * after
+            by_elastic += weight * inertial**2 * (stiffer * after**2 - before**2)
+            by_inertial += weight * elastic**2 * k4 * ((stiffer * after) ** 2 - before**2)
+        return replace(
+            found,
+            response=found.response + total,
+            by_elastic=found.by_elastic + by_elastic,
+            by_inertial=found.by_inertial + by_inertial,
+        )
+
+    def residues(self, poles_rad_s: Complex) -> Complex:
+        """Residues of the coupling torque per angular acceleration, ``G(s) / s²``, at poles of it.
+
+        A mode whose pair of poles is p and its conjugate adds ``2 Re(r exp(p t))`` to the response
+        to a unit change of the angular velocity.
+
+        Parameters
+        ----------
+        poles_rad_s : ndarray of complex, shape (n,)
+            As of `poles`.
+
+        Returns
+        -------
+        ndarray of complex, shape (n,)
+            In N·m s.
+        """
+        # On a rigid clamp G is infinite at a pole, but next to it the ratio is as it should be.
+        aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
+        s = poles_rad_s * (1 - aside)
+        at = self.at(s)
+        residues: Complex = -(at.response**2) / self.slope(s, at) / s**2
+        return residues
 
     def factors(self, s: Complex) -> tuple[Complex, Complex]:
         """Elastic factor c and inertial factor p."""
@@ -306,8 +391,14 @@ class LoadedBeam:
 
     def _followed(self, z: Real, *, zeros: bool) -> Complex:
         """Follow poles or zeros from those of the bare beam."""
+        offsets = np.array(self.stiffness_offsets)
+        if not zeros and offsets.size:
+            # On a rigid clamp they are those of the stiffness k⁴ (1 + d), exactly.
+            z = z.copy()
+            z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
         found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
-        if self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0:
+        rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if rigid and not (zeros and offsets.any()):
             return found
         known = ~np.isnan(found[:, 0])
         # One of a conjugate pair will do; where the decay does not oscillate both have to be found.
@@ -319,6 +410,8 @@ class LoadedBeam:
         share = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         turned = self.beam.bending_stiffness_n_m2 / self.beam.length_m
         share = max(share, self.root_compliance_rad_per_nm * turned)
+        if zeros:
+            share = max(share, float(np.abs(offsets).max(initial=0.0)))
         steps = min(max(math.ceil(share / _SHARE_A_STEP), 2), _HOMOTOPY_STEPS)
         before = here
         for step in range(1, steps + 1):
@@ -328,6 +421,7 @@ class LoadedBeam:
                 self.damping,
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
+                tuple((fraction if zeros else 1.0) * offsets),
             )
             last = step == steps
             start = 2 * here - before if step > 1 else here

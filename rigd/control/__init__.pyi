@@ -7,6 +7,9 @@ from ._damper import DamperSettings as DamperSettings
 from ._damper import VibrationDamper as VibrationDamper
 from ._damper import damped_poles as damped_poles
 from ._damper import design_damper as design_damper
+from ._friction import Disturbances as Disturbances
+from ._friction import DisturbedResponse as DisturbedResponse
+from ._friction import simulate_disturbed as simulate_disturbed
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._pid import ControlDesignError as ControlDesignError

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rigd.beam import (
     Beam,
     Damping,
+    LoadedBeam,
     Realisation,
     couple,
     propagator,
@@ -85,6 +86,24 @@ class LoopModel:
     """Age of the coupling torque at the tick that uses it."""
     settings: ControlSettings
     """Settings of the controller."""
+    tip_mass_kg: float = 0.0
+    """Point mass at the beam's tip."""
+    root_compliance_rad_per_nm: float = 0.0
+    """By how much the clamp turns for a torque on the beam's root."""
+    stiffness_offsets: tuple[float, ...] = ()
+    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+
+    @property
+    def loaded_beam(self) -> LoadedBeam:
+        """The beam with what is at its ends; a loop without a beam has none."""
+        assert self.beam is not None
+        return LoadedBeam(
+            self.beam,
+            self.damping,
+            self.tip_mass_kg,
+            self.root_compliance_rad_per_nm,
+            self.stiffness_offsets,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,6 +156,10 @@ class ClosedLoop:
     """The torque command, the angle and the coupling torque as the controller reads them."""
     poles_rad_s: Complex
     """Its modes as poles in continuous time, the fastest growing (or slowest decaying) first."""
+    shaft_torque: Real
+    """(n,): what a torque of 1 N·m on the shaft, held for a period, adds to the next state."""
+    realisation: Realisation | None
+    """The beam, whose states follow angle and velocity in x; None: the motor alone."""
 
     @property
     def spectral_radius(self) -> float:
@@ -261,7 +284,17 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     """
     settings = model.settings
     gains = design_pid(model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad, settings.pole_rad_s)
-    realisation = None if model.beam is None else realise(model.beam, model.damping)
+    realisation = (
+        None
+        if model.beam is None
+        else realise(
+            model.beam,
+            model.damping,
+            tip_mass_kg=model.tip_mass_kg,
+            root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
+            stiffness_offsets=model.stiffness_offsets,
+        )
+    )
     plant = _Plant(model, realisation)
     n = plant.a.shape[0]
 
@@ -321,7 +354,17 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     d = np.array([0.0, 0.0, torque_from_reference, speed_from_reference, 0.0])
 
     poles = continuous_poles(a, model.rate_hz)
-    return ClosedLoop(a, b, c, d, model, cuts, poles[np.argsort(-poles.real)])
+    return ClosedLoop(
+        a,
+        b,
+        c,
+        d,
+        model,
+        cuts,
+        poles[np.argsort(-poles.real)],
+        np.append(plant.shaft_torque, np.zeros(4)),
+        realisation,
+    )
 
 
 def continuous_poles(a: Real, rate_hz: float) -> Complex:
@@ -469,6 +512,7 @@ class _Plant:
             return reading
 
         extended[:n] = advance(period_s)[0]
+        self.shaft_torque = np.append(propagator(coupled, period_s)[1], np.zeros(size - n))
         extended[n, size] = 1.0
         for command in range(1, commands):
             extended[n + command, n + command - 1] = 1.0

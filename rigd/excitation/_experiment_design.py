@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping
+from rigd.beam import SMALL_SLOPE_RAD, LoadedBeam
 from rigd.excitation._fisher_information import BeamEstimate, RecordSoFar
 from rigd.excitation._piece_search import LOOK_AHEAD_S, SHORTEST_S, Piece, PieceSearch
 from rigd.excitation._shortest_move import MovePlant
@@ -38,13 +38,13 @@ class DesignRig(Protocol):
     def start_rad(self) -> float:
         """Where the motor stands, from the rig's zero."""
 
-    def plant_with(self, beam: Beam, damping: Damping) -> MovePlant:
+    def plant_with(self, beam: LoadedBeam) -> MovePlant:
         """Return closed loop and limits with a beam in place of the profile's.
 
         Parameters
         ----------
-        beam, damping
-            The beam as estimated.
+        beam
+            The beam as estimated, with what is at its ends.
         """
 
 
@@ -106,7 +106,7 @@ def next_piece(
     quantities = Quantities.of(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is asked for; give for example --damping 1%.")
-    plant = rig.plant_with(estimate.beam, estimate.damping)
+    plant = rig.plant_with(estimate.loaded_beam)
     record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, LOOK_AHEAD_S)
     decision = PieceSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
@@ -165,7 +165,7 @@ def design_excitation(
     >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
     (True, True)
     """
-    plant = rig.plant_with(estimate.beam, estimate.damping)
+    plant = rig.plant_with(estimate.loaded_beam)
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     left_s = duration_s

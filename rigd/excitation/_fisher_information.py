@@ -218,6 +218,11 @@ class BeamEstimate:
         at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm
         if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
             return None
+        return self.loaded_beam
+
+    @property
+    def loaded_beam(self) -> LoadedBeam:
+        """The beam with what is at its ends."""
         return LoadedBeam(
             self.beam, self.damping, self.tip_mass_kg, self.root_compliance_rad_per_nm
         )

@@ -25,6 +25,7 @@ from rigd.excitation._moves import (
     quintic,
     zero_rows,
 )
+from rigd.excitation._residual_vibration import predict_end
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
     Excitation,
@@ -34,6 +35,7 @@ from rigd.excitation._signals import (
     lay_out_segments,
     within_a_turn,
 )
+from rigd.identified_beam import MOVE, IdentifiedBeam, Use
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -86,12 +88,17 @@ class MovePlant:
     """Ticks a second."""
     respond: Callable[[Real], Response]
     """Response of the closed loop to a reference (n,) from rest, without friction."""
+    disturbed: Callable[[Real, int], tuple[Real, Real]]
+    """Response to a reference (n,) from rest with friction, encoder steps and noise, in several
+    draws: angle (n, draws), and amplitude of the torque of the lowest modes (n, modes, draws)."""
     poles_rad_s: Complex
     """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
     torque_per_state_nm_s: Real
     """Shape (m,): amplitude of the coupling torque for what `modal_state` says of a mode."""
     frequency_uncertainty: Real
     """Shape (m,): relative standard uncertainty of the modes' frequencies."""
+    torque_noise_nm: float
+    """Standard deviation of the noise of one reading of the coupling torque."""
     settling_s: float
     """Time in which the loop follows up what the reference has done."""
     peak_torque_nm: float
@@ -108,6 +115,8 @@ class MovePlant:
     """Range of the sensor."""
     angle_rad: float
     """Limit of the angle from the rig's zero, either way."""
+    model: IdentifiedBeam | None = None
+    """Beam of an analysis; None: it is the profile's, or an estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +130,7 @@ class Move:
     share: float
     """Largest share of a limit that it is predicted to take; at most `SHARE_OF_LIMITS`."""
     residual_nm: float
-    """Coupling torque that the modes are predicted to swing with afterwards: the sum of their
+    """Coupling torque that the modes swing with afterwards in the linear loop: the sum of their
     amplitudes, each for a frequency that is wrong by its standard uncertainty."""
     quintic_residual_nm: float
     """The same of a quintic that takes the same time."""
@@ -471,13 +480,15 @@ class MoveRig(Protocol):
     def start_rad(self) -> float:
         """Where the motor stands, from the rig's zero."""
 
-    def move_plant(self, path: str | Path) -> MovePlant:
+    def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the rig for planning, with the beam of an analysis; without a path the profile's.
 
         Parameters
         ----------
         path
             Document of ``analyze --json``, or empty.
+        use
+            What the beam is for.
         """
 
 
@@ -516,8 +527,9 @@ def move(
     Raises
     ------
     ExcitationError
-        If not exactly one angle is given, the move would leave the limits, or the file is not what
-        it should be.
+        If not exactly one angle is given, or the move would leave the limits.
+    IdentifiedBeamError
+        If the file is not what it should be, or has what a move does not take into account.
     """
     if rig is None:
         raise ExcitationError("A move is planned for a rig; run it with its profile.")
@@ -531,7 +543,7 @@ def move(
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     within_a_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
-    plant = rig.move_plant(path)
+    plant = rig.move_plant(path, MOVE)
     farthest_rad = _FARTHEST * plant.angle_rad
     if not abs(target_rad) <= farthest_rad:
         raise ExcitationError(
@@ -547,6 +559,7 @@ def move(
         )
     planned = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
     segments = lay_out_segments(rate_hz, rest_s, planned.duration_s, ring_down_s)
+    end = predict_end(plant, planned.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
@@ -556,11 +569,15 @@ def move(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "limits_share": planned.share,
-        "residual_nm": planned.residual_nm,
+        "residual_nm": end.residual_nm,
+        "residual_floor_nm": end.floor_nm,
+        "frequency_residual_nm": planned.residual_nm,
         "quintic_residual_nm": planned.quintic_residual_nm,
     }
+    if end.arrival_s is not None:
+        parameters["arrival_s"] = end.arrival_s
     made = assemble("move", parameters, rate_hz, segments, planned.reference_rad)
-    return replace(made, stays=True)
+    return replace(made, stays=True, model=plant.model)
 
 
 def _by_at_most(farthest_rad: float, start_rad: float) -> str:

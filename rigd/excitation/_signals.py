@@ -14,6 +14,7 @@ from rigd.session import MAX_SAMPLES
 if TYPE_CHECKING:
     from rigd.excitation._touch_passes import Approach
     from rigd.excitation._until import PrecisionSearch
+    from rigd.identified_beam import IdentifiedBeam
 
 FloatArray = NDArray[np.float64]
 
@@ -52,6 +53,8 @@ class Excitation:
         What the loop does when it detects a touch; None: it does not look for one.
     search
         What is asked of a session that goes on until it has found it; None: its end is planned.
+    model
+        Beam of an analysis that it was made for; None: the profile's.
     """
 
     kind: str
@@ -62,6 +65,7 @@ class Excitation:
     stays: bool = False
     approach: "Approach | None" = None
     search: "PrecisionSearch | None" = None
+    model: "IdentifiedBeam | None" = None
 
     @property
     def shows_modes(self) -> bool:

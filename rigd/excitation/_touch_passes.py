@@ -6,7 +6,7 @@ the same stretch (`after_touch`): it brakes, stays, and goes back to where the p
 session has the same number of ticks whatever it meets. Neither way makes the beam ring.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
+from rigd.identified_beam import TOUCH
 
 Real = NDArray[np.float64]
 
@@ -109,6 +110,9 @@ def touch(
     ------
     ExcitationError
         If an option is not finite or out of range, or the rig cannot brake from that speed.
+    IdentifiedBeamError
+        If the file is not what it should be, or has what a search for touches does not take into
+        account.
     """
     if rig is None:
         raise ExcitationError("touch is made for a rig; none was given.")
@@ -128,7 +132,7 @@ def touch(
         raise ExcitationError(f"passes = {passes} must be at least 1.")
     at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
     check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
-    plant = rig.move_plant(path)
+    plant = rig.move_plant(path, TOUCH)
     out = slew(
         by_rad,
         speed_rad_s=speed_rad_s,
@@ -181,7 +185,8 @@ def touch(
         "braking_s": braking.duration_s,
     }
     sweep = np.tile(stretch, passes)
-    return assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
+    made = assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
+    return replace(made, model=plant.model)
 
 
 def after_touch(

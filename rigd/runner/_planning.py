@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from rigd.beam import (
     SMALL_SLOPE_RAD,
     Beam,
-    Damping,
+    LoadedBeam,
     RealisationError,
     TipMotion,
-    participation,
-    poles,
     tip_motion,
 )
 from rigd.control import (
@@ -38,8 +36,9 @@ from rigd.excitation import (
     Value,
     make_excitation,
 )
-from rigd.identified_beam import read_identified_beam
+from rigd.identified_beam import Use, read_identified_beam
 from rigd.profile import Profile
+from rigd.runner._move_plant import loop_model_with, mode_poles, move_plant_of, with_beam
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -49,17 +48,8 @@ _MOST_RAD = 2.0 * math.pi
 """Largest amplitude that an excitation takes."""
 _ROUNDS = 10
 """Steps of the search for the largest amplitude; three or four are needed."""
-_MOST_MODES = 6
-"""Modes that a move leaves at rest; those above are too weak to be seen."""
-_UNSURE = 0.01
-"""Relative uncertainty of the frequencies of a profile's beam, which nobody states."""
-_FILTERS = 1.2
-"""Acceleration of a move's reference over what the peak torque does to the motor alone: some more,
-for the loop follows it through its filters."""
 _GOING = ("move", "touch")
 """Excitations that go to an angle: they know where they start, and have no amplitude."""
-_SETTLED = 5.0
-"""Time constants of the loop in which it follows up a reference."""
 _NO_FORCE = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
     "(--force-limit) ends nothing, and points are less precise."
@@ -116,7 +106,7 @@ class LoopPreview:
     def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
         self._profile = profile
         self.start_rad = start_rad
-        self._estimated: tuple[Beam, Damping, MovePlant] | None = None
+        self._estimated: tuple[LoadedBeam, MovePlant] | None = None
 
     @property
     def beam(self) -> Beam:
@@ -143,7 +133,7 @@ class LoopPreview:
         firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
         return _share(firm + forcible)
 
-    def move_plant(self, path: str | Path = "") -> MovePlant:
+    def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the rig for planning a move.
 
         Parameters
@@ -151,21 +141,21 @@ class LoopPreview:
         path
             Document of ``analyze --json``, whose beam takes the place of the profile's; empty: the
             profile's.
+        use
+            What the beam is for.
 
         Raises
         ------
-        ExcitationError
-            If the document is not what it should be.
+        IdentifiedBeamError
+            If the document is not what it should be, or has what this use does not account for.
         ControlDesignError
             If the loop is unstable with that beam.
         RealisationError
             If its damping cannot be realised.
         """
-        if not path:
-            rig = self._profile.rig
-            return self._plant_with(rig.beam, rig.damping, _UNSURE)
-        found = read_identified_beam(path, self.beam.length_m)
-        return self._plant_with(found.beam, found.damping, found.frequency_uncertainty)
+        found = read_identified_beam(path, self.beam.length_m, use) if path else None
+        model = loop_model_with(self._profile, found)
+        return move_plant_of(self._profile, model, _sensor_limit_nm(self._profile), found)
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
         """Largest slope of the free end that is predicted for a reference (n,)."""
@@ -173,7 +163,7 @@ class LoopPreview:
         rig = self._profile.rig
         return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
 
-    def plant_with(self, beam: Beam, damping: Damping) -> MovePlant:
+    def plant_with(self, beam: LoadedBeam) -> MovePlant:
         """Return the rig with an estimated beam, for the design of excitation.
 
         Where the loop cannot be computed with its damping, that of the profile is taken: the motor
@@ -182,8 +172,8 @@ class LoopPreview:
 
         Parameters
         ----------
-        beam, damping
-            The beam as estimated.
+        beam
+            The beam as estimated, with what is at its ends.
 
         Raises
         ------
@@ -192,67 +182,17 @@ class LoopPreview:
         RealisationError
             If no damping can be realised.
         """
-        if self._estimated is not None and self._estimated[:2] == (beam, damping):
-            return self._estimated[2]
-        try:
-            plant = self._plant_with(beam, damping, _UNSURE)
-        except (ControlDesignError, RealisationError):
-            plant = self._plant_with(beam, self._profile.rig.damping, _UNSURE)
-        self._estimated = beam, damping, plant
-        return plant
-
-    def _plant_with(self, beam: Beam, damping: Damping, uncertainty: float) -> MovePlant:
+        if self._estimated is not None and self._estimated[0] == beam:
+            return self._estimated[1]
         profile = self._profile
-        model = replace(profile.loop_model(), beam=beam, damping=damping)
-        # tanh of the speed is not linear: its largest value is taken off the torque.
-        settings = replace(model.settings, friction_compensation_nm=0.0)
-        loop = close_loop(replace(model, settings=settings))
-        check_stability(loop)
-        ringing = mode_poles(loop)
-        # Torque of a mode of the beam for the angle's acceleration: a² rho omega sin(omega t).
-        omega = np.abs(ringing)
-        per_angle = participation(beam, ringing.size) * beam.density_kg_per_m * omega
-        motor = profile.control_motor
-        return MovePlant(
-            rate_hz=model.rate_hz,
-            respond=loop.simulate,
-            poles_rad_s=ringing,
-            torque_per_state_nm_s=per_angle * np.abs(loop.response(omega / (2.0 * math.pi))),
-            frequency_uncertainty=np.full(ringing.size, uncertainty),
-            settling_s=_SETTLED / settings.pole_rad_s,
-            peak_torque_nm=motor.peak_torque_nm,
-            friction_nm=profile.control.friction_compensation_nm,
-            largest_acceleration_rad_s2=_FILTERS * motor.peak_torque_nm / motor.inertia_kg_m2,
-            velocity_rad_s=profile.limits.velocity_rad_s,
-            tracking_error_rad=profile.limits.tracking_error_rad,
-            coupling_torque_nm=_sensor_limit_nm(profile),
-            angle_rad=profile.limits.angle_rad,
-        )
-
-
-def mode_poles(loop: ClosedLoop) -> Complex:
-    """Return the poles of a closed loop that are the modes of its beam, one of each pair.
-
-    What rings on while the motor is held is the closed loop: its poles lie near those of the beam
-    with locked hub, and where the loop damps them they differ.
-
-    Parameters
-    ----------
-    loop
-        Closed loop with a beam.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        In rad/s, of the lowest modes that oscillate and lie within reach of the ticks.
-    """
-    model = loop.model
-    assert model.beam is not None
-    locked = poles(model.beam, model.damping, _MOST_MODES)[:, 0]
-    oscillating = (locked.imag != 0.0) & (np.abs(locked) < 0.5 * math.pi * model.rate_hz)
-    return np.array(
-        [loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked[oscillating]]
-    )
+        limit_nm = _sensor_limit_nm(profile)
+        try:
+            plant = move_plant_of(profile, with_beam(profile.loop_model(), beam), limit_nm)
+        except (ControlDesignError, RealisationError):
+            stated = replace(beam, damping=profile.rig.damping)
+            plant = move_plant_of(profile, with_beam(profile.loop_model(), stated), limit_nm)
+        self._estimated = beam, plant
+        return plant
 
 
 def excitation_for(
@@ -311,7 +251,7 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
     RealisationError
         If the beam's damping cannot be realised.
     """
-    loop = close_loop(profile.loop_model())
+    loop = close_loop(loop_model_with(profile, excitation.model))
     unstable = check_stability(loop)
     prediction = predict(loop, excitation)
     firm, forcible = (
@@ -349,7 +289,7 @@ def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
     """Plan what follows the record: a return that leaves the beam at rest, and active damping."""
     if loop.model.beam is None:
         return Ending(stays=stays)
-    return Ending(stays, tuple(map(complex, mode_poles(loop))), design_damper(loop))
+    return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), design_damper(loop))
 
 
 def largest_amplitude(
@@ -462,17 +402,28 @@ def _sweep_in_words(excitation: Excitation) -> str:
 
 def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
     """Say where a move goes, how long it takes, and what vibration it is predicted to leave."""
-    by_rad, angle_rad, duration_s, share, residual_nm, quintic_nm = (
+    by_rad, angle_rad, duration_s, share, residual_nm, floor_nm, off_nm, quintic_nm = (
         float(parameters[name])
         for name in (
-            *("by_rad", "angle_rad", "duration_s"),
-            *("limits_share", "residual_nm", "quintic_residual_nm"),
+            *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
+            *("residual_floor_nm", "frequency_residual_nm", "quintic_residual_nm"),
         )
     )
+    arrival = "more than 1 s after that"
+    if "arrival_s" in parameters:
+        arrival = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
+    left = f"{1e3 * residual_nm:.2g} mN·m"
+    if residual_nm < floor_nm:
+        left = f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)"
+    if off_nm > max(residual_nm, floor_nm):
+        left += (
+            f", {1e3 * off_nm:.2g} mN·m if the beam's frequencies are wrong by their uncertainty"
+        )
     return (
-        f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms "
-        f"({100 * share:.0f} % of the limits), vibration left {1e3 * residual_nm:.2g} mN·m "
-        f"(quintic {1e3 * quintic_nm:.3g}; beam of {parameters['file'] or 'profile'})"
+        f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
+        f"within 1 mrad {arrival} ({100 * share:.0f} % of the limits); vibration left {left}; "
+        f"a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
+        f"{parameters['file'] or 'profile'})"
     )
 
 
@@ -513,7 +464,14 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     model = loop.model
     tip = None
     if model.beam is not None:
-        tip = tip_motion(model.beam, model.damping, response.angle_rad, model.rate_hz)
+        tip = tip_motion(
+            model.beam,
+            model.damping,
+            response.angle_rad,
+            model.rate_hz,
+            tip_mass_kg=model.tip_mass_kg,
+            root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
+        )
     peaks = _peaks(excitation.reference_rad, response, tip)
     if excitation.kind not in _GOING:
         return peaks

@@ -354,7 +354,7 @@ class Search:
             return
         if estimate is None:
             raise ExcitationError("No beam was found that excitation can be planned for.")
-        plant = self._rig.plant_with(estimate.beam, estimate.damping)
+        plant = self._rig.plant_with(estimate.loaded_beam)
         angle_rad = plant.respond(reference_rad).angle_rad
         piece = next_piece(
             estimate,

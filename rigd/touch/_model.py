@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from rigd.beam import Beam, Damping
-from rigd.identified_beam import read_identified_beam
+from rigd.identified_beam import TOUCH, read_identified_beam
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 UNCERTAIN: Final = (
@@ -161,9 +161,10 @@ class TouchModel:
         Raises
         ------
         IdentifiedBeamError
-            If the file cannot be read, or lacks the beam's stiffness or density.
+            If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
+            uniform beam on a rigid clamp has not, or flags a number that is needed.
         """
-        found = read_identified_beam(path, length_m)
+        found = read_identified_beam(path, length_m, TOUCH)
         tool = found.tool_inertia_kg_m2
         return cls(
             found.beam,

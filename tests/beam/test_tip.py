@@ -86,3 +86,18 @@ def test_the_largest_deflection_is_that_of_the_shape_as_it_happens():
     assert motion.deflection_m == pytest.approx(np.abs(ends).max(), rel=5e-3)
     speed = np.gradient(np.array(ends) + BEAM.length_m * angle[4::5], 5 / rate_hz)
     assert motion.speed_m_s == pytest.approx(np.abs(speed).max(), rel=1e-2)
+
+
+def test_a_tip_mass_and_a_clamp_are_in_the_motion_of_the_tip():
+    """A slow turn: the mass bends the beam by its own inertia, and the clamp yields."""
+    t = np.arange(4000) / 1000.0
+    angle_rad = 0.05 * np.sin(2 * np.pi * 0.2 * t) * np.minimum(t, 1.0) ** 2
+    bare = tip_motion(BEAM, VI, angle_rad, 1000.0)
+    same = tip_motion(BEAM, VI, angle_rad, 1000.0, tip_mass_kg=1e-12)
+    assert same.deflection_m == pytest.approx(bare.deflection_m, rel=1e-3)
+    assert same.speed_m_s == pytest.approx(bare.speed_m_s, rel=1e-3)
+    heavy = tip_motion(BEAM, VI, angle_rad, 1000.0, tip_mass_kg=1e-3)
+    assert heavy.slope_rad > 1.3 * bare.slope_rad
+    soft = tip_motion(BEAM, VI, angle_rad, 1000.0, root_compliance_rad_per_nm=0.5)
+    assert soft.slope_rad == pytest.approx(bare.slope_rad, rel=0.3)
+    assert soft.speed_m_s == pytest.approx(bare.speed_m_s, rel=0.1)

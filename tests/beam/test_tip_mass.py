@@ -58,6 +58,60 @@ def test_the_closed_form_solves_the_boundary_value_problem(name, mass, complianc
     )
 
 
+OFFSETS = (0.04, -0.07, 0.1)
+
+
+def offset(compliance):
+    """Give a beam whose modes have stiffnesses of their own."""
+    return LoadedBeam(BEAM, DAMPINGS["fractional"], 0.0, compliance, OFFSETS)
+
+
+@pytest.mark.parametrize("compliance", [0.0, 0.05])
+def test_modes_of_their_own_stiffness_replace_those_of_the_uniform_beam(compliance):
+    """By the sum of the modes: each of the first four with its own stiffness."""
+    s = 0.5 + 2j * np.pi * np.geomspace(0.5, 100, 60)
+    loaded = offset(compliance)
+    elastic, inertial = loaded.factors(s)
+    response = transfer(s, BEAM, DAMPINGS["fractional"])
+    for z, share in zip(clamped_free_eigenvalues(4)[1:], OFFSETS, strict=True):
+        k4, stiffness = (z / BEAM.length_m) ** 4, BEAM.bending_stiffness_n_m2
+        for sign, own in ((-1, k4), (1, k4 * (1 + share))):
+            # Of a mode a² EI p - a² EI p²/(p + c k⁴): the first part is the rigid link's.
+            weight = 4 * BEAM.length_m**3 / z**4 * stiffness
+            response = response - sign * weight * inertial**2 / (inertial + elastic * own)
+    exact = response / (1 + compliance * response)
+    assert loaded.transfer(s) == pytest.approx(exact, rel=1e-9)
+    h = 1e-6 * s
+    difference = (loaded.at(s + h).response - loaded.at(s - h).response) / (2 * h)
+    assert loaded.slope(s, loaded.at(s)) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize("compliance", [0.0, 0.05])
+def test_their_poles_are_found_and_realised(compliance):
+    loaded = offset(compliance)
+    at_poles = loaded.poles(clamped_free_eigenvalues(6))[:, 0]
+    far, near = (np.abs(loaded.transfer(at_poles * (1 + h))) for h in (1e-4, 1e-8))
+    assert (near > 1e3 * far).all()
+    made = realise(
+        BEAM, DAMPINGS["fractional"], root_compliance_rad_per_nm=compliance,
+        stiffness_offsets=OFFSETS,
+    )  # fmt: skip
+    s = 2j * np.pi * np.geomspace(0.1, 90, 200)
+    assert made.transfer(s) == pytest.approx(loaded.transfer(s), rel=1e-3)
+    # The residues are those of the realisation: half of what both states of a pair contribute.
+    of_states = made.c[: 2 * at_poles.size].reshape(-1, 2)
+    assert 2 * np.abs(loaded.residues(at_poles)) == pytest.approx(np.hypot(*of_states.T), rel=1e-4)
+
+
+def test_what_modes_of_their_own_stiffness_do_not_define_is_refused():
+    s = np.array([1j])
+    for undefined in (offset(0.0).shear, offset(0.0).tip_slope, offset(0.0).tip_response):
+        with pytest.raises(ValueError, match="only the coupling torque is known"):
+            undefined(s)
+    with pytest.raises(ValueError, match="exclude each other"):
+        replace(offset(0.0), tip_mass_kg=1e-4)
+
+
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)
 def test_the_slope_of_the_tip_is_that_of_the_boundary_value_problem(mass, compliance):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 60)

@@ -34,7 +34,7 @@ DAMPING = [parse_target("damping", "1%")]
 def scanned(rig):
     """Angle of a fast scan."""
     scan = chirp(rate_hz=RATE_HZ, start_hz=0.5, duration_s=5.0, rest_s=1.0, ring_down_s=0.0)
-    plant = rig.plant_with(ESTIMATE.beam, ESTIMATE.damping)
+    plant = rig.plant_with(ESTIMATE.loaded_beam)
     return plant.respond(scan.reference_rad).angle_rad
 
 
@@ -60,9 +60,10 @@ def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
 
 
 def test_the_loop_with_an_estimate_is_computed_once(rig):
-    plant = rig.plant_with(LINK, ESTIMATE.damping)
-    assert rig.plant_with(replace(LINK), replace(ESTIMATE.damping)) is plant
-    assert rig.plant_with(LINK, Damping(zeta=7e-5)) is not plant
+    plant = rig.plant_with(ESTIMATE.loaded_beam)
+    assert rig.plant_with(replace(ESTIMATE.loaded_beam)) is plant
+    assert rig.plant_with(replace(ESTIMATE.loaded_beam, damping=Damping(zeta=7e-5))) is not plant
+    assert rig.plant_with(replace(ESTIMATE.loaded_beam, tip_mass_kg=3e-4)) is not plant
 
 
 def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
@@ -75,7 +76,7 @@ def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
 
 def test_the_whole_session_keeps_the_limits_and_the_small_slopes(rig):
     """By another way: the whole reference through the loop, the tip from the whole angle."""
-    plant = rig.plant_with(ESTIMATE.beam, ESTIMATE.damping)
+    plant = rig.plant_with(ESTIMATE.loaded_beam)
     alone = design_excitation(ESTIMATE, rig, DAMPING, 6.0)
     response = plant.respond(alone.reference_rad)
     torque = np.abs(response.torque_nm).max() + plant.friction_nm

@@ -1,11 +1,14 @@
 """Moves as sessions: what they refuse, the identified beam, and one through the real engine."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rigd.excitation import KINDS, ExcitationError, move
+from rigd.beam import clamped_free_eigenvalues
+from rigd.excitation import KINDS, ExcitationError, modal_state, move
+from rigd.identified_beam import MOVE, IdentifiedBeamError
 from rigd.profile import load_profile
 from rigd.runner import (
     LoopPreview,
@@ -16,6 +19,9 @@ from rigd.runner import (
     plan_session,
 )
 from rigd.session import read_session
+from rigd.testing import write_profile
+
+STATED = ("residual_nm", "residual_floor_nm", "quintic_residual_nm", "arrival_s")
 
 
 def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
@@ -26,13 +32,17 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
     )
     assert same.parameters["file"] == "model.json"
     assert np.allclose(same.reference_rad, own.reference_rad, atol=1e-3)
-    assert same.parameters["residual_nm"] < 0.1 * own.parameters["residual_nm"]
+    off_nm = [each.parameters["frequency_residual_nm"] for each in (same, own)]
+    assert off_nm[0] < 0.1 * off_nm[1]
+    assert same.parameters["residual_nm"] == pytest.approx(own.parameters["residual_nm"], rel=0.5)
     stiffness = 1.2 * profile.rig.beam.bending_stiffness_n_m2
     stiffer = LoopPreview(profile).move_plant(
         analysed(bending_stiffness_n_m2={"value": stiffness, "std": 0.0},
-                 density_over_stiffness={"value": 4.7e-3 / stiffness, "std": 0.0})
+                 density_over_stiffness={"value": 4.7e-3 / stiffness, "std": 0.0}),
+        MOVE,
     )  # fmt: skip
-    ratio = abs(stiffer.poles_rad_s[0]) / abs(LoopPreview(profile).move_plant().poles_rad_s[0])
+    stated = LoopPreview(profile).move_plant("", MOVE)
+    ratio = abs(stiffer.poles_rad_s[0]) / abs(stated.poles_rad_s[0])
     assert ratio == pytest.approx(1.2**0.5, rel=1e-2)
 
 
@@ -94,6 +104,104 @@ def test_a_move_through_the_engine_leaves_nothing_that_rings(rigd, tmp_path):
     amplitude = 2 * abs(np.mean((torque - torque.mean()) * wave))
     assert predicted_nm > 0.1
     assert amplitude < 0.02 * predicted_nm
+
+
+def amplitude_nm(samples, first, hz):
+    """Amplitude of the torque at a frequency in two seconds, by its Fourier coefficient."""
+    torque = samples["coupling_torque_nm"][first : first + 2000]
+    wave = np.exp(-2j * np.pi * hz * np.arange(torque.size) / 1000.0)
+    return 2 * abs(np.mean((torque - torque.mean()) * wave))
+
+
+def test_a_move_with_an_identified_tip_mass_leaves_what_its_plan_states(rigd, analysed, tmp_path):
+    """The rig has 0.3 g at its tip, of which its profile knows nothing and the model does."""
+    heavy = write_profile(tmp_path, {"simulation.tip_mass_kg": 3e-4})
+    model = analysed(tip_mass_kg={"value": 3e-4, "std": 2e-6})
+    done = rigd(
+        "run", "move", "0.5", "--model", model, "--profile", heavy, "--fast", "--json",
+        "--no-look", "--ring-down", "3", "--output", tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    session = read_session(json.loads(done.stdout)["sessions"][0]["path"])
+    stated = {name: float(session.metadata[name]) for name in STATED}
+    floor_nm, quintic_nm = stated["residual_floor_nm"], stated["quintic_residual_nm"]
+    assert stated["residual_nm"] < floor_nm < 0.02 * quintic_nm
+    assert f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)" in done.stderr
+    first, end = session.segments["sweep"]
+    # The first mode is at 2.29 Hz; that of the profile would be at 2.57 Hz.
+    assert amplitude_nm(session.samples, end + 150, 2.286) < min(floor_nm, 0.01 * quintic_nm)
+    away = np.flatnonzero(np.abs(session.samples["angle_rad"] - 0.5) > 1e-3)[-1] + 1 - first
+    assert stated["arrival_s"] == pytest.approx(away / 1000.0, abs=0.01)
+    assert (end - first) / 1000.0 == pytest.approx(stated["arrival_s"] - 0.08, abs=0.02)
+    arrives = f"the angle within 1 mrad after {1e3 * stated['arrival_s']:.0f} ms"
+    assert arrives in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "effect", "says"),
+    [
+        ("move", "clock_rate_difference", "clocks of different rates, which a move does not"),
+        ("touch", "tip_mass_kg", "a mass at the tip, which a search for touches does not"),
+    ],
+)
+def test_a_model_with_an_effect_that_its_use_does_not_take_is_refused(
+    profile, analysed, kind, effect, says
+):
+    path = analysed(**{effect: {"value": 1e-4}})
+    with pytest.raises(IdentifiedBeamError, match=says) as refused:
+        excitation_for(profile, kind, {"angle_rad": 0.5, "path": path})
+    assert f"headlines[0].parameters.{effect}.value = 0.0001" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        {"tip_mass_kg": {"value": 1e-3}},
+        {"root_compliance_rad_per_nm": {"value": 0.5}},
+        {"stiffness_offset_2": {"value": -0.1}, "stiffness_offset_3": {"value": 0.2}},
+    ],
+)
+def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analysed, effect):
+    plant = LoopPreview(profile).move_plant(analysed(**effect), MOVE)
+    assert plant.model is not None
+    locked = plant.model.loaded_beam.poles(clamped_free_eigenvalues(3))[:, 0]
+    assert plant.poles_rad_s[:3] == pytest.approx(locked, rel=5e-3)
+    made = excitation_for(profile, "move", {"by_rad": 0.1, "path": analysed(**effect)})
+    path = made.reference_rad[slice(made.segments["sweep"][0] - 1, made.segments["sweep"][1])]
+    left = np.abs(modal_state(path, 1000.0, plant.poles_rad_s)) @ plant.torque_per_state_nm_s
+    assert left < 1e-4 * made.parameters["quintic_residual_nm"]
+    plan = plan_session(profile, made)
+    assert plan.prediction.tip is not None
+
+
+def test_a_plan_says_when_a_wrong_frequency_would_leave_more(profile):
+    """The frequencies of a profile's beam are uncertain by 1 %."""
+    made = excitation_for(profile, "move", {"by_rad": 0.8})
+    off_nm = float(made.parameters["frequency_residual_nm"])
+    assert off_nm > float(made.parameters["residual_floor_nm"])
+    words = plan_document(profile, made, plan_session(profile, made))["sweep"]
+    assert f"{1e3 * off_nm:.2g} mN·m if the beam's frequencies are wrong" in words
+
+
+def test_a_quiet_sensor_shows_what_friction_leaves(profile):
+    """The vibration is stated in numbers where the sensor shows it, and grows with the friction."""
+    left = []
+    for coulomb_nm in (0.03, 0.09):
+        rig = profile.rig
+        quiet = replace(
+            profile,
+            rig=replace(
+                rig,
+                motor=replace(rig.motor, coulomb_nm=coulomb_nm),
+                simulation=replace(rig.simulation, torque_noise_nm=1e-5),
+            ),
+        )
+        made = excitation_for(quiet, "move", {"by_rad": 0.1})
+        assert made.parameters["residual_floor_nm"] < made.parameters["residual_nm"]
+        words = plan_document(quiet, made, plan_session(quiet, made))["sweep"]
+        assert f"vibration left {1e3 * made.parameters['residual_nm']:.2g} mN·m" in words
+        left.append(made.parameters["residual_nm"])
+    assert left[1] > 2 * left[0]
 
 
 @pytest.mark.parametrize(

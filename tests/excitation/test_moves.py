@@ -18,13 +18,14 @@ from rigd.excitation import (
     slew,
     still_path,
 )
+from rigd.identified_beam import MOVE
 
 RATE_HZ = 1000.0
 
 
 @pytest.fixture(scope="session")
 def plant(rig):
-    return rig.move_plant()
+    return rig.move_plant("", MOVE)
 
 
 @pytest.fixture(scope="session")

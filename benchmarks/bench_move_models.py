@@ -1,0 +1,154 @@
+"""What moves with an identified model leave, against what their plan states.
+
+Rigs with a tip mass, an elastic clamp, more or less friction than the controller compensates, and a
+sensor without noise are each identified from one chirp of 20 s (``--identify``). A tip mass is
+also moved with the model of the same analysis in which each mode has a stiffness of its own. Moves
+are run with each model; a quintic of the same time is run with them. The torque of the modes left
+is measured as in ``bench_moves.py``, with the noise of the sensor and without.
+
+Printed per move: the vibration in the record, the same with a sensor without noise, the same of the
+quintic, and its ratio; what the plan states and the floor below which it says that nothing is
+seen; whether the record is within a factor of 3 of what is stated, or below the floor; time in
+which the angle arrives, planned and in the record.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from bench_moves import left_nm
+
+from rigd.errors import UserError
+from rigd.excitation import quintic
+from rigd.profile import load_profile
+from rigd.runner import excitation_for
+from rigd.session import read_session
+from rigd.testing import write_profile
+
+ANGLES_RAD = (0.1, 0.4, 0.8)
+SILENT = {"simulation.torque_noise_nm": 1e-9, "simulation.force_noise_n": 1e-9}
+RIGS: dict[str, dict[str, float]] = {
+    "uniform": {},
+    "friction 0.02": {"motor.coulomb_nm": 0.02},
+    "friction 0.06": {"motor.coulomb_nm": 0.06},
+    "friction 0.1": {"motor.coulomb_nm": 0.1},
+    "tip 0.1 g": {"simulation.tip_mass_kg": 1e-4},
+    "tip 0.3 g": {"simulation.tip_mass_kg": 3e-4},
+    "tip 1 g": {"simulation.tip_mass_kg": 1e-3},
+    "clamp 20 N·m/rad": {"simulation.clamp_compliance_rad_per_nm": 0.05},
+    "clamp 5 N·m/rad": {"simulation.clamp_compliance_rad_per_nm": 0.2},
+    "clamp 2 N·m/rad": {"simulation.clamp_compliance_rad_per_nm": 0.5},
+    "tip 0.3 g, friction 0.06": {"simulation.tip_mass_kg": 3e-4, "motor.coulomb_nm": 0.06},
+    "tool 1e-5 kg·m²": {"sensor.tool_inertia_kg_m2": 1e-5},
+    "filter 100 Hz": {"simulation.torque_filter_hz": 100.0},
+    "air": {"simulation.air_drag_m": 2.3e-3},
+}
+_REACHED = 3.0
+
+
+def run(profile: Path, *arguments: str) -> Path:
+    """Run a session under the virtual clock; return its file."""
+    command = [sys.executable, "-m", "rigd", "run", *arguments, "--profile", str(profile)]
+    command += ["--fast", "--json", "--no-look", "--output", str(profile.parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return Path(json.loads(done.stdout)["sessions"][0]["path"])
+
+
+def with_free_modes(model: Path) -> Path | None:
+    """Write the model whose modes have stiffnesses of their own, if the analysis fitted one."""
+    document = json.loads(model.read_text())
+    fits = [fit for fit in document["fits"] if fit.get("candidate", "").endswith(", modes free")]
+    if not fits:
+        return None
+    best = min(fits, key=lambda fit: fit["cost"])
+    parameters = {
+        name: {"value": value, "std": best["std"][name]}
+        for name, value in best["parameters"].items()
+    }
+    of_modes = document["headlines"][0]["modes"]
+    headline = {"file": "free modes", "parameters": parameters, "modes": of_modes, "named": []}
+    path = model.with_name("free-modes.json")
+    path.write_text(json.dumps({"headlines": [headline]}))
+    return path
+
+
+def main() -> None:
+    """Print a table of all moves."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--identify", type=float, default=20.0)
+    parser.add_argument("--rigs", nargs="*", default=list(RIGS), choices=list(RIGS))
+    options = parser.parse_args()
+    print("rig | angle | record | silent | quintic | ratio | stated | floor | arrives")
+    for name in options.rigs:
+        with tempfile.TemporaryDirectory() as folder:
+            one_rig(name, Path(folder), options.identify)
+
+
+def one_rig(name: str, folder: Path, identify_s: float) -> None:
+    """Identify a rig, and move it with each model."""
+    profiles = []
+    for kind, other in (("noisy", {}), ("silent", SILENT)):
+        (folder / kind).mkdir()
+        profiles.append(write_profile(folder / kind, RIGS[name] | other))
+    chirp = run(profiles[0], "chirp", "--duration", f"{identify_s:g}", "--ring-down", "5")
+    model = folder / "model.json"
+    subprocess.run(
+        [sys.executable, "-m", "analysis", str(chirp), "--json", str(model)],
+        check=True,
+        capture_output=True,
+    )
+    one_model(name, profiles, model)
+    if "tip" in name and (free := with_free_modes(model)) is not None:
+        one_model(f"{name}, free modes", profiles, free)
+
+
+def one_model(name: str, profiles: list[Path], model: Path) -> None:
+    """Move a rig with one model."""
+    noisy, silent = (load_profile(path) for path in profiles)
+    for angle_rad in ANGLES_RAD:
+        try:
+            planned = excitation_for(noisy, "move", {"by_rad": angle_rad, "path": model})
+        except UserError as refused:
+            print(f"{name} | refused: {refused}", flush=True)
+            return
+        given = planned.parameters
+        move = "move", f"{angle_rad:g}", "--model", str(model)
+        session = run(profiles[0], *move)
+        record_nm, _ = left_nm(session, noisy)
+        bare_nm, _ = left_nm(run(profiles[1], *move), silent)
+        duration_s = float(given["duration_s"])
+        shape = angle_rad * quintic(duration_s, noisy.rig.rate_hz)
+        usual = model.parent / "quintic.csv"
+        usual.write_text("angle_rad\n" + "\n".join(map(repr, shape.tolist())))
+        quintic_nm, _ = left_nm(
+            run(profiles[1], "file", str(usual), "--ring-down", "5", "--force"), silent
+        )
+        stated_nm, floor_nm = (float(given[key]) for key in ("residual_nm", "residual_floor_nm"))
+        silent_nm = float(
+            excitation_for(silent, "move", {"by_rad": angle_rad, "path": model}).parameters[
+                "residual_nm"
+            ]
+        )
+        within = record_nm <= floor_nm or 1 / _REACHED < record_nm / stated_nm < _REACHED
+        within &= 1 / _REACHED < bare_nm / silent_nm < _REACHED
+        found = read_session(session)
+        off = np.abs(found.samples["angle_rad"] - angle_rad) > 1e-3
+        arrived = int(np.flatnonzero(off)[-1]) + 1 - found.segments["sweep"][0]
+        print(
+            f"{name} | {angle_rad:g} | {1e3 * record_nm:.2f} | {1e3 * bare_nm:.2f} "
+            f"({1e3 * silent_nm:.2f} stated) | {1e3 * quintic_nm:.1f} | "
+            f"{100 * bare_nm / quintic_nm:.2f} % | {1e3 * stated_nm:.2f} | {1e3 * floor_nm:.2f} | "
+            f"{1e3 * duration_s:.0f}, {1e3 * float(given.get('arrival_s', np.nan)):.0f} "
+            f"({arrived}) ms | {'yes' if within else 'NO'}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

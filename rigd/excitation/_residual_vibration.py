@@ -1,0 +1,102 @@
+"""Vibration that a move is predicted to leave, and what of it the sensor can show."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation._moves import ROBUST_BELOW_HZ
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+ARRIVED_RAD: Final = 1e-3
+"""Distance from its end within which the angle has arrived."""
+
+_FOLLOWED_S: Final = 1.0
+"""Time after the reference for which the motion is simulated."""
+_SEEN_FOR_S: Final = 1.0
+"""Shortest ring-down for which the floor of the sensor is stated."""
+_EXCEEDED_1_IN_1000: Final = 13.8
+"""Square of the amplitude that noise exceeds once in 1000 times, over the variance of its cosine
+and of its sine: exp(-a²/2) = 0.001."""
+
+
+class DisturbedRig(Protocol):
+    """Rig with friction, encoder steps and noise."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks a second."""
+
+    @property
+    def disturbed(self) -> Callable[[Real, int], tuple[Real, Real]]:
+        """Return angle (n, draws) and torque of the lowest modes (n, modes, draws)."""
+
+    @property
+    def poles_rad_s(self) -> Complex:
+        """Poles of the modes, shape (m,)."""
+
+    @property
+    def settling_s(self) -> float:
+        """Time in which the loop follows up what the reference has done."""
+
+    @property
+    def torque_noise_nm(self) -> float:
+        """Noise of one reading of the coupling torque."""
+
+
+@dataclass(frozen=True, slots=True)
+class MoveEnd:
+    """What follows the reference of a move.
+
+    The vibration is the root of the sum of squares of the amplitudes of the modes below
+    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference; the modes above have
+    decayed when the motor has arrived.
+    """
+
+    arrival_s: float | None
+    """Time from the move's start after which the angle stays within `ARRIVED_RAD`; None: that is
+    more than a second after the reference's end."""
+    residual_nm: float
+    """Vibration that is left, with friction, encoder steps and noise of the sensor."""
+    floor_nm: float
+    """Vibration that the noise of the sensor alone makes one read from the ring-down after the
+    arrival, exceeded in one of 1000: less cannot be seen."""
+
+
+def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
+    """Predict the arrival of a move and the vibration after it.
+
+    Parameters
+    ----------
+    rig
+        The rig.
+    reference_rad
+        Shape (n,): at the ticks after the start, relative to the angle there.
+    ring_down_s
+        Time for which the session goes on.
+    """
+    rate_hz, end = rig.rate_hz, reference_rad.size
+    ringing = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
+    if not ringing.size:
+        ringing = rig.poles_rad_s[:1]
+    decay_per_s = -ringing.real
+    # The loop has followed up and the motor stands; from here on the amplitudes only decay.
+    measured = end + round(2 * rig.settling_s * rate_hz)
+    held = np.full(max(measured - end + 1, round(_FOLLOWED_S * rate_hz)), reference_rad[-1])
+    angle, torque = rig.disturbed(np.concatenate([[0.0], reference_rad, held]), ringing.size)
+    away = np.flatnonzero((np.abs(angle - reference_rad[-1]) > ARRIVED_RAD).any(axis=1))
+    arrived = int(away[-1]) + 1 if away.size else 0
+    amplitude = torque[measured] * np.exp(decay_per_s * (measured - end) / rate_hz)[:, None]
+    # Variance of a decaying cosine's amplitude in white noise, by least squares.
+    first_s, last_s = max(arrived - end, 0) / rate_hz, max(ring_down_s, _SEEN_FOR_S)
+    decayed = [np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))]
+    variance = rig.torque_noise_nm**2 * 4 * decay_per_s / (decayed[0] - decayed[1]) / rate_hz
+    return MoveEnd(
+        arrival_s=arrived / rate_hz if arrived < angle.shape[0] - 1 else None,
+        residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
+        floor_nm=float(np.sqrt(_EXCEEDED_1_IN_1000 * variance.sum())),
+    )
