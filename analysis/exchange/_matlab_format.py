@@ -10,7 +10,6 @@ import numpy as np
 
 from analysis.exchange._matlab_times import stated_times, states_time
 from analysis.exchange._source import (
-    MAX_SAMPLES,
     ExchangeError,
     SourceChannel,
     as_column,
@@ -18,7 +17,7 @@ from analysis.exchange._source import (
     check_samples,
     no_such_channel,
 )
-from rigd.session import META_PREFIX, NOTES
+from rigd.session import MAX_SAMPLES, META_PREFIX, NOTES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:

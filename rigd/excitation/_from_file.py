@@ -7,7 +7,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.excitation._signals import (
-    MAX_TICKS,
     Excitation,
     ExcitationError,
     assemble,
@@ -16,6 +15,7 @@ from rigd.excitation._signals import (
     within_a_turn,
 )
 from rigd.runtime import open_plain_file
+from rigd.session import MAX_SAMPLES
 from rigd.text_table import MissingColumnError, TableError, TextTable, read_table, time_unit_s
 
 MOST_BYTES: Final = 256_000_000
@@ -90,8 +90,8 @@ def _read_columns(
         raise ExcitationError(
             f"{path}: has {len(angles.values)} angles; a reference needs at least two."
         )
-    if len(angles.values) > MAX_TICKS:
-        raise ExcitationError(f"{path}: has more than {MAX_TICKS} angles; shorten it.")
+    if len(angles.values) > MAX_SAMPLES:
+        raise ExcitationError(f"{path}: has more than {MAX_SAMPLES} angles; shorten it.")
     if angles.unit and angles.unit.lower() not in _RADIANS:
         raise ExcitationError(f"{path}: states another unit than rad for {ANGLE}; write rad.")
     if times is not None and times.unit and time_unit_s(times.unit) != 1.0:
@@ -114,11 +114,11 @@ def _read_columns(
 def _table(stream: BinaryIO) -> TextTable:
     """Read times and angles, or a single column."""
     try:
-        return read_table(stream, (TIME, ANGLE), most_rows=MAX_TICKS)
+        return read_table(stream, (TIME, ANGLE), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     try:
-        table = read_table(stream, (ANGLE,), most_rows=MAX_TICKS)
+        table = read_table(stream, (ANGLE,), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     else:
@@ -128,7 +128,7 @@ def _table(stream: BinaryIO) -> TextTable:
                 f"times in seconds so, or leave {ANGLE} alone."
             )
         return table
-    table = read_table(stream, ("#1",), most_rows=MAX_TICKS)
+    table = read_table(stream, ("#1",), most_rows=MAX_SAMPLES)
     if table.width > 1 or table.columns["#1"].title:
         raise TableError(
             f"must name the columns {TIME} (s) and {ANGLE} (rad) in one line above the numbers, or "
