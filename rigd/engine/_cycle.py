@@ -561,7 +561,7 @@ class Observers:
     """Compares each reading of the sensor with the one before."""
 
 
-def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -> Observers:
+def make_observers(profile: Profile, devices: Devices) -> Observers:
     """Return the observers of a profile's rig.
 
     Parameters
@@ -570,8 +570,6 @@ def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -
         Profile of the rig.
     devices
         Devices that are read.
-    scales
-        Whether the data of the motor are known; False: a session measures them.
     """
     rig = profile.rig
     prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
@@ -582,7 +580,7 @@ def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
         delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
-        scales=ScaleWatch(rig.motor.inertia_kg_m2) if scales else None,
+        scales=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
     noisy = [True] * 6
