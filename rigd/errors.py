@@ -5,6 +5,8 @@
     RigdError
      +-- UserError             the request has to be another: exit code 2
      |    +-- ProfileError          a key of the profile is missing, or its value is out of range
+     |    +-- UnknownValueError     motor.peak_torque_nm has source = "unknown" in the profile
+     |    +-- UnknownRowError       --accept names no row of rigd check
      |    +-- UnknownDeviceError    [devices] names a driver that does not exist
      |    +-- ExcitationError       --amplitude 0, or a CSV file with semicolons
      |    +-- IdentifiedBeamError   --model of a file that holds no beam

@@ -1,13 +1,14 @@
 """The whole check of a rig, in the order in which one thing rules out the next."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from rigd.checks._devices import calibration_rows, inspect_devices
+from rigd.checks._gate import paper_rows
 from rigd.checks._machine import machine_rows, rights_rows
-from rigd.checks._on_paper import eds_rows, loop_rows, profile_rows, travel_rows, wiring_rows
+from rigd.checks._on_paper import wiring_rows
 from rigd.checks._rows import Row, Verdict
+from rigd.devices import unknown_values
 from rigd.profile import Profile
 
 
@@ -15,11 +16,14 @@ def check_rig(profile: Profile) -> list[Row]:
     """Check the rig of a profile without a torque: on paper, this computer, then the devices.
 
     Where the identifiers meet or the bus cannot carry the frames, nothing is connected: devices
-    might obey what is not meant for them.
+    might obey what is not meant for them. Nor is it while a value of the profile is unknown.
     """
     rows = _rows_without_devices(profile)
     if any(row.verdict is Verdict.FAIL for row in wiring_rows(profile.rig)):
         why = "not connected: first the bus has to be right"
+        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+    if unknown_values(profile.rig):
+        why = "not connected: first the unknown values have to be entered"
         return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
     return rows + inspect_devices(profile)
 
@@ -43,17 +47,7 @@ def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> lis
 
 def _rows_without_devices(profile: Profile) -> list[Row]:
     return [
-        *_drive_rows(profile),
-        *profile_rows(profile),
-        *wiring_rows(profile.rig),
-        *loop_rows(profile),
-        *travel_rows(profile),
+        *paper_rows(profile),
         *rights_rows(profile.realtime),
         *machine_rows(profile.realtime),
     ]
-
-
-def _drive_rows(profile: Profile) -> list[Row]:
-    """Hold the EDS that a profile names against what is asked of a drive."""
-    settings = profile.rig.cia402
-    return list(eds_rows(Path(settings.eds), profile.rig)) if settings and settings.eds else []

@@ -99,6 +99,8 @@ class SessionJob:
     """What follows the record."""
     touch: TouchOrder | None = None
     """What to look for; None: nothing."""
+    accepted: tuple[str, ...] = ()
+    """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile, with_specimen
 from rigd.runner._console import ProgressLine, plan_lines, result_line
+from rigd.runner._planning import clear_on_paper
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._quick_looks import QuickLook, QuickLooks
 from rigd.runner._request import load_rig, what_is_kept
@@ -64,6 +65,7 @@ def run_in_foreground(
     fast: bool,
     live: bool,
     force: bool,
+    accept: Sequence[str] = (),
     quiet_stdout: bool,
     hardware: bool = False,
     look: bool = False,
@@ -86,7 +88,7 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Where the files go; made if it does not exist.
-    repeat, seed, notes, fast, live, force, hardware
+    repeat, seed, notes, fast, live, force, accept, hardware
         As on the command line. The sessions of a series follow each other on one connection: each
         waits until the beam has come to rest.
     quiet_stdout
@@ -125,15 +127,17 @@ def run_in_foreground(
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
+            specimen = notes.get("specimen", "")
+            clear_on_paper(with_specimen(profile, specimen), accept)
             if prepare is not None:
                 profile = prepare(profile)
+            mounted = with_specimen(profile, specimen)
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
-            mounted = with_specimen(profile, notes.get("specimen", ""))
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
                 rig.connect(moving)
@@ -145,6 +149,7 @@ def run_in_foreground(
                 repeat=repeat,
                 notes=notes,
                 force=force,
+                accept=accept,
                 watch_fit=watch_fit,
             )
             results = series.results

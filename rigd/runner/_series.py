@@ -6,7 +6,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -64,6 +64,8 @@ class Series:
         specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
+    accept
+        Names of rows of `rigd check` that may fail; those that do are recorded in the files.
     watch_fit
         Fit each record while it is recorded.
 
@@ -77,8 +79,10 @@ class Series:
     Raises
     ------
     RefusedError, ControlDesignError, RealisationError
-        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
-        profile requires.
+        If the sessions fail a check on paper, would leave the limits, cannot be predicted, or lack
+        metadata that the profile requires.
+    UnknownRowError
+        If `accept` names no row.
     NoRoomError
         If there is no room for the first one.
     """
@@ -92,6 +96,7 @@ class Series:
         repeat: int = 1,
         notes: Mapping[str, str] | None = None,
         force: bool = False,
+        accept: Sequence[str] = (),
         watch_fit: bool = False,
     ) -> None:
         self._watch_fit = watch_fit
@@ -106,7 +111,7 @@ class Series:
                 f"--repeat {repeat}: a {excitation.kind} ends elsewhere than it starts and is run "
                 "once; omit the option."
             )
-        self.plan = plan_session(profile, excitation, force=force)
+        self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -179,6 +184,7 @@ class Series:
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
+                self.plan.clearance.accepted,
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:

@@ -316,7 +316,12 @@ class Session:
         self._control_at_work = True
         touch = None if order.touch is None else order.touch.order
         job = SessionJob(
-            order.profile, reference, self._refused_to_supervision(), order.ending, touch
+            order.profile,
+            reference,
+            self._refused_to_supervision(),
+            order.ending,
+            touch,
+            tuple(f"{each.name}: {each.text}" for each in order.accepted),
         )
         group.control.send(job)
         answer = self._listen_to_control()

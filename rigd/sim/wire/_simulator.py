@@ -20,7 +20,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigd.devices import SimulatorAddress, announce, described, find_simulator, forget
+from rigd.devices import (
+    SimulatorAddress,
+    announce,
+    describe_unknown_values,
+    described,
+    find_simulator,
+    forget,
+)
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.runtime import runtime_folder
@@ -266,12 +273,14 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     Raises
     ------
     WrongUseError
-        If the profile cannot be simulated on the wire, a fault is none that this rig can have, or
-        the log's name is taken.
+        If the profile cannot be simulated on the wire or has unknown values, a fault is none that
+        this rig can have, or the log's name is taken.
     DeviceError
         If its simulated rig is already running, or if sockets or files cannot be made.
     """
     check_on_wire(rig)
+    if unknown := describe_unknown_values(rig):
+        raise WrongUseError(unknown)
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:
