@@ -1,15 +1,17 @@
 """The whole check of a rig, in the order in which one thing rules out the next."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rigd.checks._devices import calibration_rows, inspect_devices
 from rigd.checks._gate import paper_rows
 from rigd.checks._machine import machine_rows, rights_rows
 from rigd.checks._on_paper import wiring_rows
-from rigd.checks._rows import Row, Verdict
+from rigd.checks._rows import Row, Verdict, grade
 from rigd.devices import unknown_values
+from rigd.errors import UserError
 from rigd.profile import Profile
+from rigd.runner import excitation_for, limits_exceeded
 
 
 def check_rig(profile: Profile) -> list[Row]:
@@ -48,6 +50,29 @@ def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> lis
 def _rows_without_devices(profile: Profile) -> list[Row]:
     return [
         *paper_rows(profile),
+        *default_session_rows(profile),
         *rights_rows(profile.realtime),
         *machine_rows(profile.realtime),
     ]
+
+
+def default_session_rows(profile: Profile) -> Iterator[Row]:
+    """Say whether `rigd run chirp` without options stays within the limits of the profile.
+
+    Advice, since another session may: a hold moves nothing.
+    """
+    try:
+        exceeded = limits_exceeded(profile, excitation_for(profile, "chirp", {}))
+    except UserError:  # an unstable loop or an unknown value, which have rows of their own
+        return
+    yield Row(
+        "session",
+        "chirp without options",
+        "; ".join(exceeded) or "predicted to stay within all limits",
+        "within all limits",
+        grade(fail=False, warn=bool(exceeded)),
+        "Session: rigd run chirp is refused with its default amplitude; choose a lower one "
+        "(--amplitude)."
+        if exceeded
+        else "",
+    )
