@@ -21,6 +21,7 @@
      |    +-- WrongUseError         rigd inject with a fault that does not exist
      +-- FailureError          the same request may succeed later: exit code 1
      |    +-- DeviceError           the drive does not answer, or reports a fault
+     |    +-- CheckFailedError      rigd check fails without a device: the worst travel is too long
      |    +-- ChildError            the control process was killed
      |    +-- RigError              the rig is not connected, or its zero is lost
      |    +-- SessionFailedError    the recorder died; part of the record is kept

@@ -1,5 +1,7 @@
 from ._check import check_beside as check_beside
 from ._check import check_rig as check_rig
+from ._gate import ACCEPTABLE as ACCEPTABLE
+from ._gate import CheckFailedError as CheckFailedError
 from ._gate import Clearance as Clearance
 from ._gate import FailedCheck as FailedCheck
 from ._gate import UnknownRowError as UnknownRowError

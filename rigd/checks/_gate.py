@@ -11,8 +11,12 @@ from typing import Final
 from rigd.checks import _on_paper as paper
 from rigd.checks._rows import Row, Verdict
 from rigd.devices import unknown_values
-from rigd.errors import UserError
+from rigd.errors import FailureError, UserError
 from rigd.profile import Profile
+
+
+class CheckFailedError(FailureError):
+    """The checks on paper fail; the message names the rows, and how to accept them."""
 
 
 class UnknownRowError(UserError):
@@ -61,6 +65,10 @@ PAPER_CHECKS: Final = (
 )
 """All checks on paper, in the order of their rows. Those of one group follow each other."""
 
+ACCEPTABLE: Final = tuple(
+    name for check in PAPER_CHECKS for name in check.names if not check.not_acceptable
+)
+"""Names of the rows whose failure the operator can accept."""
 _OWNERS: Final = {name: check for check in PAPER_CHECKS for name in check.names}
 
 
@@ -150,10 +158,9 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
 def _check_name(name: str) -> None:
     check = _OWNERS.get(name)
     if check is None:
-        names = ", ".join(name for name, check in _OWNERS.items() if not check.not_acceptable)
         raise UnknownRowError(
             f"--accept {name[:60]}: no row of rigd check has that name; those that can be accepted "
-            f"are {names}."
+            f"are {', '.join(ACCEPTABLE)}."
         )
     if check.not_acceptable:
         raise UnknownRowError(

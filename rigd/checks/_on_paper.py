@@ -28,7 +28,7 @@ friction alone.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from math import degrees, inf, isinf, log10, radians
+from math import degrees, inf, isfinite, isinf, log1p, log10, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ from rigd.safety import Limits
 # Modules of devices that a rig does not have are not loaded: these checks precede every session.
 if TYPE_CHECKING:
     from rigd.control import Margins
-    from rigd.devices import AtiSerial
+    from rigd.devices import AtiSerial, Motor
     from rigd.devices.canbus import BusLoad
 
 # Closed loop
@@ -142,6 +142,8 @@ def _at(value: str, frequency_hz: float) -> str:
 
 _STEP_S = 5e-5
 _FOR_EVER_RAD = 100.0
+_NO_VISCOUS = 1e-6
+"""Viscous over Coulomb friction below which only the latter counts."""
 _GROUP = "travel"
 _LOOP_FAILS = "if the loop fails"
 TRAVEL_LOOP_FAILS = "travel_loop_fails"
@@ -204,14 +206,20 @@ def worst_travel(
             break
     if driven_rad > _FOR_EVER_RAD:
         return Travel(inf, inf)
-    coasting_rad = 0.0
-    while speed_rad_s > 0.0:
-        slower_rad_s = speed_rad_s - _friction_nm(rig, speed_rad_s) / heavy_kg_m2 * _STEP_S
-        coasting_rad += 0.5 * (speed_rad_s + max(0.0, slower_rad_s)) * _STEP_S
-        if coasting_rad > _FOR_EVER_RAD or slower_rad_s == speed_rad_s:
-            return Travel(driven_rad, inf)
-        speed_rad_s = slower_rad_s
-    return Travel(driven_rad, coasting_rad)
+    coasting_rad = _coasting_rad(heavy_kg_m2, motor, speed_rad_s)
+    return Travel(driven_rad, coasting_rad if coasting_rad <= _FOR_EVER_RAD else inf)
+
+
+def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
+    """Return the angle in which friction alone stops an inertia; infinite without friction."""
+    viscous, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
+    ratio = viscous * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
+    if ratio < _NO_VISCOUS:
+        return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
+    if viscous == 0.0:
+        return inf if speed_rad_s > 0.0 else 0.0
+    braked = log1p(ratio) / ratio if isfinite(ratio) else 0.0
+    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - braked)
 
 
 @dataclass(frozen=True, slots=True)

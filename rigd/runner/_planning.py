@@ -21,7 +21,7 @@ from rigd.beam import (
     poles,
     tip_motion,
 )
-from rigd.checks import Clearance, check_on_paper
+from rigd.checks import CheckFailedError, Clearance, check_on_paper
 from rigd.control import (
     ClosedLoop,
     ControlDesignError,
@@ -277,7 +277,7 @@ def excitation_for(
 
 
 def clear_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
-    """Refuse what `rigd check` refuses without a device: see `rigd.checks.check_on_paper`.
+    """Refuse what `rigd check` refuses without a device.
 
     Parameters
     ----------
@@ -288,14 +288,14 @@ def clear_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
 
     Raises
     ------
-    RefusedError
+    CheckFailedError
         Naming each row that failed and is not accepted.
     UnknownRowError
         If no row has such a name, or its failure cannot be accepted.
     """
     clearance = check_on_paper(profile, accept)
     if clearance.refusals:
-        raise RefusedError("\n".join(clearance.refusals))
+        raise CheckFailedError("\n".join(clearance.refusals))
     return clearance
 
 
@@ -311,15 +311,16 @@ def plan_session(
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        As `clear_on_paper`.
     RefusedError
-        Naming every row of `rigd check` that failed, every limit the session would leave, and the
-        largest amplitude that passes.
-    UnknownRowError
-        If `accept` names none.
+        Naming every limit the session would leave, and the largest amplitude that passes.
     ControlDesignError, RealisationError, UnknownValueError
         As `predict_session`.
     """
     plan = predict_session(profile, excitation, force=force, accept=accept)
+    if plan.clearance.refusals:
+        raise CheckFailedError("\n".join(plan.clearance.refusals))
     if plan.refused:
         raise RefusedError(plan.refused)
     return plan

@@ -78,11 +78,11 @@ class Series:
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError, ControlDesignError, RealisationError
-        If the sessions fail a check on paper, would leave the limits, cannot be predicted, or lack
-        metadata that the profile requires.
-    UnknownRowError
-        If `accept` names no row.
+        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
+        profile requires.
     NoRoomError
         If there is no room for the first one.
     """
