@@ -131,7 +131,7 @@ class Rig:
             the profile is unknown.
         """
         if unknown := describe_unknown_values(self._profile.rig):
-            raise RigError(unknown)
+            raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
         if self.connected:
             self.disconnect()
         try:
