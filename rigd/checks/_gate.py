@@ -16,7 +16,19 @@ from rigd.profile import Profile
 
 
 class CheckFailedError(FailureError):
-    """The checks on paper fail; the message names the rows, and how to accept them."""
+    """The checks on paper fail; the message names the rows, and how to accept them.
+
+    Parameters
+    ----------
+    message
+        A sentence or two for each row, for the operator.
+    wrong_use
+        No session can be run with this profile, whatever the operator accepts.
+    """
+
+    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
 
 
 class UnknownRowError(UserError):
@@ -120,6 +132,18 @@ class Clearance:
     def accepted(self) -> tuple[FailedCheck, ...]:
         """Rows that failed and are accepted."""
         return tuple(each for each in self.failed if each.accepted)
+
+    def require(self) -> None:
+        """Refuse the session unless all that failed is accepted.
+
+        Raises
+        ------
+        CheckFailedError
+            Naming each row that failed and is not accepted.
+        """
+        if self.refusals:
+            final = not all(each.acceptable for each in self.failed)
+            raise CheckFailedError("\n".join(self.refusals), wrong_use=final)
 
 
 def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:

@@ -48,7 +48,6 @@ from rigd.runner import (
     RigStatus,
     Series,
     SessionFailedError,
-    clear_on_paper,
     excitation_for,
     what_is_kept,
 )
@@ -504,7 +503,7 @@ class Service:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
-            clear_on_paper(profile, request.accept)
+            check_on_paper(profile, request.accept).require()
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters, self._start_rad()),

@@ -6,7 +6,6 @@ from ._foreground import run_in_foreground as run_in_foreground
 from ._planning import LoopPreview as LoopPreview
 from ._planning import Plan as Plan
 from ._planning import RefusedError as RefusedError
-from ._planning import clear_on_paper as clear_on_paper
 from ._planning import excitation_for as excitation_for
 from ._planning import largest_amplitude as largest_amplitude
 from ._planning import limits_exceeded as limits_exceeded

@@ -9,13 +9,13 @@ from typing import Final, Self
 
 import typer
 
+from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile, with_specimen
 from rigd.runner._console import ProgressLine, plan_lines, result_line
-from rigd.runner._planning import clear_on_paper
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._quick_looks import QuickLook, QuickLooks
 from rigd.runner._request import load_rig, what_is_kept
@@ -128,7 +128,7 @@ def run_in_foreground(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
             specimen = notes.get("specimen", "")
-            clear_on_paper(with_specimen(profile, specimen), accept)
+            check_on_paper(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
             mounted = with_specimen(profile, specimen)

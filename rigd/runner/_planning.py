@@ -21,7 +21,7 @@ from rigd.beam import (
     poles,
     tip_motion,
 )
-from rigd.checks import CheckFailedError, Clearance, check_on_paper
+from rigd.checks import Clearance, check_on_paper
 from rigd.control import (
     ClosedLoop,
     ControlDesignError,
@@ -276,29 +276,6 @@ def excitation_for(
     return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile, start_rad))
 
 
-def clear_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
-    """Refuse what `rigd check` refuses without a device.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig, with the beam of the session.
-    accept
-        Names of rows that may fail in this session.
-
-    Raises
-    ------
-    CheckFailedError
-        Naming each row that failed and is not accepted.
-    UnknownRowError
-        If no row has such a name, or its failure cannot be accepted.
-    """
-    clearance = check_on_paper(profile, accept)
-    if clearance.refusals:
-        raise CheckFailedError("\n".join(clearance.refusals))
-    return clearance
-
-
 def plan_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
@@ -312,15 +289,14 @@ def plan_session(
     Raises
     ------
     CheckFailedError, UnknownRowError
-        As `clear_on_paper`.
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError
         Naming every limit the session would leave, and the largest amplitude that passes.
     ControlDesignError, RealisationError, UnknownValueError
         As `predict_session`.
     """
     plan = predict_session(profile, excitation, force=force, accept=accept)
-    if plan.clearance.refusals:
-        raise CheckFailedError("\n".join(plan.clearance.refusals))
+    plan.clearance.require()
     if plan.refused:
         raise RefusedError(plan.refused)
     return plan
