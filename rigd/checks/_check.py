@@ -11,7 +11,7 @@ from rigd.checks._rows import Row, Verdict, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile
-from rigd.runner import excitation_for, limits_exceeded
+from rigd.runner import LoopPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[Row]:
@@ -62,17 +62,19 @@ def default_session_rows(profile: Profile) -> Iterator[Row]:
     Advice, since another session may: a hold moves nothing.
     """
     try:
-        exceeded = limits_exceeded(profile, excitation_for(profile, "chirp", {}))
+        chirp = excitation_for(profile, "chirp", {})
+        percent = 100 * LoopPreview(profile).share_of_limits(chirp.reference_rad)
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
+    beyond = not percent <= 100
     yield Row(
         "session",
         "chirp without options",
-        "; ".join(exceeded) or "predicted to stay within all limits",
-        "within all limits",
-        grade(fail=False, warn=bool(exceeded)),
-        "Session: rigd run chirp is refused with its default amplitude; choose a lower one "
-        "(--amplitude)."
-        if exceeded
+        f"predicted peaks reach {percent:.0f} % of a limit",
+        "at most 100 %",
+        grade(fail=False, warn=beyond),
+        "Session: rigd run chirp is refused with its default amplitude; it says which limit, and the "
+        "largest amplitude (--amplitude)."
+        if beyond
         else "",
     )

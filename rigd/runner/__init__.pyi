@@ -8,7 +8,6 @@ from ._planning import Plan as Plan
 from ._planning import RefusedError as RefusedError
 from ._planning import excitation_for as excitation_for
 from ._planning import largest_amplitude as largest_amplitude
-from ._planning import limits_exceeded as limits_exceeded
 from ._planning import plan_document as plan_document
 from ._planning import plan_session as plan_session
 from ._planning import predict_session as predict_session

@@ -355,25 +355,6 @@ def predict_session(
     )
 
 
-def limits_exceeded(profile: Profile, excitation: Excitation) -> list[str]:
-    """Name the limits that a session is predicted to exceed, without its tip motion.
-
-    Parameters
-    ----------
-    profile, excitation
-        Rig and excitation of the session.
-
-    Raises
-    ------
-    ControlDesignError, RealisationError, UnknownValueError
-        As `predict_session`.
-    """
-    loop, _ = stable_loop(profile.loop_model())
-    reference_rad = excitation.reference_rad
-    firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
-    return [finding for peak in (*firm, *forcible) if (finding := peak.violation())]
-
-
 def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
     """Say what of an excitation is to be changed where it would leave the limits."""
     if excitation.kind in _GOING:
