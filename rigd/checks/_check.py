@@ -73,7 +73,7 @@ def default_session_rows(profile: Profile) -> Iterator[Row]:
         f"predicted peaks reach {percent:.0f} % of a limit",
         "at most 100 %",
         grade(fail=False, warn=beyond),
-        "Session: rigd run chirp is refused with its default amplitude; it says which limit, and the "
+        "Session: rigd run chirp is refused with its default amplitude; it names the limit and the "
         "largest amplitude (--amplitude)."
         if beyond
         else "",
