@@ -124,6 +124,15 @@ Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
 ]
 
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept",
+        metavar="ROW",
+        help="Run although this row of rigd check fails, for this start only; recorded in the "
+        "file; repeat for each row.",
+    ),
+]
 
 NoLook = Annotated[
     bool,

@@ -18,6 +18,7 @@ from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
     EXIT_WRONG_USE,
+    Accept,
     AsJson,
     Force,
     Meta,
@@ -93,6 +94,7 @@ def start_sessions(
     note: Note = "",
     meta: Meta = None,
     force: Force = False,
+    accept: Accept = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
     ] = False,
@@ -123,6 +125,8 @@ def start_sessions(
     }
     if watch_fit:  # an older daemon does not know the member
         request["watch_fit"] = True
+    if accept:  # likewise
+        request["accept"] = accept
     with daemon_of(profile) as client:
         daemon = client.ask("status")["daemon"]
         typer.echo(daemon["what_moves"], err=True)

@@ -7,6 +7,7 @@ at the very moment a new torque takes effect sees the old one.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import exp, floor, pi
 
 import numpy as np
@@ -420,6 +421,40 @@ def check_stability(loop: ClosedLoop) -> str | None:
         f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
+
+
+def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
+    """Close the loop of a rig, and refuse an unstable one.
+
+    The result for the last few models is stored: what checks a rig and what plans a session need
+    the same one.
+
+    Parameters
+    ----------
+    model
+        From :meth:`rigd.profile.Profile.loop_model`.
+
+    Returns
+    -------
+    loop : ClosedLoop
+        The loop.
+    warning : str or None
+        As `check_stability` returns it.
+
+    Raises
+    ------
+    ControlDesignError
+        As `close_loop` and `check_stability`.
+    RealisationError
+        If the beam's damping cannot be realised.
+    """
+    return _stable_loop(model)
+
+
+@lru_cache(maxsize=4)
+def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
+    loop = close_loop(model)
+    return loop, check_stability(loop)
 
 
 def _remedy(settings: ControlSettings) -> str:

@@ -23,7 +23,9 @@ _LONGEST_TEXT = 1000
 _SHOWN = 60
 
 _LONGEST_ID = 64
+_MOST_ROWS = 32
 Note = Annotated[str, Field(max_length=1000)]
+RowName = Annotated[str, Field(max_length=_LONGEST_ID)]
 Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
@@ -134,6 +136,7 @@ class SessionRequest(Request):
     notes: Notes = Notes()
     force: bool = False
     watch_fit: bool = False
+    accept: list[RowName] = Field(default=[], max_length=_MOST_ROWS)
 
 
 class Start(SessionRequest):

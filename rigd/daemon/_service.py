@@ -10,11 +10,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import asdict
 from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TypeVar
 
+from rigd.checks import check_on_paper
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import NAME
@@ -115,6 +117,7 @@ class Service:
         self._publish = publish
         self._moving = moving
         self._began_moving = moving()
+        self._failed_checks = [asdict(each) for each in check_on_paper(profile).failed]
         self._fast = fast
         self._live = live
         self._states = StateMachine(self._tell_transition)
@@ -272,6 +275,7 @@ class Service:
                 web=self._page,
                 calibration=self._rig.calibration,
                 quick_looks=self._looks is not None,
+                failed_checks=self._failed_checks,
                 began_utc_ns=self._began_utc_ns,
             ),
             "state": self.state.value,
@@ -366,6 +370,7 @@ class Service:
             request.force,
             request.notes.specimen,
             self._start_rad(),
+            tuple(request.accept),
         )
         self._predictions += 1
         try:
@@ -498,6 +503,7 @@ class Service:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
+            check_on_paper(profile, request.accept).require()
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters, self._start_rad()),
@@ -505,6 +511,7 @@ class Service:
                 repeat=request.repeat,
                 notes=notes,
                 force=request.force,
+                accept=request.accept,
                 watch_fit=request.watch_fit,
             )
         except NoRoomError as error:  # the same request may succeed later

@@ -48,6 +48,8 @@ class PredictionJob:
     """Name of the specimen; empty: the profile's."""
     start_rad: float = 0.0
     """Where the motor stands, from the rig's zero."""
+    accept: tuple[str, ...] = ()
+    """Names of rows of `rigd check` that may fail."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
@@ -61,7 +63,7 @@ class PredictionJob:
 
         profile = with_specimen(self.profile, self.specimen)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
-        plan = predict_session(profile, excitation, force=self.force)
+        plan = predict_session(profile, excitation, force=self.force, accept=self.accept)
         return {
             "plan": plan_document(profile, excitation, plan),
             "largest_amplitude_rad": largest_amplitude(profile, excitation, force=self.force),

@@ -101,6 +101,8 @@ class SessionJob:
     """What to look for; None: nothing."""
     seed: int | None = None
     """Seed of a simulated rig's noise; None: one of the rig's own."""
+    accepted: tuple[str, ...] = ()
+    """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -272,6 +272,7 @@ class _ControlServer:
         ):
             board[word] = 0
         self._warn_of_refusals(job)
+        self._log_accepted(job)
         cycle = self._cycle = self._make_cycle(job.profile)
         reference = map_reference(job.reference)
         touch = None
@@ -446,6 +447,11 @@ class _ControlServer:
                 names = ", ".join(f"{name} ({text})" for name, text in refused.items())
                 message = f"The system did not grant {names}: {what_follows}."
                 write_event(self._channels.events, Event(0, "warning", message))
+
+    def _log_accepted(self, job: SessionJob) -> None:
+        for text in job.accepted:
+            message = f"Accepted by the operator, though rigd check fails: {text}"
+            write_event(self._channels.events, Event(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.devices import (
+    MAY_BE_UNKNOWN,
     NOT_BESIDE_FORCES,
     NOT_BESIDE_OBSTACLES,
     AtiSerial,
@@ -57,6 +58,19 @@ def no_source(key: str, source: object) -> str:
     if source is None:
         return f"{key} has no source; add source = {_choice(SOURCES)}."
     return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
+
+
+def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
+    """Complain about a source "unknown" of a key that has a value, or that needs one."""
+    if key in MAY_BE_UNKNOWN:
+        return (
+            f'{key} = {_show(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
+            f"remove the value, or choose {_choice(SOURCES)} as its source."
+        )
+    return (
+        f'{key} has source = "unknown", but needs a value; only {", ".join(MAY_BE_UNKNOWN)} may be '
+        "unknown."
+    )
 
 
 def bare_number(key: str, value: object) -> str:

@@ -9,6 +9,7 @@ from typing import Final, Self
 
 import typer
 
+from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
@@ -67,6 +68,7 @@ def run_in_foreground(
     fast: bool,
     live: bool,
     force: bool,
+    accept: Sequence[str] = (),
     quiet_stdout: bool,
     hardware: bool = False,
     look: bool = False,
@@ -89,7 +91,7 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Where the files go; made if it does not exist.
-    repeat, seed, notes, fast, live, force, hardware
+    repeat, seed, notes, fast, live, force, accept, hardware
         As on the command line. The sessions of a series follow each other on one connection: each
         waits until the beam has come to rest.
     quiet_stdout
@@ -128,15 +130,17 @@ def run_in_foreground(
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
+            specimen = notes.get("specimen", "")
+            check_on_paper(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
+            mounted = with_specimen(profile, specimen)
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
-            mounted = with_specimen(profile, notes.get("specimen", ""))
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
                 rig.connect(moving)
@@ -148,6 +152,7 @@ def run_in_foreground(
                 repeat=repeat,
                 notes=notes,
                 force=force,
+                accept=accept,
                 watch_fit=watch_fit,
             )
             results = series.results

@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,13 +19,13 @@ from rigd.beam import (
     TipMotion,
     tip_motion,
 )
+from rigd.checks import Clearance, check_on_paper
 from rigd.control import (
     ClosedLoop,
     ControlDesignError,
     LoopResponse,
-    check_stability,
-    close_loop,
     design_damper,
+    stable_loop,
 )
 from rigd.engine import Ending
 from rigd.errors import UserError
@@ -90,6 +90,8 @@ class Plan:
     """Why it must not be run: a line for each limit that it would leave; empty if it may be run."""
     ending: Ending = field(default_factory=Ending)
     """What follows the record, for the control process."""
+    clearance: Clearance = field(default_factory=Clearance)
+    """What the checks on paper found."""
 
 
 class LoopPreview:
@@ -115,7 +117,7 @@ class LoopPreview:
 
     @cached_property
     def _loop(self) -> ClosedLoop:
-        return close_loop(self._profile.loop_model())
+        return stable_loop(self._profile.loop_model())[0]
 
     def tracking(self, frequency_hz: Real) -> Complex:
         """Angle over reference at some frequencies, of the shape given."""
@@ -212,29 +214,36 @@ def excitation_for(
     return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile, start_rad))
 
 
-def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
-    """Predict a session and refuse one that would leave the profile's limits.
+def plan_session(
+    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+) -> Plan:
+    """Predict a session and refuse one that the checks on paper or the profile's limits forbid.
 
     Parameters
     ----------
-    profile, excitation, force
+    profile, excitation, force, accept
         See `predict_session`.
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError
         Naming every limit the session would leave, and the largest amplitude that passes.
-    ControlDesignError, RealisationError
+    ControlDesignError, RealisationError, UnknownValueError
         As `predict_session`.
     """
-    plan = predict_session(profile, excitation, force=force)
+    plan = predict_session(profile, excitation, force=force, accept=accept)
+    plan.clearance.require()
     if plan.refused:
         raise RefusedError(plan.refused)
     return plan
 
 
-def predict_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
-    """Predict a session and compare it with the profile's limits.
+def predict_session(
+    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+) -> Plan:
+    """Check a session on paper, predict it, and compare it with the profile's limits.
 
     Parameters
     ----------
@@ -243,27 +252,33 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
     force
         Let torques be clipped, of the motor or of the sensor. No other limit can be forced: leaving
         it would end the session.
+    accept
+        Names of rows of `rigd check` that may fail.
 
     Raises
     ------
+    UnknownRowError
+        If `accept` names none.
+    UnknownValueError
+        If a value of the profile is unknown.
     ControlDesignError
         If the loop is unstable.
     RealisationError
         If the beam's damping cannot be realised.
     """
-    loop = close_loop(loop_model_with(profile, excitation.model))
-    unstable = check_stability(loop)
+    clearance = check_on_paper(profile, accept)
+    loop, unstable = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(loop, excitation)
     firm, forcible = (
         [finding for limited in channels if (finding := limited.violation())]
         for channels in _limited(profile, prediction)
     )
-    refusals: list[str] = []
+    refusals = list(clearance.refusals)
     if firm or (forcible and not force):
         lower = _remedy(profile, excitation, force=force)
-        refusals = [f"{finding}; {lower}." for finding in firm]
+        refusals += [f"{finding}; {lower}." for finding in firm]
         refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
-    warnings = [unstable] if unstable else []
+    warnings = [*clearance.warnings, *([unstable] if unstable else [])]
     if not refusals:
         warnings += [f"{finding}: it will be clipped and flagged." for finding in forcible]
     if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
@@ -274,6 +289,7 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
         tip_in_words=_tip_in_words(prediction, profile.rig.beam, excitation.kind),
         refused="\n".join(refusals),
         ending=_ending(loop, stays=excitation.stays),
+        clearance=clearance,
     )
 
 
@@ -320,7 +336,7 @@ def largest_amplitude(
     """
     if excitation.kind in ("modes", "until") or not _has_amplitude(excitation.kind):
         return None
-    loop = close_loop(profile.loop_model())
+    loop, _ = stable_loop(profile.loop_model())
     given_rad = abs(float(excitation.parameters["amplitude_rad"]))
 
     def share_at(amplitude_rad: float) -> float:
@@ -372,6 +388,7 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
             "tip_slope_rad": SMALL_SLOPE_RAD,
         },
         "refused": plan.refused or None,
+        "failed_checks": [asdict(each) for each in plan.clearance.failed],
         "tip_in_words": plan.tip_in_words,
         "beam": asdict(profile.rig.beam),
         "damping": asdict(profile.rig.damping),

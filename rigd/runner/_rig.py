@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, WhatMoves
+from rigd.devices import DeviceError, WhatMoves, describe_unknown_values
 from rigd.engine import (
     CONTROL,
     LIVE,
@@ -127,8 +127,11 @@ class Rig:
         Raises
         ------
         RigError
-            If that fails; everything is closed again then.
+            If that fails; everything is closed again then. Nothing is connected while a value of
+            the profile is unknown.
         """
+        if unknown := describe_unknown_values(self._profile.rig):
+            raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
         if self.connected:
             self.disconnect()
         try:

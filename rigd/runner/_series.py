@@ -6,7 +6,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -65,6 +65,8 @@ class Series:
         specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
+    accept
+        Names of rows of `rigd check` that may fail; those that do are recorded in the files.
     watch_fit
         Fit each record while it is recorded.
 
@@ -77,6 +79,8 @@ class Series:
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError, ControlDesignError, RealisationError
         If the sessions would leave the limits, cannot be predicted, or lack metadata that the
         profile requires.
@@ -93,6 +97,7 @@ class Series:
         repeat: int = 1,
         notes: Mapping[str, str] | None = None,
         force: bool = False,
+        accept: Sequence[str] = (),
         watch_fit: bool = False,
     ) -> None:
         self._watch_fit = watch_fit
@@ -107,7 +112,7 @@ class Series:
                 f"--repeat {repeat}: a {excitation.kind} ends elsewhere than it starts and is run "
                 "once; omit the option."
             )
-        self.plan = plan_session(profile, excitation, force=force)
+        self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -181,6 +186,7 @@ class Series:
                 self._touch,
                 self._watch_fit,
                 self._seed(number),
+                self.plan.clearance.accepted,
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:

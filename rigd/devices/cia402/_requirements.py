@@ -14,6 +14,7 @@ from enum import Enum, Flag, auto
 from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
+from rigd.devices import unknown_values
 from rigd.devices.cia402 import _objects as objects
 
 if TYPE_CHECKING:
@@ -506,7 +507,8 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
 def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     """Return what the set-up has the drive's objects hold, by index and sub-index.
 
-    Only what the set-up asks the drive about, such as which watchdog it has, is not among it.
+    Only what the set-up asks the drive about, such as which watchdog it has, is not among it; nor
+    is what follows from a value that the profile does not know.
 
     Parameters
     ----------
@@ -523,7 +525,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     at_sync = settings.torque_delivery == "at_sync"
     period_us = sync_period_us(rig.rate_hz)
     value, exponent = interpolation_time(rig.rate_hz)
-    limit = torque_limit_per_mille(rig)
+    unknown = unknown_values(rig)
     wanted = fixed_values(settings.node_id) | {
         (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
@@ -532,10 +534,12 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
         (objects.ABORT_OPTION, 0): settings.abort_option,
         (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
         (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
-        (objects.MAX_TORQUE, 0): limit,
-        **{(index, 0): limit for index in objects.TORQUE_LIMITS},
     }
-    if settings.max_speed_rad_s > 0:
+    if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown):
+        limit = torque_limit_per_mille(rig)
+        limiting = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
+        wanted |= {(index, 0): limit for index in limiting}
+    if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown:
         wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
     return wanted
 
