@@ -297,8 +297,8 @@ class Scene:
         """The limits of CHANGES let the shaft of a wired rig turn beyond its stop."""
         if self.mode == "direct":
             return []
-        names = ("travel_loop_fails", "travel_no_angle", "travel_missed_ticks")
-        return [word for name in names for word in ("--accept", name)]
+        ways = "loop_fails", "no_angle", "encoder_fails", "missed_ticks"
+        return [word for way in ways for word in ("--accept", f"travel_{way}")]
 
     @property
     def _where(self) -> list[object]:

@@ -104,14 +104,14 @@ def test_every_row_that_fails_has_a_name_of_its_check(lie):
         assert names <= set(check.names) | {""}
         assert check.names or names == {""}
     assert {each.name for each in check_on_paper(profile).failed} == {
-        "travel_loop_fails", "travel_no_angle", "travel_missed_ticks",
+        "travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks",
     }  # fmt: skip
 
 
 def test_only_what_is_accepted_passes(lie, tmp_path):
     profile = load_profile(lie("limits.stop_angle_rad", 0.51))
-    rows = ["travel_loop_fails", "travel_no_angle", "travel_missed_ticks"]
-    left = refusal(profile, tmp_path, "hold", accept=rows[:2])
+    rows = ["travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks"]
+    left = refusal(profile, tmp_path, "hold", accept=rows[:3])
     assert "(travel_missed_ticks)" in left
     assert "(travel_no_angle)" not in left
     assert not refusal(profile, tmp_path, "hold", accept=rows)

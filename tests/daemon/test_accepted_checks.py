@@ -62,7 +62,7 @@ def test_a_row_that_is_none_or_has_no_failure(operated):
     assert refused.wrong_use
     assert str(refused) == (
         "--accept travel: no row of rigd check has that name; those that can be accepted are eds, "
-        f"travel_loop_fails, travel_no_angle, {ROW}."
+        f"travel_loop_fails, travel_no_angle, travel_encoder_fails, {ROW}."
     )
     refused = operated.ask("start", **SHORT, accept=[ROW, "loop_stability"])
     assert refused.wrong_use
