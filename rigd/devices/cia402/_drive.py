@@ -167,14 +167,20 @@ class Cia402Drive:
         Returns
         -------
         dict
-            ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks something that the
-            profile accepts by name, ``drive_without``; where something stands in for an object,
-            ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
+            ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks
+            something that the profile accepts by name, ``drive_without``; where something stands
+            in for an object, ``drive_stand_ins``; objects that the profile has set,
+            ``drive_objects_set``.
         """
         outfit = self._outfit
         if outfit is None:
             return {}
+        numbers = ("vendor_id", "product_code", "revision", "serial_number")
         told = {
+            "drive_identity": " ".join(
+                f"0x{number:X}" if isinstance(number := outfit.identity.get(key), int) else "-"
+                for key in numbers
+            ),
             "drive_watchdog": outfit.watchdog.value,
             "drive_watchdog_s": repr(outfit.watchdog_s),
         }
