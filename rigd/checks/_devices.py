@@ -27,6 +27,8 @@ from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
 from rigd.engine import RealClock
 from rigd.profile import Profile
 
+_SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
+"""What a drive need not state of its position, and the objects."""
 _IN_HEX = ("vendor_id", "product_code", "supported_modes")
 
 
@@ -69,6 +71,8 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
         "supported_modes": "0x200 (cyclic torque) among them",
     }
     if settings is not None:
+        wanted["gear_ratio"] = f"{settings.gear_ratio:.5g}"
+        wanted["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
         wanted["vendor_id"] = f"{settings.vendor_id:#x}" if settings.vendor_id else "any"
         wanted["product_code"] = f"{settings.product_code:#x}" if settings.product_code else "any"
     for key, value in drive.identity().items():
@@ -76,7 +80,11 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
             found = f"{value:#x}"
         else:
             found = "not stated by the drive" if value in (None, "") else value_of(key, value)
-        yield Row("drive", name_of(key), found, wanted.get(key, ""), Verdict.OK)
+        verdict = Verdict.OK
+        if key in _SCALES and value is None:
+            found = f"unknown: the drive does not state it (object {_SCALES[key]})"
+            verdict = Verdict.SKIPPED
+        yield Row("drive", name_of(key), found, wanted.get(key, ""), verdict)
     outfit = drive.outfit() if isinstance(drive, OutfittedDrive) else None
     if outfit is not None:
         yield from _safeguard_rows(outfit)

@@ -153,6 +153,7 @@ class Cia402Drive:
             ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None where it has
             none), ``device_name``, ``supported_modes`` (object 6502), ``rated_torque_counts``
             (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft;
+            ``gear_ratio`` (6091) and ``encoder_step_rad`` (608F, 6092), None where it states none;
             ``quick_stop_option`` (605A) and ``fault_reaction_option`` (605E) where it has them.
         """
         return {} if self._outfit is None else dict(self._outfit.identity)
