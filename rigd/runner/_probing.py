@@ -4,20 +4,22 @@ A result holds until the computer is restarted, and as long as the values that i
 drive, the sensor and a simulated rig are the same. It is in the user's runtime folder.
 """
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from rigd.devices import described, find_simulator
+from rigd.devices import WhatMoves, described, find_simulator, what_moves
 from rigd.engine import probed_rig
 from rigd.errors import FailureError
 from rigd.profile import Profile
+from rigd.runner._process_group import ProcessGroup
+from rigd.runner._request import load_rig
 from rigd.runner._rig import Rig
-from rigd.runtime import StopRequest, runtime_folder
+from rigd.runtime import RigLock, StopRequest, runtime_folder
 from rigd.safety import ProbeEnd, ProbeEstimate, contradiction, doubts, plan_probe
 
 _MEASURED: Final = ("motor.inertia_kg_m2", "motor.rated_torque_nm", "encoder.resolution_rad")
@@ -165,7 +167,7 @@ def announcement(profile: Profile) -> str:
     """
     plan = plan_probe(probed_rig(profile))
     return (
-        "Probing move, because motor and encoder of the profile are not measured: strokes of up to "
+        "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
         f"{plan.travel_rad:.2g} rad to one side and back at {plan.speed_rad_s:.2g} and "
         f"{plan.fast_rad_s:.2g} rad/s, at most {plan.torque_limit_nm:.2g} N·m."
     )
@@ -191,12 +193,60 @@ def probe(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
     result = _result(rig.probe(profile, stop))
     document = {"key": _key(profile, rig), "boot": _boot(), "end": result.end.name}
     path = _file(profile)
-    with suppress(OSError):
+    with contextlib.suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         fresh = path.with_suffix(".new")
         fresh.write_text(json.dumps(document | result.estimate.as_dict()), encoding="utf-8")
         fresh.replace(path)
     return result
+
+
+def probe_in_foreground(
+    group: ProcessGroup,
+    stop: StopRequest,
+    *,
+    profile_name: str,
+    fast: bool,
+    hardware: bool,
+    says: Callable[[str], None],
+) -> tuple[Profile, ProbeResult]:
+    """Make a probing move by itself, whatever the profile states.
+
+    Parameters
+    ----------
+    group
+        The processes, started; ended when this returns.
+    stop
+        The operator's.
+    profile_name
+        Name or path of the profile.
+    fast, hardware
+        As on the command line.
+    says
+        Takes what the operator should know before it begins.
+
+    Returns
+    -------
+    profile, result
+        The profile, and what the move showed.
+
+    Raises
+    ------
+    UserError
+        If it is refused.
+    RigError
+        If the rig cannot be connected, or the move is stopped or ended by an interlock.
+    """
+    with contextlib.ExitStack() as reserved, group:
+        profile, moving = load_rig(profile_name, fast=fast, hardware=hardware)
+        says(what_moves(profile.rig, moving))
+        alone = not (fast and moving is WhatMoves.SIMULATED)
+        shared = moving is WhatMoves.HARDWARE
+        reserved.enter_context(RigLock(profile.name, "rigd probe", hardware=shared, alone=alone))
+        rig = Rig(profile, fast=fast, group=group)
+        rig.connect(moving)
+        says(announcement(profile))
+        return profile, probe(profile, rig, stop)
 
 
 def stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:

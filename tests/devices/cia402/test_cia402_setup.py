@@ -153,6 +153,8 @@ def test_who_the_drive_is(drive):
         "supported_modes": 0x3ED,
         "rated_torque_counts": 5,
         "rated_torque_nm": pytest.approx(0.5),
+        "gear_ratio": None,
+        "encoder_step_rad": None,
     }
 
 
