@@ -26,6 +26,7 @@ from rigd.devices import (
 from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
 from rigd.engine import RealClock
 from rigd.profile import Profile
+from rigd.safety import MEASURED
 
 _SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
 """What a drive need not state of its position, and the objects."""
@@ -322,6 +323,29 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row
     return Row(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
 
 
+# Probing move
+
+
+def probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
+    """Say whether scales and signs are known, or verified before the first session."""
+    if moves is WhatMoves.SIMULATED:
+        return
+    missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
+    if not missing:
+        found, verdict = "motor and encoder are measured", Verdict.OK
+    else:
+        found = "scales and signs: verified by the probing move before the first session"
+        verdict = Verdict.SKIPPED
+    detail = (
+        f"Probing move: sessions begin with it because {', '.join(missing)} "
+        f"{'is' if len(missing) == 1 else 'are'} not measured; rigd probe makes it by itself "
+        "(docs/safety.md)."
+        if missing
+        else ""
+    )
+    yield Row("drive", "probing move", found, "", verdict, detail)
+
+
 # All devices
 
 
@@ -352,6 +376,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
         yield Row("drive", "connection", _answer(moves), "an answer, no fault", Verdict.OK)
         if isinstance(drive, InspectableDrive):
             yield from drive_rows(drive, rig)
+        yield from probing_rows(profile, moves)
 
     def about_sensor() -> Iterator[Row]:
         sensor.connect()

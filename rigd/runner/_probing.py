@@ -20,10 +20,8 @@ from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import load_rig
 from rigd.runner._rig import Rig
 from rigd.runtime import RigLock, StopRequest, runtime_folder
-from rigd.safety import ProbeEnd, ProbeEstimate, contradiction, doubts, plan_probe
+from rigd.safety import MEASURED, ProbeEnd, ProbeEstimate, contradiction, doubts, plan_probe
 
-_MEASURED: Final = ("motor.inertia_kg_m2", "motor.rated_torque_nm", "encoder.resolution_rad")
-"""Values of an identified motor: with the source "measured" they are not probed."""
 _VERIFIED: Final = (
     "rate_hz", "beam.", "damping.", "motor.", "encoder.", "actuation.", "sensor.projection",
     "sensor.tool_inertia_kg_m2", "sensor.delay_s", "cia402.direction", "cia402.gear_ratio",
@@ -143,7 +141,7 @@ def verify(
 
 def _is_identified(profile: Profile) -> bool:
     """Whether a profile states that motor and encoder were measured."""
-    return all(profile.sources.get(key) == "measured" for key in _MEASURED)
+    return all(profile.sources.get(key) == "measured" for key in MEASURED)
 
 
 def _is_simulated_alike(profile: Profile) -> bool:

@@ -13,6 +13,7 @@ from ._probe_estimate import ProbeEstimate as ProbeEstimate
 from ._probe_estimate import contradiction as contradiction
 from ._probe_estimate import doubts as doubts
 from ._probe_estimate import estimate_probe as estimate_probe
+from ._probing_move import MEASURED as MEASURED
 from ._probing_move import ProbedRig as ProbedRig
 from ._probing_move import ProbeEnd as ProbeEnd
 from ._probing_move import ProbePlan as ProbePlan

@@ -1,12 +1,13 @@
 """Estimate of scales and friction from the record of a probing move, and the verdict on them."""
 
-from dataclasses import asdict, dataclass
-from math import log, sqrt
+from dataclasses import asdict, dataclass, replace
+from math import hypot, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.safety._probing_move import ProbedRig, ProbeEnd, ProbingMove, beam_oscillators, held_line
+from rigd.beam import transfer
+from rigd.safety._probing_move import ProbedRig, ProbeEnd, ProbingMove
 
 Real = NDArray[np.float64]
 
@@ -16,13 +17,16 @@ little."""
 WARNING_BAND = (0.8, 1.25)
 """Ratios beyond which the operator is warned."""
 
-_FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.88, 1.12, 25))
+_FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
 """Of the beam's frequencies: a beam a little stiffer than its data must not look like a scale."""
 _SMOOTH_S = 0.008
 """Standard deviation of the window through which all signals are seen."""
 _LEAST_SPEED_PART = 0.1
 """Part of the largest speed below which friction has no certain sign."""
 _LEAST_SAMPLES = 50
+_TOP_HZ = 100.0
+"""Above it that window lets nothing through."""
+_DECAY = 12.0
 _WORST_CONDITION = 1e6
 _LARGEST_STD = 0.1
 """Relative uncertainty of a ratio beyond which it counts as unknown."""
@@ -95,6 +99,11 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     moving: NDArray[np.bool_] = np.abs(speed) > _LEAST_SPEED_PART * fastest
     found = _motor(smooth(command), acceleration, speed, beam_nm, moving, window.size)
     scale, scale_std, inertia, inertia_std, coulomb, viscous = found
+    if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
+        # Both count in the torque of the beam as it was fitted.
+        part = ratio_std / ratio
+        scale_std = hypot(scale_std, part * scale)
+        inertia_std = hypot(inertia_std, part * inertia)
     return ProbeEstimate(
         ratio,
         ratio_std,
@@ -146,19 +155,26 @@ def _correlated(window: Real) -> float:
 
 
 def _beam_torques(rig: ProbedRig, angle: Real) -> Real:
-    """Torque of the beam at the measured angle, for each factor on its frequencies: (f, n)."""
-    pole, residue, stiffness, _ = beam_oscillators(rig, _FREQUENCY_FACTORS)
-    # The inertias are those of the profile; only the frequencies differ.
-    steps = [held_line(complex(p), complex(r), 1.0 / rig.rate_hz)
-             for p, r in zip(pole.ravel(), residue.ravel(), strict=True)]  # fmt: skip
-    turn, first, last = (np.array(part).reshape(pole.shape) for part in zip(*steps, strict=True))
-    state = np.zeros_like(pole)
-    result = np.empty((len(pole), angle.size))
-    before = 0.0
-    for tick, now in enumerate(angle.tolist()):
-        state = turn * state + first * before + last * now
-        result[:, tick] = np.sum(stiffness.real * (now - 2.0 * state.real), axis=1)
-        before = now
+    """Torque of the exact beam at the measured angle, for factors on its frequencies: (f, n)."""
+    n = angle.size
+    padded = 1 << (2 * n - 1).bit_length()
+    # On s = sigma + j omega what wraps round has decayed.
+    sigma = _DECAY * rig.rate_hz / padded
+    frequency_hz = np.fft.rfftfreq(padded, 1.0 / rig.rate_hz)
+    inside = frequency_hz <= _TOP_HZ
+    s = sigma + 2j * pi * frequency_hz[inside]
+    growth = np.exp(sigma * np.arange(padded) / rig.rate_hz)
+    held = np.full(padded, angle[-1])
+    held[:n] = angle
+    turned = np.fft.rfft(held / growth)[inside]
+    result = np.empty((len(_FREQUENCY_FACTORS), n))
+    spectrum = np.zeros(frequency_hz.size, dtype=np.complex128)
+    for row, factor in zip(result, _FREQUENCY_FACTORS, strict=True):
+        stiffness = rig.beam.bending_stiffness_n_m2 * factor**2
+        beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
+        response = transfer(s, beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
+        spectrum[inside] = response * turned
+        row[:] = (np.fft.irfft(spectrum, padded) * growth)[:n]
     return result
 
 
