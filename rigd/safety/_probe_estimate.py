@@ -239,7 +239,7 @@ def contradiction(
         Judge the motor's torque and inertia too, not only what the bounds of travel and speed rest
         on.
     """
-    found = _of_motion(rig, end, estimate)
+    found = _of_motion(rig, end)
     if not found and (end is ProbeEnd.PULLED or not _accepted(estimate.coupling_ratio)):
         found = _of_coupling(estimate, motor=motor)
     if not found and motor:
@@ -275,7 +275,7 @@ def _accepted(ratio: float | None) -> bool:
     return ratio is not None and low <= ratio <= high
 
 
-def _of_motion(rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate) -> str:
+def _of_motion(rig: ProbedRig, end: ProbeEnd | None) -> str:
     """Return what a shaft shows that moves the wrong way or, as far as is measured, not at all."""
     if end is ProbeEnd.REVERSED:
         return (
@@ -289,8 +289,7 @@ def _of_motion(rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate) ->
             f"torque ({0.5 * rig.rated_torque_nm:.3g} N·m). The shaft is blocked or its friction "
             "far above motor.coulomb_nm, or the motor is weaker than motor.rated_torque_nm says."
         )
-    still_rad = 8.0 * rig.resolution_rad
-    if end is ProbeEnd.PULLED and estimate.travel_rad <= still_rad:
+    if end is ProbeEnd.STILL:
         return (
             "the encoder stands still while the coupling torque shows that the beam is moved. "
             "Check the encoder and its cable, then the sensor."

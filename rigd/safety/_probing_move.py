@@ -202,6 +202,7 @@ class ProbeEnd(Enum):
     COMPLETE = "all strokes were made"
     BLOCKED = "the shaft did not move"
     REVERSED = "the encoder counts against the torque"
+    STILL = "the encoder stands still while the beam pulls"
     PULLED = "the coupling torque is not the beam's at the measured angle"
     AWAY = "the shaft left the bounds of the move"
 
@@ -221,6 +222,8 @@ _PULL_NOISE = 2.5
 _PULL_PART = 0.4
 """Difference from the beam's torque that ends the move: a floor, or so many standard deviations at
 rest, and a part of that torque."""
+_STILL_S = 0.025
+"""Time without a new angle that shows an encoder that stands still, where the beam pulls."""
 _PAUSE_S = 0.15
 _LONGEST_S = 5.0
 """Time for a stroke, which a sound one does not need."""
@@ -346,7 +349,11 @@ class ProbingMove:
         self._reach_nm = max(abs(self._smooth_beam_nm), fade * self._reach_nm)
         difference_nm = abs(self._smooth_coupling_nm - self._smooth_beam_nm)
         if self.end is None and difference_nm > self._pull_nm + _PULL_PART * self._reach_nm:
-            self.end = ProbeEnd.PULLED
+            self.end = ProbeEnd.STILL if self._stands_still(angle_rad) else ProbeEnd.PULLED
+
+    def _stands_still(self, angle_rad: float) -> bool:
+        recent = self.angles_rad[-max(3, self._ticks(_STILL_S)) :]
+        return all(each == angle_rad for each in recent)
 
     def _check(self, angle_rad: float) -> None:
         """End a move that leaves its bounds."""
