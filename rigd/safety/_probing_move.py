@@ -218,10 +218,10 @@ _MOVED_STEPS = 8
 """Encoder steps that count as a motion: a number that is right whatever the step is."""
 _LEAST_MOVED_RAD = 2e-4
 _PULL_NM = 8e-3
-_PULL_NOISE = 2.5
-_PULL_PART = 0.4
-"""Difference from the beam's torque that ends the move: a floor, or so many standard deviations at
-rest, and a part of that torque."""
+_PULL_NOISE = 2.0
+_PULL_PART = 0.6
+"""Difference from the beam's torque that ends the move: the largest of a floor, of so many standard
+deviations at rest, and of a part of that torque."""
 _STILL_S = 0.025
 """Time without a new angle that shows an encoder that stands still, where the beam pulls."""
 _PAUSE_S = 0.15
@@ -348,7 +348,7 @@ class ProbingMove:
         fade = 1.0 - 3.0 * self._period_s
         self._reach_nm = max(abs(self._smooth_beam_nm), fade * self._reach_nm)
         difference_nm = abs(self._smooth_coupling_nm - self._smooth_beam_nm)
-        if self.end is None and difference_nm > self._pull_nm + _PULL_PART * self._reach_nm:
+        if self.end is None and difference_nm > max(self._pull_nm, _PULL_PART * self._reach_nm):
             self.end = ProbeEnd.STILL if self._stands_still(angle_rad) else ProbeEnd.PULLED
 
     def _stands_still(self, angle_rad: float) -> bool:
