@@ -15,9 +15,9 @@ def probe(
     hardware: Hardware = False,
     as_json: AsJson = False,
 ) -> None:
-    """Verify scales and signs of motor, encoder and sensor by a small move.
+    """Verify the rig's scales and signs by a small move.
 
-    The shaft makes strokes of 0.3 rad at 0.4 and 0.8 rad/s under tight bounds; about eight seconds.
+    Those of motor, encoder and sensor against each other and the beam. The shaft makes strokes of 0.3 rad at 0.4 and 0.8 rad/s under tight bounds; about eight seconds.
     Sessions on hardware make this move by themselves before the first one, unless the profile
     states that motor and encoder were measured. Exits with 1 if the rig contradicts the profile.
 

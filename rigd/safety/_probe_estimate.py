@@ -18,7 +18,7 @@ WARNING_BAND = (0.8, 1.25)
 """Ratios beyond which the operator is warned."""
 
 _FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
-"""Of the beam's frequencies: a beam a little stiffer than its data must not look like a scale."""
+"""Factors on the beam's frequencies that are tried: a stiffer beam must not look like a scale."""
 _SMOOTH_S = 0.008
 """Standard deviation of the window through which all signals are seen."""
 _LEAST_SPEED_PART = 0.1
