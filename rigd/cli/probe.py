@@ -17,9 +17,10 @@ def probe(
 ) -> None:
     """Verify the rig's scales and signs by a small move.
 
-    Those of motor, encoder and sensor against each other and the beam. The shaft makes strokes of 0.3 rad at 0.4 and 0.8 rad/s under tight bounds; about eight seconds.
-    Sessions on hardware make this move by themselves before the first one, unless the profile
-    states that motor and encoder were measured. Exits with 1 if the rig contradicts the profile.
+    Compares motor, encoder and sensor with each other and with the beam. The shaft makes strokes of
+    0.3 rad at 0.4 and 0.8 rad/s under tight bounds; about eight seconds. Sessions on hardware begin
+    with this move by themselves, unless the profile states that motor and encoder were measured.
+    Exits with 1 if the rig contradicts the profile.
 
     Example: rigd probe --profile sim --fast
     """
