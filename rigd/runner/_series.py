@@ -21,7 +21,7 @@ from rigd.runner._planning import (
 )
 from rigd.runner._quick_looks import QuickLooks
 from rigd.runner._request import Order, check_required, choose_path, make_room
-from rigd.runner._rig import Rig
+from rigd.runner._rig import Rig, RigError
 from rigd.runner._session import SessionProgress, SessionResult, always
 from rigd.runner._touch_search import touch_search
 from rigd.runtime import StopRequest
@@ -170,7 +170,12 @@ class Series:
         ProbeFailedError
             If a probing move before the first session shows that the rig contradicts its profile.
         """
-        probed = {} if stop.requested else self._probe(rig, stop, watcher)
+        try:
+            probed = {} if stop.requested else self._probe(rig, stop, watcher)
+        except RigError:
+            if stop.requested and rig.connected:
+                return  # the move was stopped, and nothing else happened
+            raise
         for number in range(1, self._repeat + 1):
             if looks is not None and number > 1:
                 _await_look(looks, rig, stop)
