@@ -13,6 +13,7 @@ from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import errors_told
+from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
@@ -37,7 +38,7 @@ _SECTIONS: Final = {
     "Sessions": ("run", "serve", "start", "status", "stop"),
     "Rig": ("check", "tare", "zero", "reset", "live"),
     "Session files": ("list", "info", "replay", "recover"),
-    "Set-up": ("profiles", "specimens", "identify", "bench"),
+    "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
 """Commands by what they are for, as the help lists them."""
@@ -92,6 +93,7 @@ app.command()(specimens)
 app.command()(info)
 app.command()(replay)
 app.command()(recover)
+app.command()(probe)
 app.add_typer(identify_app, name="identify")
 app.add_typer(profiles_app, name="profiles")
 app.command()(bench)

@@ -41,6 +41,7 @@ from rigd.errors import RigdError, UserError
 from rigd.profile import Profile, with_specimen
 from rigd.runner import (
     NoRoomError,
+    ProbeFailedError,
     QuickLook,
     QuickLooks,
     Rig,
@@ -527,7 +528,7 @@ class Service:
         loop = asyncio.get_running_loop()
         try:
             await self._call(partial(self._run_series, series, planned, loop))
-        except (UserError, RigError, SessionFailedError) as error:
+        except (UserError, RigError, ProbeFailedError, SessionFailedError) as error:
             series.reason = str(error)
             if not error.wrong_use:
                 path = error.path if isinstance(error, SessionFailedError) else None

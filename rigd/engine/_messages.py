@@ -5,7 +5,7 @@ The supervisor gives jobs and orders, the others answer:
 ============  =============================================  ================================
 process       is told                                        tells
 ============  =============================================  ================================
-control       ControlJob, then SessionJob, Tare, Zero        Connected, then Ready, Finished;
+control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Ready, Finished;
                                                              Measured or Refused; last Ended
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
@@ -116,6 +116,14 @@ class Zero:
 
 
 @dataclass(frozen=True, slots=True)
+class Probe:
+    """Make the probing move of a profile."""
+
+    profile: "Profile"
+    """The rig's; its beam may be another."""
+
+
+@dataclass(frozen=True, slots=True)
 class Connected:
     """The devices are connected, and the torque is off."""
 
@@ -160,7 +168,7 @@ class Measured:
     """What was measured between sessions."""
 
     values: dict[str, Any]
-    """Results by name, as :meth:`rigd.runner.Rig.tare` and :meth:`rigd.runner.Rig.zero` return."""
+    """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,7 @@ def run_in_foreground(
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
+    identifies_motor: bool = False,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -107,6 +108,8 @@ def run_in_foreground(
         What a simulated beam meets, as on the command line.
     watch_fit
         Fit each record while it is recorded, and tell.
+    identifies_motor
+        See :class:`rigd.runner._series.Series`.
 
     Raises
     ------
@@ -154,6 +157,7 @@ def run_in_foreground(
                 force=force,
                 accept=accept,
                 watch_fit=watch_fit,
+                identifies_motor=identifies_motor,
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
@@ -200,6 +204,9 @@ class _Operator:
     def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - told when it is there
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
         self._line = ProgressLine()
+
+    def says(self, level: str, text: str) -> None:
+        self._tell(f"Warning: {text}" if level == "warning" else text)
 
     def shown(self, where: str) -> None:
         if where != self._where:

@@ -402,6 +402,25 @@ OPTIONAL: Final = (
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
         fit=Fit.ANY,
     ),
+    *(
+        Requirement(
+            index,
+            sub,
+            name,
+            False,
+            _R,
+            "the probing move before the first session (docs/safety.md)",
+            fit=Fit.ANY,
+        )
+        for index, sub, name in (
+            (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
+            (objects.ENCODER_RESOLUTION, 2, "Motor revolutions"),
+            (objects.GEAR_RATIO, 1, "Motor shaft revolutions"),
+            (objects.GEAR_RATIO, 2, "Driving shaft revolutions"),
+            (objects.FEED_CONSTANT, 1, "Feed"),
+            (objects.FEED_CONSTANT, 2, "Driving shaft revolutions of the feed"),
+        )
+    ),
     Requirement(
         objects.ACTUAL_TORQUE,
         0,
