@@ -48,6 +48,7 @@ from rigd.runner import (
     SessionFailedError,
     excitation_for,
     what_is_kept,
+    with_tip_slope,
 )
 
 LOOK_S = 0.2
@@ -366,6 +367,7 @@ class Service:
             request.force,
             request.notes.specimen,
             self._start_rad(),
+            request.tip_slope_rad,
         )
         self._predictions += 1
         try:
@@ -498,6 +500,7 @@ class Service:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
+            profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters, self._start_rad()),

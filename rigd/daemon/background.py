@@ -48,6 +48,8 @@ class PredictionJob:
     """Name of the specimen; empty: the profile's."""
     start_rad: float = 0.0
     """Where the motor stands, from the rig's zero."""
+    tip_slope_rad: float | None = None
+    """Largest slope of the tip in an identification; None: the profile's."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
@@ -57,9 +59,11 @@ class PredictionJob:
             largest_amplitude,
             plan_document,
             predict_session,
+            with_tip_slope,
         )
 
         profile = with_specimen(self.profile, self.specimen)
+        profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
         plan = predict_session(profile, excitation, force=self.force)
         return {

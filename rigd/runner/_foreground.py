@@ -21,6 +21,7 @@ from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._session import SessionFailedError, SessionProgress, SessionResult
+from rigd.runner._tip_slope import with_tip_slope
 from rigd.runtime import RigLock, StopRequest
 
 _LOOK_PATIENCE_S: Final = 10.0
@@ -71,6 +72,7 @@ def run_in_foreground(
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
+    tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -102,6 +104,8 @@ def run_in_foreground(
         What a simulated beam meets, as on the command line.
     watch_fit
         Fit each record while it is recorded, and tell.
+    tip_slope_rad
+        Largest slope of the tip in an identification; None: the profile's.
 
     Raises
     ------
@@ -127,6 +131,7 @@ def run_in_foreground(
             )
             if prepare is not None:
                 profile = prepare(profile)
+            profile = with_tip_slope(profile, tip_slope_rad)
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")

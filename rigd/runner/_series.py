@@ -175,7 +175,11 @@ class Series:
                 self._excitation,
                 path,
                 tuple(notes.items()),
-                tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+                tuple(
+                    predicted_metadata(
+                        self._profile, self.plan.prediction, self._excitation
+                    ).items()
+                ),
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,

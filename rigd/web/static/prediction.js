@@ -52,10 +52,13 @@ export class Prediction {
     const { tip } = plan;
     if (tip) {
       bars.push(peakBar("Tip slope, linear model", tip.slope_rad, limits.tip_slope_rad, "rad"));
-      bars.push(peakBar("Tip deflection", 1e3 * tip.deflection_m, undefined, "mm"));
-      bars.push(peakBar("Tip speed", tip.speed_m_s, undefined, "m/s"));
+      if (tip.physical !== false) {
+        bars.push(peakBar("Tip deflection", 1e3 * tip.deflection_m, undefined, "mm"));
+        bars.push(peakBar("Tip speed", tip.speed_m_s, undefined, "m/s"));
+      }
     }
     const words = [];
+    if (tip && plan.tip_in_words) words.push(make("p", { class: "muted" }, plan.tip_in_words));
     if (plan.refused) words.push(make("p", { class: "refused" }, plan.refused));
     for (const warning of plan.warnings ?? []) {
       words.push(make("p", { class: "refused" }, `Warning: ${warning}`));
