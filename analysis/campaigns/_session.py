@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from analysis.campaigns._experiment import Experiment, task_errors
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
 from analysis.results import RecordResult, whole_record
+from rigd.session import Validity
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ class SessionResult:
         Band of the whole-record fits.
     name : str
         What tables and sentences call it: see `told_apart`; by itself the name of its file.
+    validity : Validity
+        How exact the linear model is for the session.
     """
 
     path: Path
@@ -106,6 +109,7 @@ class SessionResult:
     settings: WelchSettings = _USUAL
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
     name: str = ""
+    validity: Validity = field(default_factory=Validity)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
@@ -225,6 +229,7 @@ def _session_result(
         headline=None if whole is None else whole.headline_json(),
         settings=welch_settings(record, task.settings, task.band_hz),
         record_band_hz=record_band_hz(record, task.band_hz),
+        validity=result.validity,
     )
 
 

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from rigd.printable import listed
 from rigd.session._format import Buffer, SessionError, decode_samples
+from rigd.session._validity import Validity
 from rigd.units import decimals, with_half_width
 
 _VERSION: Final = 1
@@ -225,6 +226,8 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     unseen = unseen_modes(answer["modes"])
     if unseen:
         lines.append(f"  not visible so far: {unseen}")
+    if answer["modes"]:
+        lines.append(f"  {Validity.of_document(answer.get('validity')).sentence}")
     return [*lines, *found]
 
 
