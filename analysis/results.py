@@ -10,8 +10,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from analysis.validity import record_validity
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
@@ -220,6 +218,8 @@ class RecordResult:
 
 
 def _validity(record: Record, model: tuple[Beam, Damping] | None) -> Validity:
+    from analysis.validity import record_validity
+
     return record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
 
 

@@ -216,7 +216,9 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     found = [f"  {sentence}" for sentence in answer["findings"]]
     if answer["problem"]:
         return [f"After {answer['duration_s']:.1f} s: {answer['problem']}", *found]
-    lines = [f"After {answer['duration_s']:.1f} s (± 95 %, statistical only):"]
+    validity = Validity.of_document(answer.get("validity")).short
+    head = f"± 95 %, statistical only; tip slope {validity}"
+    lines = [f"After {answer['duration_s']:.1f} s ({head}):"]
     earlier = {mode["mode"]: mode for mode in (before or {}).get("modes", ()) if mode["shown"]}
     for mode in answer["modes"]:
         if mode["shown"]:
@@ -226,8 +228,6 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     unseen = unseen_modes(answer["modes"])
     if unseen:
         lines.append(f"  not visible so far: {unseen}")
-    if answer["modes"]:
-        lines.append(f"  {Validity.of_document(answer.get('validity')).sentence}")
     return [*lines, *found]
 
 

@@ -57,8 +57,8 @@ export class Prediction {
         bars.push(peakBar("Tip speed", tip.speed_m_s, undefined, "m/s"));
       }
     }
+    if (tip && plan.tip_in_words) bars.push(make("p", { class: "muted" }, plan.tip_in_words));
     const words = [];
-    if (tip && plan.tip_in_words) words.push(make("p", { class: "muted" }, plan.tip_in_words));
     if (plan.refused) words.push(make("p", { class: "refused" }, plan.refused));
     for (const warning of plan.warnings ?? []) {
       words.push(make("p", { class: "refused" }, `Warning: ${warning}`));
