@@ -194,11 +194,11 @@ class RecordResult:
     def __post_init__(self) -> None:
         if self.whole is not None:
             validity = self.whole.validity
-        elif self.welch is not None and self.welch.models:
-            freest = max(self.welch.models, key=lambda each: len(each.fit.structure.free))
-            validity = _validity(self.record, (self.record.beam, freest.fit.damping))
         else:
-            validity = _validity(self.record, None)
+            # Welch's fits differ: the slope is up to the largest of theirs.
+            models = () if self.welch is None else self.welch.models
+            dampings = [each.fit.damping for each in models]
+            validity = _validity(self.record, *((self.record.beam, each) for each in dampings))
         object.__setattr__(self, "validity", validity)
 
     @property
@@ -217,10 +217,10 @@ class RecordResult:
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
-def _validity(record: Record, model: tuple[Beam, Damping] | None) -> Validity:
+def _validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
     from analysis.validity import record_validity
 
-    return record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
+    return record_validity(record.metadata, record.angle_rad, record.rate_hz, *models)
 
 
 def whole_record(

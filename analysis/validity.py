@@ -44,7 +44,7 @@ def record_validity(
     metadata: Mapping[str, str],
     angle_rad: NDArray[np.float64],
     rate_hz: float,
-    model: tuple[Beam, Damping] | None,
+    *models: tuple[Beam, Damping],
 ) -> Validity:
     """Return the validity of a record: as its file states it, else from the measured angle.
 
@@ -56,14 +56,18 @@ def record_validity(
         Measured angle at consecutive ticks.
     rate_hz : float
         Ticks a second.
-    model : tuple of Beam and Damping, or None
-        Estimated from the record; without it a file that states nothing leaves it unknown.
+    *models : tuple of Beam and Damping
+        Estimated from the record, of which the largest slope counts; without any, a file that
+        states nothing leaves it unknown.
     """
     stated = stated_validity(metadata)
-    if stated.predicted_peak_tip_slope_rad is not None or model is None:
+    if stated.predicted_peak_tip_slope_rad is not None:
         return stated
     with np.errstate(all="ignore"):  # an estimate that does not suit may overflow: then unknown
-        return _of_slope(tip_motion(*model, angle_rad, rate_hz).slope_rad)
+        return worst(
+            _of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
+            for beam, damping in models
+        )
 
 
 def worst(validities: Iterable[Validity]) -> Validity:

@@ -49,7 +49,7 @@ def test_every_output_with_a_damping_has_its_validity(record_result, report):
     searched = outputs(record_result) | alone | written
     found = {name for name, text in searched.items() if NUMBER_OF_DAMPING.search(text)}
     assert len(found) > 15
-    # From Welch's fits alone the slope comes out a little different.
+    # From Welch's fits alone the slope comes out larger: the largest of theirs counts.
     stated = re.compile(r"Tip slopes up to 0\.4\d rad|predicted_peak_tip_slope_rad\W+0\.4|"
                         r"predicted_peak_tip_slope_rad,linear_model_error")  # fmt: skip
     assert not [name for name in found if not stated.search(searched[name])]
@@ -61,7 +61,7 @@ def test_the_slope_is_computed_from_a_record_that_states_none(record_result):
     error = record_result.validity.linear_model_error
     assert error == linear_model_error(of_record)
     by_welch = replace(record_result, whole=None).validity.predicted_peak_tip_slope_rad
-    assert by_welch == pytest.approx(of_record, rel=0.1)
+    assert by_welch == pytest.approx(of_record, rel=0.25)
     assert replace(record_result, whole=None, welch=None).validity == Validity()
 
 
