@@ -126,6 +126,8 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
         )
     if excitation.kind in NOT_IDENTIFYING:
         return f"{motion}{_MEANING[excitation.kind]}."
+    if excitation.kind not in KINDS:
+        return f"{motion}; the identification of the motor does not rest on it."
     lower = _rounded_down(SMALL_SLOPE_RAD / tip.slope_rad)
     within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
     exempt = (

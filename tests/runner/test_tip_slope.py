@@ -7,6 +7,7 @@ import pytest
 
 from rigd.beam import SMALL_SLOPE_RAD, linear_model_error
 from rigd.excitation import chirp, from_csv, multisine, step
+from rigd.identification import speeds_session
 from rigd.runner import (
     excitation_for,
     largest_amplitude,
@@ -79,6 +80,15 @@ def test_moves_and_touches_state_their_slope_and_are_not_refused(profile, kind, 
     assert "slope" not in plan.refused
     assert f"slope {plan.prediction.tip.slope_rad:.2g} rad" in plan.tip_in_words
     assert meaning in plan.tip_in_words
+
+
+def test_the_identification_of_the_motor_does_not_rest_on_the_model(profile):
+    excitation = speeds_session(profile, torque_percent=40.0, stroke_rad=0.8)
+    plan = predict_session(profile, excitation)
+    assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
+    assert not plan.refused
+    assert "does not rest on it" in plan.tip_in_words
+    assert "amplitude" not in plan.tip_in_words
 
 
 def test_a_deflection_that_no_beam_has_is_not_stated(profile):
