@@ -15,7 +15,7 @@ export function modesInShort(modes, validity) {
     `${estimate(frequency, 1, 1).value} Hz, ${estimate(damping, 100, 1).value} %${flagged ? " (flagged)" : ""}`);
   });
   if (modes.length) {
-    parts.push(make("span", { class: "line muted" }, validity?.sentence ?? NOT_KNOWN));
+    parts.push(make("div", { class: "muted" }, validity?.sentence ?? NOT_KNOWN));
   }
   return parts;
 }
