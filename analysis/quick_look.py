@@ -347,7 +347,7 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     for mode in shown:
         yield f"  {mode_line(mode)}"
     if shown:
-        yield f"  {Validity.of_document(document['validity']).sentence}"
+        yield f"  {Validity.of_document(document.get('validity')).sentence}"
     doubts = dict.fromkeys(
         flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
     )
