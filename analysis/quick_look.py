@@ -23,7 +23,15 @@ from typing import TYPE_CHECKING, Any, Final
 from rigd.library import change_between
 from rigd.printable import listed
 from rigd.runtime import begin_background, raise_on
-from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_line, read_look
+from rigd.session import (
+    LOOK_VERSION,
+    SessionError,
+    Validity,
+    last_look,
+    look_path,
+    mode_line,
+    read_look,
+)
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -87,6 +95,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     response, coherence = None, _no_coherence()
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     flags: list[str] = []
+    validity = Validity()
     compared = None
     try:
         record = load_record(path)
@@ -98,7 +107,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        modes, more = _modes(record)
+        modes, validity, more = _modes(record)
         flags += more
         response, coherence, more = _response(record)
         flags += more
@@ -115,6 +124,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         "specimen": specimen,
         "excitation": excitation,
         "modes": modes,
+        "validity": validity.as_json(),
         "coherence": coherence,
         "flags": flags,
         "against_last": compared,
@@ -124,11 +134,12 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     return dict(finite(document))
 
 
-def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
-    """Estimate the modes; return them, and what is to be said of them."""
+def _modes(record: Record) -> tuple[list[dict[str, Any]], Validity, list[str]]:
+    """Estimate the modes; return them, their validity, and what is to be said of them."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
+    from analysis.validity import record_validity, stated_validity
 
     said = []
     length_s = record.time_s.size / record.rate_hz
@@ -136,21 +147,24 @@ def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
         told: Headline
         found: tuple[Finding, ...]
         if length_s <= _JUDGED_S:
-            selection = whole_record(record).selection
-            told, found = selection.headline, selection.verdict.findings
+            whole = whole_record(record)
+            told, found, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
             told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            model = told.fit.plant.beam, told.fit.plant.damping
+            validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
             said.append(
                 f"The record is long ({length_s:.0f} s): type {told.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
-        return [], [f"No modes: {_without_name(str(error), record.path)}"]
+        no_modes = f"No modes: {_without_name(str(error), record.path)}"
+        return [], stated_validity(record.metadata), [no_modes]
     said += [each.sentence for each in found]
     if not told.modes:
         said.append("No modes: none lies in the excited band.")
-    return [_mode(each) for each in told.modes], said
+    return [_mode(each) for each in told.modes], validity, said
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -335,6 +349,8 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     shown = [mode for mode in document["modes"] if mode["shown"]]
     for mode in shown:
         yield f"  {mode_line(mode)}"
+    if shown:
+        yield f"  {Validity.of_document(document.get('validity')).sentence}"
     doubts = dict.fromkeys(
         flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
     )

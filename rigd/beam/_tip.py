@@ -33,6 +33,28 @@ _BLOCK = 1 << 15
 """Frequencies that are evaluated at once, lest an hour at 1 kHz take a gigabyte."""
 
 
+def linear_model_error(slope_rad: float) -> float:
+    """Return a bound of the linear model's relative error, from the largest slope of the tip.
+
+    Parameters
+    ----------
+    slope_rad
+        Largest slope of the tip against the root.
+
+    Returns
+    -------
+    float
+        A third of the slope squared: see `SMALL_SLOPE_RAD`. From 1 on the model says nothing.
+
+    Examples
+    --------
+    >>> from rigd.beam import linear_model_error
+    >>> print(f"{100 * linear_model_error(0.6):.0f} %")
+    12 %
+    """
+    return slope_rad * slope_rad / 3.0  # infinite, not an error, of what no tip does
+
+
 @dataclass(frozen=True, slots=True)
 class TipMotion:
     """Largest motion of the free end."""

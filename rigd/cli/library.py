@@ -147,7 +147,10 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
     if not rows:
         yield "No sessions."
         return
-    heads = ("date", "file", "specimen", "operator", "excitation", "outcome", "modes", "report")
+    heads = (
+        *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
+        *("tip slope", "report"),
+    )
     yield from _table(
         heads,
         [
@@ -159,6 +162,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
                     for text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode, row.modes)),
+                _validity(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
@@ -175,6 +179,12 @@ def _mode(mode: dict[str, Any]) -> str:
     return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flagged}"
 
 
+def _validity(row: "SessionRow") -> str:
+    from rigd.session import Validity
+
+    return Validity.of_document(row.validity).short if row.modes else ""
+
+
 # Trend
 
 
@@ -187,7 +197,10 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
             yield ""
         low, high = _ends(trend)
         yield from _table(
-            (f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", "", "file"),
+            (
+                *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
+                *("tip slope", "file"),
+            ),
             [
                 (
                     _local(point.row),
@@ -196,6 +209,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
                     _uncertain(point.damping_ratio, 100),
                     _relative(point.damping_change, trend.points[0].damping_ratio["value"]),
                     _interval(point, low, high),
+                    _validity(point.row),
                     printable(point.row.path.name),
                 )
                 for point in trend.points
@@ -204,7 +218,8 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "significant (3 standard deviations), ? is flagged in its report or quick look."
+        "significant (3 standard deviations), ? is flagged in its report or quick look. Tip slope: "
+        "the largest, and the error of the linear model at it."
     )
 
 

@@ -134,6 +134,15 @@ Accept = Annotated[
     ),
 ]
 
+TipSlope = Annotated[
+    float | None,
+    typer.Option(
+        "--tip-slope",
+        help="Largest predicted slope of the antenna's tip (rad; default: limits.tip_slope_rad of "
+        "the profile). Beyond 0.14 the linear model is not exact.",
+    ),
+]
+
 NoLook = Annotated[
     bool,
     typer.Option(

@@ -26,6 +26,7 @@ from rigd.cli.options import (
     Operator,
     Repeat,
     Specimen,
+    TipSlope,
     WatchFit,
     fail,
     session_notes,
@@ -95,6 +96,7 @@ def start_sessions(
     meta: Meta = None,
     force: Force = False,
     accept: Accept = None,
+    tip_slope_rad: TipSlope = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
     ] = False,
@@ -110,7 +112,7 @@ def start_sessions(
             notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
         else:
             notes[key] = text
-    for name, value in parameters.items():
+    for name, value in {**parameters, "tip_slope_rad": tip_slope_rad}.items():
         if isinstance(value, float) and not isfinite(value):
             fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
     request = {
@@ -127,6 +129,8 @@ def start_sessions(
         request["watch_fit"] = True
     if accept:  # likewise
         request["accept"] = accept
+    if tip_slope_rad is not None:  # likewise
+        request["tip_slope_rad"] = tip_slope_rad
     with daemon_of(profile) as client:
         daemon = client.ask("status")["daemon"]
         typer.echo(daemon["what_moves"], err=True)

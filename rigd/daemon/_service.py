@@ -51,6 +51,7 @@ from rigd.runner import (
     SessionFailedError,
     excitation_for,
     what_is_kept,
+    with_tip_slope,
 )
 
 LOOK_S = 0.2
@@ -372,6 +373,7 @@ class Service:
             request.notes.specimen,
             self._start_rad(),
             tuple(request.accept),
+            request.tip_slope_rad,
         )
         self._predictions += 1
         try:
@@ -505,6 +507,7 @@ class Service:
         try:
             profile = with_specimen(self._profile, notes.get("specimen", ""))
             check_on_paper(profile, request.accept).require()
+            profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters, self._start_rad()),

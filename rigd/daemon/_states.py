@@ -288,7 +288,7 @@ def _state(process: ProcessStatus, phase: Phase) -> str:
 
 _OF_A_FIT = (
     *("tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings"),
-    *("type", "modes", "parameters", "search", "text"),
+    *("type", "validity", "modes", "parameters", "search", "text"),
 )
 """Members of a fit that clients are told; those for computing, such as its covariance, are long."""
 _MOST_ITEMS, _LONGEST_TEXT = 16, 400

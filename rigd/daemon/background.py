@@ -50,6 +50,8 @@ class PredictionJob:
     """Where the motor stands, from the rig's zero."""
     accept: tuple[str, ...] = ()
     """Names of rows of `rigd check` that may fail."""
+    tip_slope_rad: float | None = None
+    """Largest slope of the tip in an identification; None: the profile's."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
@@ -59,9 +61,11 @@ class PredictionJob:
             largest_amplitude,
             plan_document,
             predict_session,
+            with_tip_slope,
         )
 
         profile = with_specimen(self.profile, self.specimen)
+        profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
         plan = predict_session(profile, excitation, force=self.force, accept=self.accept)
         return {

@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.beam import (
+    PARAMETERS,
+    SMALL_SLOPE_RAD,
+    Beam,
+    Damping,
+    transfer_and_gradient,
+    undamped_frequencies_rad_s,
+)
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
     Excitation,
@@ -210,6 +217,9 @@ class LoopPreview(Protocol):
     def share_of_limits(self, reference_rad: Real) -> float:
         """Largest share of a limit that a reference (n,) is predicted to take."""
 
+    def tip_slope_rad(self, reference_rad: Real) -> float:
+        """Largest slope of the free end that is predicted for a reference (n,)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Band:
@@ -340,6 +350,7 @@ def modes(
     rest_s: float = 1.0,
     ring_down_s: float = 15.0,
     taper_s: float = 1.0,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
     rig: LoopPreview | None = None,
 ) -> Excitation:
     """Linear sweeps through narrow bands round modes, one after the other.
@@ -351,7 +362,7 @@ def modes(
     path
         JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
     amplitude_rad
-        Amplitude in each band; lower where the rig's limits ask for it.
+        Amplitude in each band; lower where the rig's limits or the slope of the tip require it.
     stop_hz
         Modes above are left out.
     widths
@@ -362,6 +373,8 @@ def modes(
         Time before and after them.
     taper_s
         Raised-cosine fade at both ends of every sweep: angle and speed are zero at the joints.
+    tip_slope_rad
+        Largest slope of the beam's free end, of which the sweeps use 90 %.
     rig
         Limits the amplitudes and splits the time by what each band tells of the damping. Without
         it neither happens.
@@ -376,6 +389,7 @@ def modes(
     frequency("stop_hz", stop_hz, rate_hz)
     positive("widths", widths, "half-power widths")
     positive("taper_s", taper_s, "s")
+    positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     first, end = segments["sweep"]
     bands = _bands(Path(path), stop_hz, widths, rate_hz)
@@ -390,10 +404,10 @@ def modes(
     amplitudes_rad = [amplitude_rad] * len(bands)
     sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
     if rig is not None:
-        eased_rad = _within_limits(sweeps, amplitude_rad, rig)
+        eased_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
         lengths = _lengths(_at_least(shares_of_time(bands, eased_rad, rig)), end - first)
         sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
-        amplitudes_rad = _within_limits(sweeps, amplitude_rad, rig)
+        amplitudes_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
     parameters: dict[str, float | int | str] = {
         "file": Path(path).name,
@@ -405,6 +419,7 @@ def modes(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "taper_s": taper_s,
+        "tip_slope_rad": tip_slope_rad,
         "bands": "; ".join(
             f"{band.start_hz:.6g}-{band.stop_hz:.6g} Hz, {amplitude:.4g} rad, "
             f"{ticks / rate_hz:.6g} s"
@@ -429,7 +444,9 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
     return bands
 
 
-def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: LoopPreview) -> list[float]:
+def _within_limits(
+    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: LoopPreview
+) -> list[float]:
     """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
 
     One after the other, since a mode still rings while the next is swept.
@@ -439,7 +456,10 @@ def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: LoopPrevie
     for sweep in sweeps:
         eased_rad = amplitude_rad
         for _ in range(_EASINGS):
-            share = rig.share_of_limits(np.concatenate([before_rad, eased_rad * sweep]))
+            so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
+            share = max(
+                rig.share_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
+            )
             if share <= SHARE_OF_LIMITS * _CLOSE_ENOUGH:
                 break
             eased_rad *= SHARE_OF_LIMITS / share

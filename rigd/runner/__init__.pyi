@@ -32,3 +32,4 @@ from ._session import results_document as results_document
 from ._signal_blocks import SignalBlock as SignalBlock
 from ._status import ProcessStatus as ProcessStatus
 from ._status import RigStatus as RigStatus
+from ._tip_slope import with_tip_slope as with_tip_slope

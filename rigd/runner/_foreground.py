@@ -22,6 +22,7 @@ from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._session import SessionFailedError, SessionProgress, SessionResult
+from rigd.runner._tip_slope import with_tip_slope
 from rigd.runtime import RigLock, StopRequest
 
 _LOOK_PATIENCE_S: Final = 10.0
@@ -77,6 +78,7 @@ def run_in_foreground(
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
     identifies_motor: bool = False,
+    tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -110,6 +112,8 @@ def run_in_foreground(
         Fit each record while it is recorded, and tell.
     identifies_motor
         See :class:`rigd.runner._series.Series`.
+    tip_slope_rad
+        Largest slope of the tip in an identification; None: the profile's.
 
     Raises
     ------
@@ -137,6 +141,7 @@ def run_in_foreground(
             check_on_paper(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
+            profile = with_tip_slope(profile, tip_slope_rad)
             mounted = with_specimen(profile, specimen)
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):

@@ -197,7 +197,12 @@ class Series:
                 self._excitation,
                 path,
                 tuple(notes.items()),
-                tuple((predicted_metadata(self._profile, self.plan.prediction) | probed).items()),
+                tuple(
+                    (
+                        predicted_metadata(self._profile, self.plan.prediction, self._excitation)
+                        | probed
+                    ).items()
+                ),
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,

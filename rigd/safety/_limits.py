@@ -11,6 +11,8 @@ from typing import Annotated, Final
 
 from annotated_types import Ge, Gt, Le, Lt
 
+from rigd.beam import SMALL_SLOPE_RAD
+
 Positive = Annotated[float, Gt(0)]
 BelowAll = Annotated[float, Gt(0), Lt(100)]
 """Per cent; a share is never more than all."""
@@ -66,6 +68,9 @@ class Limits:
     stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
     """Share of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as for
     `missed_percent`. ``analyze`` takes no record with more than 1 %."""
+    tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
+    """Slope of the antenna's tip that an identification may be predicted to reach; checked before
+    the session, not in it. Beyond the default the linear model is not exact."""
 
 
 @dataclass(frozen=True, slots=True)

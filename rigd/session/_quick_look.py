@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.session._validity import Validity
 from rigd.units import finite_number
 
 Document = dict[str, Any]
@@ -69,6 +70,7 @@ def read_look(path: Path) -> Document | None:
             **{name: _text(found.get(name) or "") for name in _TEXTS},
             **{name: int(found.get(name) or 0) for name in _TIMES},
             "modes": modes_of(found.get("modes")),
+            "validity": Validity.of_document(found.get("validity")).as_json(),
             "response": _response(found.get("response")),
             **{name: [_text(line) for line in found.get(name) or []] for name in _LINES},
         }
@@ -183,7 +185,8 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     Returns
     -------
     dict or None
-        ``duration_s`` of the record that was fitted, ``problem``, ``modes`` as of `modes_of`,
+        ``duration_s`` of the record that was fitted, ``problem``, ``validity`` as of
+        `Validity.as_json`, ``modes`` as of `modes_of`,
         ``parameters`` by name, ``findings``, and ``search`` of a session that went on until a
         precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
         ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None if there is none that can
@@ -200,6 +203,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         return {
             "duration_s": max(duration_s or 0.0, 0.0),
             "problem": _text(found.get("problem") or ""),
+            "validity": Validity.of_document(found.get("validity")).as_json(),
             "modes": modes_of(found.get("modes")),
             "parameters": {name: value for name, value in parameters.items() if value is not None},
             "findings": [_text(line) for line in found.get("findings") or []],

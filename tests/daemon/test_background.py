@@ -42,6 +42,17 @@ def test_a_prediction_is_that_of_a_start_and_needs_no_rig(operate, profile):
     assert operated.ask("predict", excitation="hold")["largest_amplitude_rad"] is None
 
 
+def test_the_limit_of_the_slope_is_given_with_a_request(operate):
+    """As a member of it, or as clients of before an update have it: among the parameters."""
+    operated = operate()
+    plan = operated.ask("predict", **loud(0.05), tip_slope_rad=2.0)["plan"]
+    assert "tip slope" not in (plan["refused"] or "")
+    assert plan["limits"]["tip_slope_rad"] == 2.0
+    older = {"targets": "damping 1%", "tip_slope_rad": 0.2}
+    plan = operated.ask("predict", excitation="until", parameters=older)["plan"]
+    assert plan["parameters"]["tip_slope_rad"] == plan["limits"]["tip_slope_rad"] == 0.2
+
+
 def test_what_no_prediction_can_be_made_of_is_refused(operate):
     told = operate().ask("predict", excitation="chirp", parameters={"stop_hz": 1e5})
     assert isinstance(told, CommandError)

@@ -194,11 +194,24 @@ export class StartForm {
     }
     if (Object.keys(meta).length) notes.meta = meta;
     const force = byId("force").checked;
+    const slope = this.#tipSlope();
+    if (slope === null) return null;
     const excitation = byId("excitation").value;
     const watch = byId("watch-fit").checked && excitation !== "until" ? { watch_fit: true } : {};
     const accepted = this.#accepted();
     const accept = accepted.length ? { accept: accepted } : {};
-    return { excitation, parameters, repeat, notes, force, ...watch, ...accept };
+    return { excitation, parameters, repeat, notes, force, ...watch, ...accept, ...slope };
+  }
+
+  /** The limit of the tip's slope for this session, as a member; null if it is not a number. */
+  #tipSlope() {
+    const text = byId("tip-slope").value.trim();
+    if (text === "") return {};
+    const value = Number(text.replace(/^(\d*),(\d+)$/, "$1.$2"));
+    byId("tip-slope").setAttribute("aria-invalid", String(!(value > 0 && Number.isFinite(value))));
+    if (value > 0 && Number.isFinite(value)) return { tip_slope_rad: value };
+    this.#say(`Tip slope limit ${text} is not a number above 0; give one in rad.`);
+    return null;
   }
 
   async #predict() {
@@ -224,6 +237,7 @@ export class StartForm {
       // For one session: the next one is asked for again.
       byId("force").checked = false;
       for (const box of byId("failed-rows").querySelectorAll("input")) box.checked = false;
+      byId("tip-slope").value = "";
       this.#prediction.show(reply.plan, null);
     } else {
       this.#enable(this.#state);
