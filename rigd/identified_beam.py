@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.beam import Beam, Damping
+from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
-from rigd.runtime import open_plain_file
 from rigd.units import finite_number
 
-_MOST_BYTES: Final = 64_000_000
 _NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _BELOW: Final = {"zeta": 1.0, "alpha": 2.0, "lambda": 2.0}
 _UNITS: Final = {
@@ -95,12 +94,9 @@ def read_identified_beam(path: str | Path, length_m: float) -> IdentifiedBeam:
 
 def _parameters(path: Path) -> Mapping[str, Any]:
     try:
-        with open_plain_file(path, _MOST_BYTES) as file:
-            document = json.load(file)
-    except OSError as error:
-        raise IdentifiedBeamError(f"{path}: cannot be read ({error.strerror}).") from error
-    except (ValueError, RecursionError) as error:
-        raise IdentifiedBeamError(f"{path}: is not a JSON document; {_REMEDY}.") from error
+        document = read_json(path)
+    except DocumentError as error:
+        raise IdentifiedBeamError(f"{path}: {error}; {_REMEDY}.") from error
     headlines = document.get("headlines") if isinstance(document, dict) else None
     found = [each for each in headlines or [] if isinstance(each, dict)]
     pooled = [each for each in found if each.get("file", "") is None]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.models import OptionInfo
 
+from analysis.cli.standard_streams import complain
 from analysis.cli.welch_options import (
     Band,
     Estimator,
@@ -244,10 +245,10 @@ def _explained(run: Callable[[], None]) -> int:
     try:
         run()
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         return 2
     except (ExchangeError, SessionError, RecordError, EstimateError, OutputError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         return 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)

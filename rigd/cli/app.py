@@ -21,6 +21,7 @@ from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
+from rigd.printable import readable_errors, readable_message
 from rigd.runtime import raise_on
 
 
@@ -66,9 +67,14 @@ class RigdGroup(TyperGroup):
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
+    def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
+        """Parse what stands before the command."""
+        with readable_errors():
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
-        with errors_told():
+        with readable_errors(), errors_told():
             return super().invoke(ctx)
 
 
@@ -121,7 +127,7 @@ def main() -> None:
         sys.exit(EXIT_INTERRUPTED)
     except OSError as error:
         with contextlib.suppress(OSError):  # standard error may be closed as well
-            sys.stderr.write(f"Error: {_explained(error)}\n")
+            sys.stderr.write(f"Error: {readable_message(_explained(error))}\n")
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)

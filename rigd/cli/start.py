@@ -26,6 +26,7 @@ from rigd.cli.options import (
     Repeat,
     Specimen,
     WatchFit,
+    complain,
     fail,
     session_notes,
 )
@@ -152,7 +153,7 @@ def start_sessions(
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
-        typer.echo(f"Error: {series['reason']}", err=True)
+        complain(series["reason"])
         raise typer.Exit(EXIT_FAILED)
     if series["stopped"]:
         raise typer.Exit(EXIT_INTERRUPTED)

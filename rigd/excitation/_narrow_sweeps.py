@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
     Excitation,
@@ -32,7 +33,6 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
-from rigd.runtime import open_plain_file
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -43,7 +43,6 @@ _CLOSE_ENOUGH: Final = 1.005
 LEAST_SHARE: Final = 0.5
 """Least share of an equal part of the time for every band: a mode is never left out."""
 
-MOST_BYTES: Final = 64_000_000
 SAME_MODE: Final = 1.1
 """Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
 slender beam differ by more."""
@@ -123,16 +122,10 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        with open_plain_file(path, MOST_BYTES) as file:
-            return json.load(file)
-    except OSError as error:
-        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
-    except RecursionError:
-        raise ExcitationError(f"{path}: is nested too deeply.") from None
-    except ValueError as error:
+        return read_json(path)
+    except DocumentError as error:
         raise ExcitationError(
-            f"{path}: is not a JSON document ({error}); write one with analyze session.mcap "
-            "--json fits.json."
+            f"{path}: {error}; write one with analyze session.mcap --json fits.json."
         ) from error
 
 

@@ -6,7 +6,6 @@ used (``annotated_types`` on the dataclasses) and enforced here. All problems of
 reported at once.
 """
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from rigd import documents
 from rigd.devices import RigParameters
+from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._places import profile_files
@@ -74,11 +75,9 @@ def read_text(path: Path) -> str:
         If it cannot be read, or is not text.
     """
     try:
-        return path.read_bytes().decode("utf-8")
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
+        return documents.read_text(path)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def profile_of(text: str, path: Path) -> Profile:
@@ -145,9 +144,9 @@ def parse(text: str, path: Path) -> dict[str, Any]:
         If it is none.
     """
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
+        return documents.parse_toml(text)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def complaint(path: Path, problems: Iterable[str]) -> ProfileError:

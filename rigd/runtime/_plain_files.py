@@ -24,6 +24,8 @@ def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) 
     OSError
         If it cannot be opened, or is not of that kind.
     """
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "its name contains a NUL character")
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     status = os.fstat(fd)
     if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
