@@ -13,11 +13,13 @@ from typing import Any, Final
 
 from rigd.runtime import open_plain_file
 
-MOST_TOML_BYTES: Final = 1_000_000
+MOST_TOML_BYTES: Final = 250_000
 MOST_JSON_BYTES: Final = 16_000_000
 """As objects, the most unfavourable document takes twenty times as much."""
 _MOST_ENTRIES: Final = 3000
 """Keys and elements of a TOML document; a profile has 150."""
+_LONGEST_LINE: Final = 4096
+"""Characters of a line of TOML: the memory for a dotted key grows with the square of its length."""
 _DEEPEST: Final = 16
 
 
@@ -63,7 +65,9 @@ def parse_toml(text: str) -> dict[str, Any]:
         If it is not TOML, is nested too deeply, or has more in it than people write.
     """
     if len(text) > MOST_TOML_BYTES:
-        raise DocumentError(f"has more than {MOST_TOML_BYTES / 1e6:g} MB; shorten it")
+        raise DocumentError(f"has more than {MOST_TOML_BYTES} characters; shorten it")
+    if any(len(line) > _LONGEST_LINE for line in text.splitlines()):
+        raise DocumentError(f"has a line of more than {_LONGEST_LINE} characters; shorten it")
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,13 +1,17 @@
 """Reference signals from CSV files."""
 
 import csv
+from array import array
+from collections.abc import Iterator
+from itertools import chain
 from math import isfinite
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 import numpy as np
 
 from rigd.excitation._signals import (
+    MAX_TICKS,
     Excitation,
     ExcitationError,
     assemble,
@@ -18,6 +22,7 @@ from rigd.excitation._signals import (
 from rigd.runtime import open_plain_file
 
 MOST_BYTES: Final = 256_000_000
+_LONGEST_LINE: Final = 65_536
 
 
 def from_csv(
@@ -65,17 +70,34 @@ def from_csv(
     return assemble("file", parameters, rate_hz, segments, sweep)
 
 
-def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
+def _read_csv(path: Path) -> "tuple[array[float] | None, array[float]]":
     try:
         with open_plain_file(path, MOST_BYTES, newline="") as file:
-            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
+            return _columns(path, file)
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
     except UnicodeDecodeError as error:
         raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error.reason}).") from error
     except csv.Error as error:
         raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error}).") from error
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    while line := file.readline(_LONGEST_LINE + 1):
+        if len(line) > _LONGEST_LINE:
+            raise ExcitationError(
+                f"{path}: has a line of more than {_LONGEST_LINE} characters; write one angle a "
+                "line."
+            )
+        yield line
+
+
+def _columns(path: Path, file: TextIO) -> "tuple[array[float] | None, array[float]]":
+    """Return times and angles, read line by line into arrays: a list takes ten times as much."""
+    reader = enumerate(csv.reader(_lines(path, file)), 1)
+    rows: Iterator[tuple[int, list[str]]] = ((line, row) for line, row in reader if any(row))
+    first = next(rows, None)
+    header = [] if first is None else [cell.strip() for cell in first[1]]
     if "angle_rad" in header:
         angle_column = header.index("angle_rad")
         time_column = header.index("time_s") if "time_s" in header else None
@@ -84,7 +106,6 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
                 f"{path}: line 1 has {len(header)} columns, angle_rad among them, but no time_s; "
                 "name the column of times in seconds so, or leave angle_rad alone."
             )
-        rows = rows[1:]
     elif len(header) == 1 and ";" in header[0]:
         raise ExcitationError(f"{path}: separates its columns by semicolons; use commas.")
     elif len(header) == 1:
@@ -94,8 +115,9 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
             f"{path}: line 1 must name the columns time_s (s) and angle_rad (rad), or the file "
             "must be one column of angles in rad."
         )
-    angles: list[float] = []
-    times: list[float] = []
+    angles, times = array("d"), array("d")
+    if first is not None and "angle_rad" not in header:
+        rows = chain([first], rows)
     for number, row in rows:
         angles.append(_cell(path, number, row, angle_column, "angle_rad"))
         if time_column is not None:
@@ -105,6 +127,8 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
                     f"{path}: line {number}: time_s does not come after the one before it; times "
                     "must increase."
                 )
+        if len(angles) > MAX_TICKS:
+            raise ExcitationError(f"{path}: has more than {MAX_TICKS} angles; shorten it.")
     if len(angles) < 2:
         raise ExcitationError(f"{path}: has {len(angles)} angles; a reference needs at least two.")
     return (times if time_column is not None else None), angles

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
@@ -74,7 +74,7 @@ class _Document(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    modes: list[_Entry]
+    modes: Annotated[list[_Entry], FailFast()]  # the errors of a million take gigabytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.runtime import read_plain_file
 from rigd.session import modes_of, read_look
 
 SUFFIX: Final = ".mcap"
@@ -200,9 +201,7 @@ def _modes(look: Path | None, report: Path | None) -> tuple[Mode, ...]:
 
 def _document(path: Path) -> object:
     try:
-        if path.stat().st_size > _MOST_JSON_BYTES:
-            return None
-        return json.loads(path.read_bytes())
+        return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):  # a result less, no session less
         return None
 

@@ -17,6 +17,7 @@ from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
 from ._plain_files import open_plain_file as open_plain_file
+from ._plain_files import read_plain_file as read_plain_file
 from ._stop_signals import StopRequest as StopRequest
 from ._stop_signals import held_back as held_back
 from ._stop_signals import ignore as ignore

@@ -15,11 +15,13 @@ import importlib
 import inspect
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_args
@@ -71,8 +73,8 @@ class Case:
     name: str
     program: str
     arguments: list[str]
-    files: dict[str, bytes] = field(default_factory=dict)
-    """Files that it needs, by their names in the case's folder."""
+    files: dict[str, bytes | Callable[[], bytes]] = field(default_factory=dict)
+    """Files that it needs, or what makes them, by their names in the case's folder."""
 
     @property
     def serves(self):
@@ -117,13 +119,23 @@ class Ground:
             [*command, "--no-look", "--output", str(self.folder / "served")],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        status = [sys.executable, "-m", "rigd", "status", "--json", "--profile", str(self.served)]
+        self.wait_until_ready()
+
+    def wait_until_ready(self):
+        """End what the daemon runs, and wait until it can run the next."""
         for _ in range(600):
-            told = subprocess.run(status, capture_output=True, check=False).stdout
-            if told and json.loads(told).get("state") == "ready":
+            told = self._ask("status", "--json")
+            state = json.loads(told).get("state") if told else ""
+            if state == "ready":
                 return
+            if state in ("running", "fault"):
+                self._ask("stop" if state == "running" else "reset")
             time.sleep(0.1)
         raise RuntimeError("the daemon does not become ready")
+
+    def _ask(self, *words):
+        command = [sys.executable, "-m", "rigd", *words, "--profile", str(self.served)]
+        return subprocess.run(command, capture_output=True, check=False).stdout
 
     def stop_daemon(self):
         """End it."""
@@ -204,8 +216,16 @@ def commands():
 
 
 def option_cases(ground, seed, every):
-    """Yield a case for each option and argument, or for every value of it."""
+    """Yield a case for each option and argument, or for every value of it.
+
+    An option that all excitations share is tried once with `rigd run` and once with `rigd start`.
+    """
     turn = seed
+    known = set()
+    shared = set.intersection(
+        *({p.opts[-1] for p, _ in parameters} for words, parameters in commands() if len(words) == 3
+          and words[1] in ("run", "start"))
+    )  # fmt: skip
     for words, parameters in commands():
         sound = sound_arguments(ground, words)
         program, *names = [word for word in words if word != "default"]
@@ -224,6 +244,9 @@ def option_cases(ground, seed, every):
                 values = tuple(_file_values(label))
             else:
                 values = (*TEXTS, *NUMBERS, *(f"@odd/{kind}.toml" for kind in ODD))
+            if (*words[:2], label) in known and label in shared:
+                continue
+            known.add((*words[:2], label))
             for value in values if every else [values[turn % len(values)]]:
                 name = f"{' '.join(words)} {label} {value[:40]!r}"
                 if not is_option:
@@ -413,22 +436,22 @@ def whole_file_cases(ground):
     """Yield files that are hostile as a whole, for each command that reads such files."""
     deep_toml = b"a = " + b"[" * 20_000 + b"]" * 20_000
     tomls = {
-        "deep arrays": deep_toml,
-        "deep tables": b"a = " + b"{ b = " * 20_000 + b"1" + b" }" * 20_000,
-        "deep keys": b"a" + b".a" * 20_000 + b" = 1",
-        "deep header": b"[" + b"a." * 20_000 + b"a]",
-        "long number": b"a = " + b"9" * 5000,
-        "long float": b"a = 1." + b"9" * 1_000_000,
-        "unknown tables": b"".join(b"[t%d]\na = 1\n" % i for i in range(100_000)),
-        "unknown keys": b"".join(b"k%d = 1\n" % i for i in range(100_000)),
-        "unknown parts": b"[rig]\nrate_hz = { value = 1, "
+        "deep arrays": lambda: deep_toml,
+        "deep tables": lambda: b"a = " + b"{ b = " * 20_000 + b"1" + b" }" * 20_000,
+        "deep keys": lambda: b"a" + b".a" * 20_000 + b" = 1",
+        "deep header": lambda: b"[" + b"a." * 20_000 + b"a]",
+        "long number": lambda: b"a = " + b"9" * 5000,
+        "long float": lambda: b"a = 1." + b"9" * 1_000_000,
+        "unknown tables": lambda: b"".join(b"[t%d]\na = 1\n" % i for i in range(100_000)),
+        "unknown keys": lambda: b"".join(b"k%d = 1\n" % i for i in range(100_000)),
+        "unknown parts": lambda: b"[rig]\nrate_hz = { value = 1, "
         + b", ".join(b"p%d = 1" % i for i in range(20_000)) + b" }",
-        "long key": b"x" * LONG + b" = 1",
-        "nul": b"\0" * LONG,
-        "control": b'a = "\x1b[2J"',
-        "escaped control": b'"\\u001b[2J\\u0007" = 1\n[x]\n"\\u202e" = 2',
-        "large": b"# comment\n" * 10_000_000,
-        "not utf-8": b"\xff\xfe" * 1000,
+        "long key": lambda: b"x" * LONG + b" = 1",
+        "nul": lambda: b"\0" * LONG,
+        "control": lambda: b'a = "\x1b[2J"',
+        "escaped control": lambda: b'"\\u001b[2J\\u0007" = 1\n[x]\n"\\u202e" = 2',
+        "large": lambda: b"# comment\n" * 10_000_000,
+        "not utf-8": lambda: b"\xff\xfe" * 1000,
     }  # fmt: skip
     run = ["run", "hold", "--duration", "0.2", "--fast", "--no-look", "--output", "@/out"]
     record = b"a,t\n" + b"0.1,0.2\n" * 3000
@@ -442,16 +465,16 @@ def whole_file_cases(ground):
         yield Case(f"specimen of {name}", "rigd", ["specimens"], files)
         yield Case(f"import of {name}", "analyze", [*convert, "@/f.toml"], files)
     jsons = {
-        "deep": b"[" * 200_000 + b"]" * 200_000,
-        "deep objects": b'{"modes":' * 50_000 + b"1" + b"}" * 50_000,
-        "long number": b'{"modes": ' + b"9" * 5000 + b"}",
-        "many modes": b'{"modes": [' + b",".join([b'{"frequency_hz": 2.6, "damping_ratio": 1}']
+        "deep": lambda: b"[" * 200_000 + b"]" * 200_000,
+        "deep objects": lambda: b'{"modes":' * 50_000 + b"1" + b"}" * 50_000,
+        "long number": lambda: b'{"modes": ' + b"9" * 5000 + b"}",
+        "many modes": lambda: b'{"modes": [' + b",".join([b'{"frequency_hz": 2.6, "damping_ratio": 1}']
         * 300_000) + b"]}",
-        "many keys": b"{" + b",".join(b'"k%d": 1' % i for i in range(500_000)) + b"}",
-        "empty lists": b'{"modes": [' + b",".join([b"[]"] * 5_000_000) + b"]}",
-        "long text": b'{"modes": "' + b"x" * 30_000_000 + b'"}',
-        "large": b" " * 300_000_000,
-        "surrogates": b'{"modes": "\\ud800", "headlines": [{"file": "\\udfff", "parameters": 1}]}',
+        "many keys": lambda: b"{" + b",".join(b'"k%d": 1' % i for i in range(500_000)) + b"}",
+        "empty lists": lambda: b'{"modes": [' + b",".join([b"[]"] * 5_000_000) + b"]}",
+        "long text": lambda: b'{"modes": "' + b"x" * 30_000_000 + b'"}',
+        "large": lambda: b" " * 300_000_000,
+        "surrogates": lambda: b'{"modes": "\\ud800", "headlines": [{"file": "\\udfff", "parameters": 1}]}',
     }  # fmt: skip
     short = ["--profile", "sim", "--fast", "--no-look", "--output", "@/out"]
     for name, data in jsons.items():
@@ -466,19 +489,19 @@ def whole_file_cases(ground):
         start = ["start", "modes", "@/f.json", "--profile", str(ground.served)]
         yield Case(f"start of {name}", "rigd", start, files)
     texts = {
-        "65 MB": b"0.001\n" * 11_000_000,
-        "90 MB of times": b"time_s,angle_rad\n" + b"".join(
+        "65 MB": lambda: b"0.001\n" * 11_000_000,
+        "90 MB of times": lambda: b"time_s,angle_rad\n" + b"".join(
             b"%.3f,0.0010000000\n" % (i / 1000) for i in range(4_400_000)
         ),
         "many columns": (b"1," * 1_000_000 + b"\n") * 3,
-        "a line without end": b"0" * 50_000_000,
-        "quotes": b'angle_rad\n"' + b"0.1\n" * 5_000_000,
-        "empty lines": b"angle_rad\n" + b"\n" * 50_000_000,
-        "far times": b"time_s,angle_rad\n0,0\n1e308,0\n",
-        "not finite": b"angle_rad\n0\nnan\n1e999\n",
-        "long digits": b"angle_rad\n0\n" + b"9" * 200_000 + b"\n",
-        "nul": b"\0" * 1_000_000,
-        "huge angles": b"angle_rad\n0\n1e308\n",
+        "a line without end": lambda: b"0" * 50_000_000,
+        "quotes": lambda: b'angle_rad\n"' + b"0.1\n" * 5_000_000,
+        "empty lines": lambda: b"angle_rad\n" + b"\n" * 50_000_000,
+        "far times": lambda: b"time_s,angle_rad\n0,0\n1e308,0\n",
+        "not finite": lambda: b"angle_rad\n0\nnan\n1e999\n",
+        "long digits": lambda: b"angle_rad\n0\n" + b"9" * 200_000 + b"\n",
+        "nul": lambda: b"\0" * 1_000_000,
+        "huge angles": lambda: b"angle_rad\n0\n1e308\n",
     }  # fmt: skip
     for name, data in texts.items():
         files = {"f.csv": data}
@@ -489,12 +512,12 @@ def whole_file_cases(ground):
         command += ["--rate-hz", "1000", "--profile", str(ground.served)]
         yield Case(f"import of text of {name}", "analyze", command, files)
     edss = {
-        "many sections": b"".join(b"[%04X]\nParameterName=a\n" % i for i in range(60_000)),
-        "many lines": b"[DeviceInfo]\n" + b"a=b\n" * 900_000,
-        "one line": b"[DeviceInfo]\nVendorName=" + b"x" * 3_900_000,
-        "large": b"x" * 50_000_000,
-        "control": b"[DeviceInfo]\nVendorName=\x1b[2J\n[1000]\nParameterName=\x1b[2J\nDataType=7\n",
-        "compact": b"".join(
+        "many sections": lambda: b"".join(b"[%04X]\nParameterName=a\n" % i for i in range(60_000)),
+        "many lines": lambda: b"[DeviceInfo]\n" + b"a=b\n" * 900_000,
+        "one line": lambda: b"[DeviceInfo]\nVendorName=" + b"x" * 3_900_000,
+        "large": lambda: b"x" * 50_000_000,
+        "control": lambda: b"[DeviceInfo]\nVendorName=\x1b[2J\n[1000]\nParameterName=\x1b[2J\nDataType=7\n",
+        "compact": lambda: b"".join(
             b"[%04X]\nParameterName=a\nCompactSubObj=254\nDataType=7\n" % i
             for i in range(0x2000, 0x2100)
         ),
@@ -528,12 +551,21 @@ def make_odd(path, kind):
 # Running
 
 
-def prepared(case, folder):
-    """Make the files of a case; return its arguments with their paths."""
-    for name, data in case.files.items():
+def write_files(files, folder):
+    """Write files; return 0."""
+    for name, data in files.items():
         path = folder / name
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(data)
+        path.write_bytes(data() if callable(data) else data)
+    return 0
+
+
+def prepared(case, folder):
+    """Make the files of a case; return its arguments with their paths."""
+    if case.files:
+        with (folder / "made").open("wb") as log:  # in a child, which takes its memory with it
+            code, _ = run_forked(lambda: write_files(case.files, folder), log.fileno())
+        assert code == 0, (folder / "made").read_text()
     arguments = []
     for given in case.arguments:
         if given.startswith("@odd/"):
@@ -600,6 +632,8 @@ def try_cases(ground, cases, report=lambda outcome: None):
     wrong = []
     before = ground.daemon_megabytes()
     for case in cases:
+        if "start" in case.arguments:
+            ground.wait_until_ready()
         outcome = run_case(case)
         report(outcome)
         if outcome.wrong():
@@ -630,7 +664,7 @@ def main():
     """Try all, and print the worst and what is wrong."""
     parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
     parser.add_argument("--seed", type=int, default=0, help="turns the values of the options")
-    parser.add_argument("--word", default="", help="only cases whose names contain it")
+    parser.add_argument("--word", default="", help="only cases whose names match this expression")
     parser.add_argument("--every", action="store_true", help="every value of each option and key")
     parser.add_argument("--verbose", action="store_true", help="name each case")
     asked = parser.parse_args()
@@ -654,7 +688,9 @@ def main():
     warm_up()
     with ground_with_daemon() as ground:
         cases = all_cases(ground, asked.seed, every=asked.every)
-        wrong = try_cases(ground, (case for case in cases if asked.word in case.name), report)
+        wrong = try_cases(
+            ground, (case for case in cases if re.search(asked.word, case.name)), report
+        )
         held, most = ground.daemon_megabytes()
     for what, outcome in worst.items():
         sys.stdout.write(f"most {what:10} {getattr(outcome, what):10.1f}  {outcome.case}\n")
