@@ -70,26 +70,39 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
     padded = _quick_length(int(np.ceil(_PADDED * n)))
     # On s = sigma + j omega what wraps round has decayed.
     sigma = _DECAY * rate_hz / padded
-    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz)
-    growth = np.exp(sigma * np.arange(n) / rate_hz)
+    s = 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz)
+    s += sigma
     # The angle stays where it ends: a jump back would ring at the last samples.
     angle = np.full(padded, angle_rad[-1] - angle_rad[0])
-    angle[:n] = angle_rad - angle_rad[0]
-    turned = np.fft.rfft(angle * np.exp(-sigma * np.arange(padded) / rate_hz))
-    displaced, sloped = np.empty((2, s.size), dtype=np.complex128)
+    np.subtract(angle_rad, angle_rad[0], out=angle[:n])
+    for start in range(0, padded, _BLOCK):
+        ticks = np.arange(start, min(start + _BLOCK, padded))
+        angle[start : start + _BLOCK] *= np.exp(-sigma * ticks / rate_hz)
+    deflected = np.fft.rfft(angle)
+    del angle
+    sloped, speeding = np.empty((2, s.size), dtype=np.complex128)
+    # Block by block and in place: these are all of the record's length.
     for start in range(0, s.size, _BLOCK):
         some = slice(start, start + _BLOCK)
-        displaced[some], sloped[some] = tip_response(beam, damping, s[some])
-    displaced *= turned
-    sloped = (sloped - 1) * turned
+        turned = deflected[some].copy()
+        displaced, sloped[some] = tip_response(beam, damping, s[some])
+        displaced *= turned
+        sloped[some] = (sloped[some] - 1) * turned
+        speeding[some] = s[some] * displaced
+        deflected[some] = displaced - beam.length_m * turned
+    del s
 
     def largest(spectrum: Complex) -> float:
-        return float(np.max(np.abs(np.fft.irfft(spectrum, padded)[:n] * growth)))
+        motion = np.fft.irfft(spectrum, padded)[:n]
+        peaks = []
+        for start in range(0, n, _BLOCK):
+            block = motion[start : start + _BLOCK]
+            growth = np.exp(sigma * np.arange(start, start + block.size) / rate_hz)
+            peaks.append(float(np.max(np.abs(block * growth))))
+        return float(np.max(peaks))  # not a number stays one
 
     return TipMotion(
-        deflection_m=largest(displaced - beam.length_m * turned),
-        slope_rad=largest(sloped),
-        speed_m_s=largest(s * displaced),
+        deflection_m=largest(deflected), slope_rad=largest(sloped), speed_m_s=largest(speeding)
     )
 
 

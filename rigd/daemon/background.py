@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from rigd.daemon._protocol import CommandError, Start
 from rigd.errors import RigdError
@@ -31,7 +31,8 @@ from rigd.runner import (
 )
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
 
-_PATIENCE_S: Final = 60.0
+_PATIENCE_S: Final = 50.0
+"""Shorter than that of a client, which could not say what has become of its request."""
 _MOST_BYTES: Final = 4 << 30
 _LEAST_BYTES: Final = 256 << 20
 """A session of two minutes takes 180 MiB, of which 120 MiB are the program."""
@@ -48,6 +49,9 @@ Done_co = TypeVar("Done_co", covariant=True)
 class Job(Protocol[Done_co]):
     """Something to be done."""
 
+    beside_sessions: ClassVar[bool]
+    """Whether it may be done while a session runs, and gives way to it."""
+
     def perform(self) -> Done_co:
         """Do it; an error of the rig is for the client."""
 
@@ -55,6 +59,8 @@ class Job(Protocol[Done_co]):
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
     """A session to predict: see `rigd.runner.predict_session`."""
+
+    beside_sessions: ClassVar[bool] = True
 
     profile: Profile
     """Rig of the session."""
@@ -84,6 +90,7 @@ class PredictionJob:
 class CheckJob:
     """A rig to check whose devices are the daemon's: see `rigd.checks.check_beside`."""
 
+    beside_sessions: ClassVar[bool] = True
     profile: Profile
     """Rig to check."""
     calibration: Mapping[str, Any] | None
@@ -111,6 +118,8 @@ class CheckJob:
 @dataclass(frozen=True, slots=True)
 class PlanJob:
     """Sessions to plan: see `rigd.runner.Series`."""
+
+    beside_sessions: ClassVar[bool] = False
 
     profile: Profile
     """Rig of the sessions."""
@@ -162,7 +171,7 @@ async def perform(job: Job[Done]) -> Done:
     Raises
     ------
     CommandError
-        If it is refused, fails, or takes longer than 60 s.
+        If it is refused, fails, or takes longer than 50 s.
     """
     try:
         process = await asyncio.create_subprocess_exec(
@@ -196,11 +205,12 @@ def main() -> None:
 
     Both ends are this program's own.
     """
-    os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     killed_first()
     most_bytes = _memory_limit()
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
     job = pickle.load(sys.stdin.buffer)
+    if job.beside_sessions:
+        os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     try:
         answer = job.perform()
     except RigdError as error:

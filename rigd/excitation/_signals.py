@@ -26,6 +26,9 @@ beam unlike the one it was made with."""
 MAX_TICKS = 7_200_000
 """Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
 
+_SMALLEST, _LARGEST = 1e-9, 1e9
+"""Size of options in their units, other than 0: beyond it products overflow or vanish."""
+
 
 class ExcitationError(UserError, ValueError):
     """An option of an excitation is absurd; the message names option, value, unit and remedy."""
@@ -110,9 +113,14 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
 
 def finite(option: str, value: float, unit: str) -> None:
-    """Refuse what is not a finite number."""
+    """Refuse what is not a finite number, or of a size that no rig has."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
+    if value != 0.0 and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise ExcitationError(
+            f"{option} = {value:g} {unit} is of no size that a rig has, {_SMALLEST:g} to "
+            f"{_LARGEST:g}; check its unit."
+        )
 
 
 def positive(option: str, value: float, unit: str) -> None:
