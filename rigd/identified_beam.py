@@ -10,7 +10,7 @@ from typing import Any, Final
 from rigd.beam import Beam, Damping
 from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
-from rigd.units import finite_number
+from rigd.units import finite_number, is_usable_size
 
 _NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _BELOW: Final = {"zeta": 1.0, "alpha": 2.0, "lambda": 2.0}
@@ -112,7 +112,8 @@ def _value(path: Path, name: str, entry: object) -> float:
     value = finite_number(given)
     below = _BELOW.get(name, inf)
     least = -inf if name == "delay_s" else 0.0
-    if value is not None and least <= value < below and (value > 0.0 or name not in _NEEDED):
+    usable = value is not None and least <= value < below and is_usable_size(value)
+    if value is not None and usable and (value > 0.0 or name not in _NEEDED):
         return value
     bound = "more than 0" if name in _NEEDED else "any size" if least < 0 else "0 or more"
     if below < inf:

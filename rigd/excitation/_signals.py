@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
+from rigd.units import is_usable_size
 
 if TYPE_CHECKING:
     from rigd.excitation._touch_passes import Approach
@@ -25,9 +26,6 @@ beam unlike the one it was made with."""
 
 MAX_TICKS = 7_200_000
 """Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
-
-_SMALLEST, _LARGEST = 1e-9, 1e9
-"""Size of options in their units, other than 0: beyond it products overflow or vanish."""
 
 
 class ExcitationError(UserError, ValueError):
@@ -116,10 +114,9 @@ def finite(option: str, value: float, unit: str) -> None:
     """Refuse what is not a finite number, or of a size that no rig has."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
-    if value != 0.0 and not _SMALLEST <= abs(value) <= _LARGEST:
+    if not is_usable_size(value):
         raise ExcitationError(
-            f"{option} = {value:g} {unit} is of no size that a rig has, {_SMALLEST:g} to "
-            f"{_LARGEST:g}; check its unit."
+            f"{option} = {value:g} {unit} is of no size that a rig can have; check its unit."
         )
 
 

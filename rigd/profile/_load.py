@@ -102,7 +102,7 @@ def profile_of(text: str, path: Path) -> Profile:
     if problems:
         raise complaint(path, problems)
 
-    section = {name: _build(name, values) for name in SECTIONS if _present(name, document)}
+    section = {name: _build(name, values) for name in SECTIONS if name not in absent}
     return Profile(
         name=values["name"],
         description=values["description"],
@@ -231,7 +231,7 @@ def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (
-            dotted in SECTIONS or not entry.keys() & {"value", "source"}
+            dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
             yield from _entries(entry, dotted + ".")
         else:
@@ -266,7 +266,9 @@ def validate(
             elif str(detail["loc"][0]) not in missing:
                 problems.append(diagnostics.wrong(detail))
         return given
-    return model.model_dump(by_alias=True)
+    usable: dict[str, Any] = model.model_dump(by_alias=True)
+    problems.extend(diagnostics.unusable_sizes(usable))
+    return usable
 
 
 @cache
@@ -279,10 +281,6 @@ def _schema(absent: frozenset[str]) -> type[BaseModel]:
     }
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return create_model("Profile", __config__=config, **definitions)
-
-
-def _present(section: str, document: Mapping[str, Any]) -> bool:
-    return section not in OPTIONAL_SECTIONS or section in document
 
 
 def _build(section: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401

@@ -245,10 +245,18 @@ def mode_poles(loop: ClosedLoop) -> Complex:
     -------
     ndarray, shape (m,)
         In rad/s, of the lowest modes that oscillate and lie within reach of the ticks.
+
+    Raises
+    ------
+    RealisationError
+        If the damping leaves the beam no such modes.
     """
     model = loop.model
     assert model.beam is not None
-    locked = poles(model.beam, model.damping, _MOST_MODES)[:, 0]
+    try:
+        locked = poles(model.beam, model.damping, _MOST_MODES)[:, 0]
+    except ArithmeticError as error:
+        raise RealisationError(f"The damping is too strong for the model: {error}") from None
     oscillating = (locked.imag != 0.0) & (np.abs(locked) < 0.5 * math.pi * model.rate_hz)
     return np.array(
         [loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked[oscillating]]

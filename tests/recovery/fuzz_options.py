@@ -33,6 +33,8 @@ from typer.utils import get_params_from_function
 from rigd.runtime import use_one_thread
 
 LONG = 1_000_000
+STEP = 11
+"""From the value of one option to that of the next: prime to the lengths of the lists."""
 DIGITS = "9" * 5000
 CONTROL = "\x1b]0;owned\x07\x1b[2J\r\nError"
 NUMBERS = (
@@ -178,7 +180,7 @@ def sound_arguments(ground, words):
         "rigd info": [str(ground.session)],
         "rigd replay": [str(ground.session), "--save", "@/out.rrd"],
         "rigd recover": [str(ground.session)],
-        "rigd bench": [*simulated, "--seconds", "0.2"],
+        "rigd bench": [*simulated, "--seconds", "1"],
         "rigd simulate": ["--profile", "antenna_can", "--quiet"],
         "rigd inject": ["sensor_dead", "--profile", "antenna_can"],
         "rigd identify motor": [*simulated, "--fast", "--output", str(ground.folder / "out")],
@@ -259,7 +261,7 @@ def option_cases(ground, seed, every):
                 else:
                     given = [*sound, label, value]
                 yield Case(name, program, [*names, *given])
-            turn += 7  # prime to the lengths of most lists, so that neighbours differ
+            turn += STEP
 
 
 def _file_values(label):
@@ -346,7 +348,7 @@ def key_cases(seed, every):
                     yield Case(f"run {name}", "rigd",
                                [*run, "--profile", "@/p.toml", "--output", "@/out"],
                                {"p.toml": hostile})  # fmt: skip
-            turn += 7
+            turn += STEP
     yield from _specimen_cases(seed, every)
     yield from _eds_cases(seed, every)
     yield from _json_cases(seed, every)
@@ -359,7 +361,7 @@ def _specimen_cases(seed, every):
     keys += ["uncertainty.length_percent", "uncertainty.density_percent", "note", "unknown"]
     keys += ["sensor.tool_inertia_kg_m2"]
     for turn, key in enumerate(keys, seed):
-        for value in TOML_NUMBERS if every else [TOML_NUMBERS[5 * turn % len(TOML_NUMBERS)]]:
+        for value in TOML_NUMBERS if every else [TOML_NUMBERS[STEP * turn % len(TOML_NUMBERS)]]:
             stated = {
                 f"beam.{k}": f'{{ value = {v}, source = "assumed" }}' for k, v in beam.items()
             }
@@ -383,7 +385,7 @@ def _eds_cases(seed, every):
     lines = text.splitlines()
     keys = {line.partition("=")[0].strip() for line in lines if "=" in line and line[0] not in ";#"}
     for turn, key in enumerate(sorted(keys), seed):
-        for value in EDS_VALUES if every else [EDS_VALUES[3 * turn % len(EDS_VALUES)]]:
+        for value in EDS_VALUES if every else [EDS_VALUES[STEP * turn % len(EDS_VALUES)]]:
             hostile = "\n".join(
                 f"{key}={value}" if line.partition("=")[0].strip() == key else line
                 for line in (lines if len(value) < 1000 else lines[:60])
@@ -396,8 +398,8 @@ def _eds_cases(seed, every):
                 ["profiles", "new", "--eds", "@/d.eds", "--output", "@/n.toml"],
                 files,
             )
-            yield Case(f"check {name}", "rigd",
-                       ["check", "--profile", "antenna_can", "--eds", "@/d.eds"], files)  # fmt: skip
+            check = ["check", "--profile", "antenna_can", "--eds", "@/d.eds"]
+            yield Case(f"check {name}", "rigd", check, files)
 
 
 def _json_cases(seed, every):
@@ -406,7 +408,7 @@ def _json_cases(seed, every):
     names += ["zeta", "alpha", "gamma", "lambda", "tool_inertia_kg_m2", "delay_s", "value", "std"]
     names += ["interval_95", "file"]
     for turn, key in enumerate(names, seed):
-        for value in JSON_VALUES if every else [JSON_VALUES[5 * turn % len(JSON_VALUES)]]:
+        for value in JSON_VALUES if every else [JSON_VALUES[STEP * turn % len(JSON_VALUES)]]:
             mark = "@@"
             mode = {"frequency_hz": 2.6, "damping_ratio": 0.01, "frequency_std_hz": 0.001}
             mode["estimator"] = "record"
@@ -451,6 +453,12 @@ def whole_file_cases(ground):
         "control": lambda: b'a = "\x1b[2J"',
         "escaped control": lambda: b'"\\u001b[2J\\u0007" = 1\n[x]\n"\\u202e" = 2',
         "large": lambda: b"# comment\n" * 10_000_000,
+        "tables as many as there may be": lambda: b"".join(
+            b"[table_%d]\nkey = 1\n" % i for i in range(1400)
+        ),
+        "keys as long as there may be": lambda: b"".join(
+            b"[t%d]\na" % i + b".a" * 2000 + b" = 1\n" for i in range(60)
+        ),
         "not utf-8": lambda: b"\xff\xfe" * 1000,
     }  # fmt: skip
     run = ["run", "hold", "--duration", "0.2", "--fast", "--no-look", "--output", "@/out"]
@@ -468,13 +476,16 @@ def whole_file_cases(ground):
         "deep": lambda: b"[" * 200_000 + b"]" * 200_000,
         "deep objects": lambda: b'{"modes":' * 50_000 + b"1" + b"}" * 50_000,
         "long number": lambda: b'{"modes": ' + b"9" * 5000 + b"}",
-        "many modes": lambda: b'{"modes": [' + b",".join([b'{"frequency_hz": 2.6, "damping_ratio": 1}']
-        * 300_000) + b"]}",
+        "many modes": lambda: b'{"modes": [' + b",".join(
+            [b'{"frequency_hz": 2.6, "damping_ratio": 1}'] * 300_000
+        ) + b"]}",
         "many keys": lambda: b"{" + b",".join(b'"k%d": 1' % i for i in range(500_000)) + b"}",
         "empty lists": lambda: b'{"modes": [' + b",".join([b"[]"] * 5_000_000) + b"]}",
         "long text": lambda: b'{"modes": "' + b"x" * 30_000_000 + b'"}',
         "large": lambda: b" " * 300_000_000,
-        "surrogates": lambda: b'{"modes": "\\ud800", "headlines": [{"file": "\\udfff", "parameters": 1}]}',
+        "surrogates": lambda: (
+            b'{"modes": "\\ud800", "headlines": [{"file": "\\udfff", "parameters": 1}]}'
+        ),
     }  # fmt: skip
     short = ["--profile", "sim", "--fast", "--no-look", "--output", "@/out"]
     for name, data in jsons.items():
@@ -516,7 +527,9 @@ def whole_file_cases(ground):
         "many lines": lambda: b"[DeviceInfo]\n" + b"a=b\n" * 900_000,
         "one line": lambda: b"[DeviceInfo]\nVendorName=" + b"x" * 3_900_000,
         "large": lambda: b"x" * 50_000_000,
-        "control": lambda: b"[DeviceInfo]\nVendorName=\x1b[2J\n[1000]\nParameterName=\x1b[2J\nDataType=7\n",
+        "control": lambda: (
+            b"[DeviceInfo]\nVendorName=\x1b[2J\n[1000]\nParameterName=\x1b[2J\nDataType=7\n"
+        ),
         "compact": lambda: b"".join(
             b"[%04X]\nParameterName=a\nCompactSubObj=254\nDataType=7\n" % i
             for i in range(0x2000, 0x2100)
@@ -622,9 +635,9 @@ def warm_up():
 
 def all_cases(ground, seed=0, *, every=False):
     """Yield all cases; `every` value of each option and key in the place of one."""
+    yield from whole_file_cases(ground)
     yield from option_cases(ground, seed, every)
     yield from key_cases(seed, every)
-    yield from whole_file_cases(ground)
 
 
 def try_cases(ground, cases, report=lambda outcome: None):
