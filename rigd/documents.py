@@ -14,8 +14,8 @@ from typing import Any, Final
 from rigd.runtime import open_plain_file
 
 MOST_TOML_BYTES: Final = 250_000
-MOST_JSON_BYTES: Final = 16_000_000
-"""As objects, the most unfavourable document takes twenty times as much."""
+MOST_JSON_BYTES: Final = 12_000_000
+"""As objects, the most unfavourable document takes thirty times as much."""
 _MOST_ENTRIES: Final = 3000
 """Keys and elements of a TOML document; a profile has 150."""
 _LONGEST_LINE: Final = 4096

@@ -64,7 +64,7 @@ def test_json_that_is_too_much_is_refused(tmp_path, data, words):
     path = tmp_path / "a.json"
     path.write_bytes(data)
     with pytest.raises(DocumentError, match=words):
-        read_json(path, 1000 if words.startswith("at most") else 16_000_000)
+        read_json(path, 1000 if words.startswith("at most") else 12_000_000)
 
 
 def test_what_is_not_an_ordinary_file_is_neither_waited_for_nor_read(tmp_path):
