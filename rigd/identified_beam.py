@@ -98,7 +98,8 @@ def _parameters(path: Path) -> Mapping[str, Any]:
     except DocumentError as error:
         raise IdentifiedBeamError(f"{path}: {error}; {_REMEDY}.") from error
     headlines = document.get("headlines") if isinstance(document, dict) else None
-    found = [each for each in headlines or [] if isinstance(each, dict)]
+    listed = headlines if isinstance(headlines, list) else []
+    found = [each for each in listed if isinstance(each, dict)]
     pooled = [each for each in found if each.get("file", "") is None]
     parameters = next(iter(pooled + found), {}).get("parameters")
     if not isinstance(parameters, dict):

@@ -122,6 +122,9 @@ class Ground:
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         self.wait_until_ready()
+        # What the first session imports is no growth.
+        self._ask("start", *sound_arguments(self, ["rigd", "start", "chirp"])[:-2])
+        self.wait_until_ready()
 
     def wait_until_ready(self):
         """End what the daemon runs, and wait until it can run the next."""
