@@ -17,6 +17,7 @@ from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
+from rigd.printable import readable_errors
 
 
 def _tell(asked: bool) -> None:
@@ -61,9 +62,14 @@ class RigdGroup(TyperGroup):
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
+    def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
+        """Parse what stands before the command."""
+        with readable_errors():
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
-        with errors_told():
+        with readable_errors(), errors_told():
             return super().invoke(ctx)
 
 

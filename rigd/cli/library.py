@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
-from rigd.printable import printable
+from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_WRONG_USE,
+    SESSIONS,
+    AsJson,
+    complain,
+    fail,
+    progress,
+)
+from rigd.printable import printable, readable_message
 from rigd.units import with_half_width
 
 if TYPE_CHECKING:
@@ -112,7 +120,7 @@ def specimens() -> None:
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
                 f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
             )
-        typer.echo(printable(f"{name}: {told}"))
+        typer.echo(readable_message(f"{name}: {told}"))
 
 
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
@@ -282,7 +290,7 @@ def info(
             found = describe(path)
         except SessionError as error:
             failed = True
-            typer.echo(f"Error: {error}", err=True)
+            complain(str(error))
             documents.append({"path": str(path), "error": str(error)})
         else:
             documents.append(found.as_dict())
@@ -321,7 +329,7 @@ def recover(
                 recovery = recover_file(path, on_progress)
         except SessionError as error:
             failed = True
-            typer.echo(f"Error: {error}", err=True)
+            complain(str(error))
             documents.append({"source": str(path), "path": None, "error": str(error)})
         else:
             documents.append(recovery.as_dict())

@@ -10,7 +10,7 @@ import typer
 
 from rigd.cli import entry
 from rigd.errors import RigdError
-from rigd.printable import progress_bar
+from rigd.printable import progress_bar, readable_message
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -22,8 +22,13 @@ EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 def fail(message: str, code: int) -> NoReturn:
     """Tell what is wrong on standard error and leave with an exit code."""
-    typer.echo(f"Error: {message}", err=True)
+    complain(message)
     raise typer.Exit(code)
+
+
+def complain(message: str) -> None:
+    """Write an error to standard error."""
+    typer.echo(f"Error: {readable_message(message)}", err=True)
 
 
 @contextlib.contextmanager

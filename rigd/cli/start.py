@@ -28,6 +28,7 @@ from rigd.cli.options import (
     Specimen,
     TipSlope,
     WatchFit,
+    complain,
     fail,
     session_notes,
 )
@@ -160,7 +161,7 @@ def start_sessions(
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
-        typer.echo(f"Error: {series['reason']}", err=True)
+        complain(series["reason"])
         raise typer.Exit(EXIT_FAILED)
     if series["stopped"]:
         raise typer.Exit(EXIT_INTERRUPTED)

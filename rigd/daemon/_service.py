@@ -37,10 +37,9 @@ from rigd.daemon._states import (
     transition_document,
 )
 from rigd.devices import WhatMoves, what_moves
-from rigd.errors import RigdError, UserError
-from rigd.profile import Profile, with_specimen
+from rigd.errors import UserError
+from rigd.profile import Profile
 from rigd.runner import (
-    NoRoomError,
     ProbeFailedError,
     QuickLook,
     QuickLooks,
@@ -49,9 +48,7 @@ from rigd.runner import (
     RigStatus,
     Series,
     SessionFailedError,
-    excitation_for,
     what_is_kept,
-    with_tip_slope,
 )
 
 LOOK_S = 0.2
@@ -411,7 +408,8 @@ class Service:
         series = self._series = ServedSeries(self._count, request, running=True)
         self._doing = "planning"
         try:
-            planned = await self._call(partial(self._plan, request))
+            job = background.PlanJob(self._profile, request, self._folder, self._start_rad())
+            planned = await (background.perform(job) if job.is_heavy else self._call(job.perform))
             if series.stop.requested or self._closing:
                 raise CommandError("It was stopped before it began.")
             refusal = self._states.refusal("start")
@@ -500,30 +498,6 @@ class Service:
         """Return where the motor stands, from the rig's zero; 0 while that is not known."""
         status = self._rig.status()
         return 0.0 if status is None else status.angle_rad
-
-    def _plan(self, request: protocol.Start) -> Series:
-        """Make the excitation and check that it may be run; in the second thread."""
-        notes = request.notes.as_metadata()
-        try:
-            profile = with_specimen(self._profile, notes.get("specimen", ""))
-            check_on_paper(profile, request.accept).require()
-            profile = with_tip_slope(profile, request.tip_slope_rad)
-            return Series(
-                profile,
-                excitation_for(profile, request.excitation, request.parameters, self._start_rad()),
-                self._folder,
-                repeat=request.repeat,
-                notes=notes,
-                force=request.force,
-                accept=request.accept,
-                watch_fit=request.watch_fit,
-            )
-        except NoRoomError as error:  # the same request may succeed later
-            raise CommandError(str(error)) from error
-        except RigdError as error:
-            raise CommandError(str(error), wrong_use=error.wrong_use) from error
-        except MemoryError:
-            raise CommandError("There is not enough memory to plan such a session.") from None
 
     async def _follow(self, series: ServedSeries, planned: Series) -> None:
         """Run a series to its end, whatever that is."""

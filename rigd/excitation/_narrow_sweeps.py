@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from rigd.beam import (
@@ -29,6 +29,7 @@ from rigd.beam import (
     transfer_and_gradient,
     undamped_frequencies_rad_s,
 )
+from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
     Excitation,
@@ -39,7 +40,6 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
-from rigd.runtime import open_plain_file
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -50,7 +50,6 @@ _CLOSE_ENOUGH: Final = 1.005
 LEAST_SHARE: Final = 0.5
 """Least share of an equal part of the time for every band: a mode is never left out."""
 
-MOST_BYTES: Final = 64_000_000
 SAME_MODE: Final = 1.1
 """Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
 slender beam differ by more."""
@@ -82,7 +81,7 @@ class _Document(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    modes: list[_Entry]
+    modes: Annotated[list[_Entry], FailFast()]  # the errors of a million take gigabytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,16 +129,10 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        with open_plain_file(path, MOST_BYTES) as file:
-            return json.load(file)
-    except OSError as error:
-        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
-    except RecursionError:
-        raise ExcitationError(f"{path}: is nested too deeply.") from None
-    except ValueError as error:
+        return read_json(path)
+    except DocumentError as error:
         raise ExcitationError(
-            f"{path}: is not a JSON document ({error}); write one with analyze session.mcap "
-            "--json fits.json."
+            f"{path}: {error}; write one with analyze session.mcap --json fits.json."
         ) from error
 
 

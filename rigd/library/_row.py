@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.runtime import read_plain_file
 from rigd.session import Validity, modes_of, read_look
 
 SUFFIX: Final = ".mcap"
@@ -211,9 +212,7 @@ def _with_validity(modes: tuple[Mode, ...], found: object) -> Document:
 
 def _document(path: Path) -> object:
     try:
-        if path.stat().st_size > _MOST_JSON_BYTES:
-            return None
-        return json.loads(path.read_bytes())
+        return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):  # a result less, no session less
         return None
 

@@ -9,7 +9,6 @@ A number that nobody knows yet is ``{ source = "unknown" }``, without a value.
 """
 
 import math
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -17,7 +16,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from rigd import documents
 from rigd.devices import MAY_BE_UNKNOWN, RigParameters
+from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._places import profile_files
@@ -32,7 +33,6 @@ from rigd.profile._schema import (
     is_number,
     keys,
 )
-from rigd.text_table import decode_text
 
 
 class ProfileError(UserError, ValueError):
@@ -79,11 +79,9 @@ def read_text(path: Path) -> str:
         If it cannot be read, or is not text.
     """
     try:
-        return decode_text(path.read_bytes())
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
+        return documents.read_text(path)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def profile_of(text: str, path: Path) -> Profile:
@@ -109,7 +107,7 @@ def profile_of(text: str, path: Path) -> Profile:
     if problems:
         raise complaint(path, problems)
 
-    section = {name: _build(name, values) for name in SECTIONS if _present(name, document)}
+    section = {name: _build(name, values) for name in SECTIONS if name not in absent}
     return Profile(
         name=values["name"],
         description=values["description"],
@@ -151,9 +149,9 @@ def parse(text: str, path: Path) -> dict[str, Any]:
         If it is none.
     """
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
+        return documents.parse_toml(text)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def complaint(path: Path, problems: Iterable[str]) -> ProfileError:
@@ -244,7 +242,7 @@ def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (
-            dotted in SECTIONS or not entry.keys() & {"value", "source"}
+            dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
             yield from _entries(entry, dotted + ".")
         else:
@@ -285,7 +283,9 @@ def validate(
             elif str(detail["loc"][0]) not in missing:
                 problems.append(diagnostics.wrong(detail))
         return given
-    return model.model_dump(by_alias=True) | dict.fromkeys(unknown, math.nan)
+    usable: dict[str, Any] = model.model_dump(by_alias=True)
+    problems.extend(diagnostics.unusable_sizes(usable))
+    return usable | dict.fromkeys(unknown, math.nan)
 
 
 @cache
@@ -298,10 +298,6 @@ def _schema(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
     }
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return create_model("Profile", __config__=config, **definitions)
-
-
-def _present(section: str, document: Mapping[str, Any]) -> bool:
-    return section not in OPTIONAL_SECTIONS or section in document
 
 
 def _build(section: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401

@@ -6,6 +6,7 @@ session file has of its record.
 """
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +24,8 @@ LOOK_VERSION: Final = 1
 """Version of its layout."""
 
 _MOST_BYTES: Final = 1 << 20
+_WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags with which a pipe reads as empty; Windows has neither."""
 _MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_READ: Final = 200
@@ -137,7 +140,8 @@ def _start_utc_ns(path: Path) -> int:
 
 
 def _content(path: Path) -> bytes:
-    with path.open("rb") as file:
+    descriptor = os.open(path, os.O_RDONLY | _WITHOUT_WAITING)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - of a descriptor
         return file.read(_MOST_BYTES)
 
 

@@ -1,7 +1,6 @@
 """Predictions and checks of the daemon, made in a process of their own, whatever else is done."""
 
 import asyncio
-import json
 import pickle
 import resource
 import subprocess
@@ -113,9 +112,10 @@ def test_a_prediction_without_the_memory_is_refused(profile):
         capture_output=True,
         check=True,
     )
-    answer = json.loads(told.stdout)
-    assert "not enough free memory" in answer["error"]
-    assert answer["wrong_use"]
+    answer = pickle.loads(told.stdout)
+    assert isinstance(answer, CommandError)
+    assert "not enough free memory" in str(answer)
+    assert answer.wrong_use
 
 
 def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):
