@@ -354,7 +354,7 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
     --------
     >>> from analysis.models import WelchSettings, estimate_text
     >>> estimate_text("h1", WelchSettings().segmentation(1000.0), 8)
-    "Welch's H1, 8 Hamming segments of 17267, overlap 2590, nfft 160000"
+    "Welch's H1, 8 Hamming segments of 17266, overlap 2590, nfft 160000"
     """
     if estimator == "fft":
         return ESTIMATOR_WORDS[estimator]

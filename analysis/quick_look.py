@@ -27,7 +27,7 @@ from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_
 from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -44,6 +44,9 @@ _JUDGED_S: Final = 300.0
 
 _NEAR: Final = 0.1
 """Distance of two such bands, relative to their frequency, below which they are told as one."""
+
+_HAMMING_BINS: Final = 1.30
+"""Width of a Hamming window's main lobe at half its power, in bins of the segment."""
 
 _QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 
@@ -84,7 +87,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
 
     began_s = time.monotonic()
     modes: list[dict[str, Any]] = []
-    response, coherence = None, _no_coherence()
+    response, coherence, model = None, _no_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     flags: list[str] = []
     compared = None
@@ -98,10 +101,12 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        modes, more = _modes(record)
+        told, more = _headline(record)
+        modes = [] if told is None else [_mode(each) for each in told.modes]
         flags += more
         response, coherence, more = _response(record)
         flags += more
+        model = None if told is None or response is None else _model(told, response["frequency_hz"])
     before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
@@ -119,22 +124,23 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         "flags": flags,
         "against_last": compared,
         "response": response,
+        "model": model,
     }
     document["text"] = list(_text(document))
     return dict(finite(document))
 
 
-def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
-    """Estimate the modes; return them, and what is to be said of them."""
+def _headline(record: Record) -> tuple[Headline | None, list[str]]:
+    """Fit the record; return the numbers, None without any, and the sentences on them."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
 
     said = []
     length_s = record.time_s.size / record.rate_hz
+    told: Headline
+    found: tuple[Finding, ...]
     try:
-        told: Headline
-        found: tuple[Finding, ...]
         if length_s <= _JUDGED_S:
             selection = whole_record(record).selection
             told, found = selection.headline, selection.verdict.findings
@@ -146,11 +152,11 @@ def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
-        return [], [f"No modes: {_without_name(str(error), record.path)}"]
+        return None, [f"No modes: {_without_name(str(error), record.path)}"]
     said += [each.sentence for each in found]
     if not told.modes:
         said.append("No modes: none lies in the excited band.")
-    return [_mode(each) for each in told.modes], said
+    return told, said
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -159,6 +165,32 @@ def _mode(mode: Mode) -> dict[str, Any]:
         "frequency_hz": mode.frequency_hz.as_json(),
         "damping_ratio": mode.damping_ratio.as_json(),
         "shown": mode.shown,
+    }
+
+
+def _model(told: Headline, shown_hz: Sequence[float]) -> dict[str, Any] | None:
+    """Return the response of the fitted model with its 95 % band, where the beam was excited.
+
+    None if it does not explain the record, or depends on the amplitude, as with drag: there is no
+    band for it then.
+    """
+    import numpy as np
+
+    from analysis.report import dense_grid, response_band
+    from rigd.view import response_thinning
+
+    if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
+        return None
+    peaks_hz = [mode.frequency_hz.value for mode in told.modes]
+    band = response_band(told.fit, dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
+    magnitude, limits = np.abs(band.response), band.magnitude_limits()
+    kept = response_thinning(band.frequency_hz).extremes(magnitude)
+    return {
+        "frequency_hz": _rounded(band.frequency_hz[kept]),
+        "magnitude": _rounded(magnitude[kept]),
+        "magnitude_low_95": _rounded(limits[0][kept]),
+        "magnitude_high_95": _rounded(limits[1][kept]),
+        "phase_rad": _rounded(np.angle(band.response[kept])),
     }
 
 
@@ -173,6 +205,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
 
     last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.sweep_samples, record.rate_hz)
+    resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate(record, segments, last_hz)
         # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
@@ -194,6 +227,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
         "magnitude": _rounded(np.abs(values[kept])),
         "phase_rad": _rounded(np.angle(values[kept])),
         "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
+        "resolution_hz": round(resolution_hz, 4),
     }
     if coherence is None or hz.size == 0:
         return response, _no_coherence(), []

@@ -118,7 +118,7 @@ def to_uncertainty(
         return tuple(f"{scale * value:{sign}.{digits}f}" for value in values)
     largest = max((abs(scale * value) for value in values), default=0.0) or size
     power = digits + floor(log10(largest))
-    return tuple(f"{scale * value:{sign}.{max(power, 1)}e}" for value in values)
+    return tuple(f"{scale * value:{sign}.{max(power, 1) + 1}g}" for value in values)
 
 
 def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
