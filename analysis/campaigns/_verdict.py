@@ -185,7 +185,7 @@ def campaign_verdict(
     validation : sequence of LeftOutError
     lost : sequence of LostTrial
     biases : sequence of WelchBias, optional
-        Of the Welch fits against the pooled estimates.
+        Differences of the Welch fits from the pooled estimates.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
