@@ -338,6 +338,32 @@ ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
 """What reports and figures call an estimator."""
 
 
+def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: int | str) -> str:
+    """Describe how a frequency response was estimated.
+
+    Parameters
+    ----------
+    estimator : str
+        As of `WelchSettings`.
+    segmentation : Segmentation
+        Lengths in samples.
+    segments : int or str
+        Number of segments.
+
+    Examples
+    --------
+    >>> from analysis.models import WelchSettings, estimate_text
+    >>> estimate_text("h1", WelchSettings().segmentation(1000.0), 8)
+    "Welch's H1, 8 Hamming segments of 17266, overlap 2590, nfft 160000"
+    """
+    if estimator == "fft":
+        return ESTIMATOR_WORDS[estimator]
+    return (
+        f"{ESTIMATOR_WORDS[estimator]}, {segments} Hamming segments of "
+        f"{segmentation.segment_length}, overlap {segmentation.overlap}, nfft {segmentation.nfft}"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class WelchSettings:
     """How the frequency response is estimated and what is fitted to it.

@@ -35,7 +35,7 @@ from rigd.session import (
 from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -52,6 +52,9 @@ _JUDGED_S: Final = 300.0
 
 _NEAR: Final = 0.1
 """Distance of two such bands, relative to their frequency, below which they are told as one."""
+
+_HAMMING_BINS: Final = 1.30
+"""Width of a Hamming window's main lobe at half its power, in bins of the segment."""
 
 _QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 
@@ -92,7 +95,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
 
     began_s = time.monotonic()
     modes: list[dict[str, Any]] = []
-    response, coherence = None, _no_coherence()
+    response, coherence, model = None, _no_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     flags: list[str] = []
     validity = Validity()
@@ -107,10 +110,12 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        modes, validity, more = _modes(record)
+        told, validity, more = _headline(record)
+        modes = [] if told is None else [_mode(each) for each in told.modes]
         flags += more
         response, coherence, more = _response(record)
         flags += more
+        model = None if told is None or response is None else _model(told, response["frequency_hz"])
     before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
@@ -129,13 +134,14 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         "flags": flags,
         "against_last": compared,
         "response": response,
+        "model": model,
     }
     document["text"] = list(_text(document))
     return dict(finite(document))
 
 
-def _modes(record: Record) -> tuple[list[dict[str, Any]], Validity, list[str]]:
-    """Estimate the modes; return them, their validity, and what is to be said of them."""
+def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
+    """Fit the record; return the numbers, None without any, their validity, and the sentences."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
@@ -143,9 +149,9 @@ def _modes(record: Record) -> tuple[list[dict[str, Any]], Validity, list[str]]:
 
     said = []
     length_s = record.time_s.size / record.rate_hz
+    told: Headline
+    found: tuple[Finding, ...]
     try:
-        told: Headline
-        found: tuple[Finding, ...]
         if length_s <= _JUDGED_S:
             whole = whole_record(record)
             told, found, validity = whole.headline, whole.verdict.findings, whole.validity
@@ -160,11 +166,11 @@ def _modes(record: Record) -> tuple[list[dict[str, Any]], Validity, list[str]]:
             )
     except MeasurementError as error:
         no_modes = f"No modes: {_without_name(str(error), record.path)}"
-        return [], stated_validity(record.metadata), [no_modes]
+        return None, stated_validity(record.metadata), [no_modes]
     said += [each.sentence for each in found]
     if not told.modes:
         said.append("No modes: none lies in the excited band.")
-    return [_mode(each) for each in told.modes], validity, said
+    return told, validity, said
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -173,6 +179,32 @@ def _mode(mode: Mode) -> dict[str, Any]:
         "frequency_hz": mode.frequency_hz.as_json(),
         "damping_ratio": mode.damping_ratio.as_json(),
         "shown": mode.shown,
+    }
+
+
+def _model(told: Headline, shown_hz: Sequence[float]) -> dict[str, Any] | None:
+    """Return the response of the fitted model with its 95 % band, where the beam was excited.
+
+    None if it does not explain the record, or depends on the amplitude, as with drag: there is no
+    band for it then.
+    """
+    import numpy as np
+
+    from analysis.report import dense_grid, response_band
+    from rigd.view import response_thinning
+
+    if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
+        return None
+    peaks_hz = [mode.frequency_hz.value for mode in told.modes]
+    band = response_band(told.fit, dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
+    magnitude, limits = np.abs(band.response), band.magnitude_limits()
+    kept = response_thinning(band.frequency_hz).extremes(magnitude)
+    return {
+        "frequency_hz": _rounded(band.frequency_hz[kept]),
+        "magnitude": _rounded(magnitude[kept]),
+        "magnitude_low_95": _rounded(limits[0][kept]),
+        "magnitude_high_95": _rounded(limits[1][kept]),
+        "phase_rad": _rounded(np.angle(band.response[kept])),
     }
 
 
@@ -187,6 +219,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
 
     last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.sweep_samples, record.rate_hz)
+    resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate(record, segments, last_hz)
         # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
@@ -208,6 +241,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
         "magnitude": _rounded(np.abs(values[kept])),
         "phase_rad": _rounded(np.angle(values[kept])),
         "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
+        "resolution_hz": round(resolution_hz, 4),
     }
     if coherence is None or hz.size == 0:
         return response, _no_coherence(), []

@@ -80,11 +80,66 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
     >>> print(with_half_width(2.56987, (2.56980, 2.56994)), with_half_width(0.0091, None, 100.0))
     2.569870 ± 0.000070 0.91
     """
-    half = 0.0 if interval is None else scale * (interval[1] - interval[0]) / 2
-    if not 0 < half < inf:
+    half = 0.0 if interval is None else (interval[1] - interval[0]) / 2
+    if not 0 < scale * half < inf:
         return f"{scale * value:.5g}"
-    digits = min(decimals(half), _MOST_DECIMALS)
-    return f"{scale * value:.{digits}f} ± {half:.{digits}f}"
+    return " ± ".join(to_uncertainty((value, half), half, scale))
+
+
+def to_uncertainty(
+    values: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
+) -> tuple[str, ...]:
+    """Write numbers to the second digit of their uncertainty.
+
+    Parameters
+    ----------
+    values
+        The numbers.
+    uncertainty
+        Standard deviation or half-width of an interval; with 0 or what is not finite, five
+        significant digits are written.
+    scale
+        Factor of the unit in which they are written.
+    sign
+        "+" to write the sign of positive numbers as well.
+
+    Examples
+    --------
+    >>> to_uncertainty((0.0305891, 0.0306012), 6e-6, 100.0, "+")
+    ('+3.05891', '+3.06012')
+    >>> to_uncertainty((1.23456e-12,), 1e-15)
+    ('1.2346e-12',)
+    """
+    size = scale * uncertainty
+    if not 0 < size < inf:
+        return tuple(f"{scale * value:{sign}.5g}" for value in values)
+    digits = decimals(size)
+    if digits <= _MOST_DECIMALS:
+        return tuple(f"{scale * value:{sign}.{digits}f}" for value in values)
+    largest = max((abs(scale * value) for value in values), default=0.0) or size
+    power = digits + floor(log10(largest))
+    return tuple(f"{scale * value:{sign}.{max(power, 1) + 1}g}" for value in values)
+
+
+def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
+    """Write an interval, to the second digit of half its width.
+
+    Parameters
+    ----------
+    interval
+        Its low and its high end.
+    scale
+        Factor of the unit in which it is written.
+    sign
+        "+" to write the sign of positive ends as well.
+
+    Examples
+    --------
+    >>> interval_text((-0.169132, -0.169084), 100.0, "+")
+    '-16.9132 to -16.9084'
+    """
+    half = (interval[1] - interval[0]) / 2
+    return " to ".join(to_uncertainty(interval, half, scale, sign))
 
 
 def with_share(std: float, value: float) -> str:

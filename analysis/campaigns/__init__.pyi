@@ -34,4 +34,6 @@ from ._validation import LeftOutError as LeftOutError
 from ._validation import LostTrial as LostTrial
 from ._validation import by_model as by_model
 from ._verdict import CampaignVerdict as CampaignVerdict
+from ._welch_bias import ParameterBias as ParameterBias
+from ._welch_bias import WelchBias as WelchBias
 from ._workers import process_pool as process_pool

@@ -33,6 +33,7 @@ from analysis.campaigns._statistics import (
 )
 from analysis.campaigns._validation import FEWEST, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
+from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns._workers import Lost, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import worst
@@ -64,6 +65,8 @@ class CampaignResult:
         Table 3; empty where Welch's method does not suit some session, as the following.
     nominal : tuple of NominalModel
         By type, then by weighting: Table 4 and Figures 6 and 7.
+    welch_biases : tuple of WelchBias
+        Differences of the Welch fits from the pooled estimates, by type, then by weighting.
     homogeneity : Homogeneity
         Whether the sessions are of one specimen.
     structures : tuple of RankedStructure
@@ -86,6 +89,7 @@ class CampaignResult:
     failures: tuple[SessionFailure, ...]
     statistics: tuple[ParameterStatistics, ...]
     nominal: tuple[NominalModel, ...]
+    welch_biases: tuple[WelchBias, ...]
     homogeneity: Homogeneity
     structures: tuple[RankedStructure, ...]
     pooled: tuple[PooledEstimate, ...]
@@ -229,6 +233,7 @@ def campaign_result(
     left_out = [(each.name, each.experiment) for each in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     alike = homogeneity(sessions, pooled, specimens)
+    biases = welch_biases(sessions, pooled)
     return CampaignResult(
         settings=sessions[0].settings,
         record_band_hz=sessions[0].record_band_hz,
@@ -236,10 +241,11 @@ def campaign_result(
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
+        welch_biases=biases,
         homogeneity=alike,
         structures=ranked_structures(sessions, pooled),
         pooled=pooled,
-        verdict=campaign_verdict(sessions, pooled, alike, validation, lost),
+        verdict=campaign_verdict(sessions, pooled, alike, validation, lost, biases),
         validation=tuple(validation),
         lost_trials=tuple(lost),
     )

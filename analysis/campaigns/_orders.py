@@ -125,6 +125,8 @@ class PooledOrder:
         Pooled estimate, where the order is identifiable.
     interval : tuple of float or None
         Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
+    std : float or None
+        Its standard deviation; None as above.
     reason : str or None
         Why the number is not a property of the specimen; None if it is.
     alone : mapping of str to int
@@ -141,6 +143,7 @@ class PooledOrder:
     reason: str | None
     alone: Mapping[str, int]
     mixture: bool = False
+    std: float | None = None
 
 
 def pooled_order(
@@ -180,6 +183,7 @@ def pooled_order(
         reason=reason,
         alone=alone,
         mixture=mixture,
+        std=free.std if free and known else None,
     )
 
 

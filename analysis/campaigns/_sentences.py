@@ -7,18 +7,22 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
-from analysis.models import QUANTITIES, STRUCTURES
+from analysis.campaigns._statistics import BEST
+from analysis.campaigns._welch_bias import LARGEST_MISFIT
+from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
 from analysis.statistics import student_t_quantile
-from rigd.units import decimals
+from rigd.printable import listed
+from rigd.units import decimals, to_uncertainty
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._pooling import PooledEstimate, PooledMode
     from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.identify import Order
 
 
@@ -218,11 +222,66 @@ def _files(names: Sequence[str]) -> str:
 
 _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
-_WRONG: Final = 1.5
-"""Residual, in units of the noise, from which a structure is called wrong."""
-
+_CLASSICAL: Final = "III"
+"""Type of integer orders with both dampings."""
 _SIGNIFICANT: Final = 0.01
 _AS_GOOD: Final = 1.01
+
+
+_NEARLY_INTEGER: Final = 0.05
+"""Distance from 1 within which an order is called nearly integer although 1 is excluded."""
+
+
+def answer(
+    freest: PooledEstimate,
+    alpha: PooledOrder,
+    lambda_: PooledOrder,
+    validation: Sequence[LeftOutError],
+) -> str:
+    """Say of which orders the dampings are, and how well the classical and the freest type predict.
+
+    Parameters
+    ----------
+    freest : PooledEstimate
+        On the beam that all sessions support.
+    alpha, lambda_ : PooledOrder
+    validation : sequence of LeftOutError
+    """
+    dampings = f"{_answered(alpha)} and {_answered(lambda_)}"
+    said = f"{dampings[0].upper()}{dampings[1:]}."
+    errors: dict[str, list[str]] = {}
+    for name in dict.fromkeys((f"{_CLASSICAL}{freest.beam}", freest.name)):
+        its = [e.error for e in validation if e.method == "record" and e.name == name]
+        if its:
+            errors.setdefault(f"{100 * float(np.mean(its)):.2g} %", []).append(name)
+    if not errors:
+        return said
+    each = ", ".join(
+        f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error}"
+        for error, names in errors.items()
+    )
+    return f"{said} Error of the torque predicted for an unseen session: {each}."
+
+
+def _answered(found: PooledOrder) -> str:
+    """Say in a few words of which order a damping is."""
+    of = _OF[found.order]
+    if found.status == "absent":
+        return f"no {of}"
+    if found.status == "compatible" and found.interval is None:
+        return f"{of} of order 1 ({found.order} was not fitted)"
+    if found.value is None or found.interval is None or found.reason is not None:
+        return f"{of} of an order that is not established"
+    half = (found.interval[1] - found.interval[0]) / 2
+    number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
+    value = f"{found.order} = {number}"
+    if found.status == "compatible":
+        return f"{of} of integer order ({value})"
+    if found.status == "open":
+        return f"{of} of an order near 1 ({value}; 1 is doubtful, but not excluded)"
+    if abs(found.value - 1) < _NEARLY_INTEGER:
+        return f"{of} of nearly integer order ({value}; 1 is excluded)"
+    return f"{of} of fractional order ({value})"
 
 
 def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
@@ -260,9 +319,9 @@ def sizes(freest: PooledEstimate) -> list[str]:
     for each in freest.sizes:
         if each.omega_rad_s is None:
             continue
-        low, high = each.interval
+        value, low, high = to_uncertainty((each.value, *each.interval), each.std)
         said.append(
-            f"{each.damping} {each.value:.4g} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.damping} {value} (95 %: {low} to {high}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
         )
     return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
@@ -291,7 +350,7 @@ def selected(
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     """Say whether what the structure leaves is noise."""
-    if best.misfit > _WRONG:
+    if best.misfit > LARGEST_MISFIT:
         return (
             f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
             "beam, and standard deviations are meaningless."
@@ -325,10 +384,11 @@ def order(found: PooledOrder) -> str:
         return f"The order {name} of the {of} is fixed at 1, with which it is compatible.{alone}"
     if found.value is None or found.interval is None:
         return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
-    low, high = found.interval
+    half = (found.interval[1] - found.interval[0]) / 2
+    value, low, high = to_uncertainty((found.value, *found.interval), found.std or half)
     is_ = (
-        f"The order {name} of the {of} is {found.value:.4f} "
-        f"(95 %: {low:.4f} to {high:.4f}, between-session variance included)"
+        f"The order {name} of the {of} is {value} "
+        f"(95 %: {low} to {high}, between-session variance included)"
     )
     if found.reason is not None:
         would = is_.replace(" is ", " would be ", 1)
@@ -339,6 +399,64 @@ def order(found: PooledOrder) -> str:
         "open": "1 is doubtful, but not excluded",
     }
     return f"{is_}: {said[found.status]}.{alone}"
+
+
+def welch_bias(
+    freest: PooledEstimate,
+    biases: Sequence[WelchBias],
+    withheld: Collection[str],
+    *,
+    mixed: bool,
+) -> list[str]:
+    """Say by how much the Welch fits of the type that the numbers are of are biased.
+
+    Parameters
+    ----------
+    freest : PooledEstimate
+        On the beam that all sessions support.
+    biases : sequence of WelchBias
+    withheld : collection of str
+        Orders that are not reported; their coefficients are not, either.
+    mixed : bool
+        Whether the sessions are of several specimens: their means are compared with nothing then.
+    """
+    if mixed:
+        return []
+    of_type = [each for each in biases if each.structure == freest.name]
+    best = [each for each in of_type if (each.structure, each.weighting) in BEST]
+    left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
+    said = []
+    for each in best or of_type[:1]:
+        found = [one for one in each.significant if one.parameter not in left_out]
+        if not found:
+            continue
+        said.append(
+            f"Welch's {'; '.join(map(_biased, found))} (type {each.structure}, weights "
+            f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
+            "reduce."
+        )
+        if each.wmse < each.record_wmse:
+            said.append(
+                f"The lower WMSE of the Welch fits ({each.wmse:.3g} against "
+                f"{each.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
+                "from Welch's response, which has the same bias."
+            )
+    return said
+
+
+def _biased(each: ParameterBias) -> str:
+    """Say what a Welch fit's parameter is, and by how much that is above or below."""
+    symbol, factor, unit = label(each.parameter)
+    value, scatter = to_uncertainty((each.welch, each.welch_std), each.welch_std, factor)
+    (record,) = to_uncertainty((each.record,), each.record_std, factor)
+    (size,) = to_uncertainty((abs(each.bias),), each.bias_std, factor)
+    name = each.parameter if each.parameter in _ORDERS else symbol
+    times = f"·{unit}" if unit else ""
+    edge = f", at the edge of the search range in {each.at_bounds}" if each.at_bounds else ""
+    return (
+        f"{name} ({value} ± {scatter}{times} between sessions{edge}) is {size}{times} "
+        f"{'above' if each.bias > 0 else 'below'} the whole records' {record}{times}"
+    )
 
 
 def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
@@ -358,7 +476,16 @@ def scatter(best: PooledEstimate) -> str:
     level = _SIGNIFICANT / max(len(best.parameters), 1)
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
-        return "No between-session variance (Cochran's Q)."
+        lowest = min((each.chance for each in best.parameters), default=1.0)
+        tau = (
+            "; the τ above zero are within chance"
+            if any(each.between_std > 0 for each in best.parameters)
+            else ""
+        )
+        return (
+            "No significant between-session variance (Cochran's Q, lowest p of "
+            f"{len(best.parameters)}: {probability(lowest)}{tau})."
+        )
     return (
         f"Between-session variance in {', '.join(moved)} (Cochran's Q): something changes between "
         "sessions, such as clamp, temperature or motor, and the interval of a single session is "

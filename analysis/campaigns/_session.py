@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -84,7 +84,9 @@ class SessionResult:
     headline : mapping or None
         What the session says first, as of a single file's document; None without a verdict.
     settings : WelchSettings
-        As used.
+        As used, the segments in samples.
+    segments : int
+        Segments that were averaged; 0 without a response by Welch's method.
     record_band_hz : tuple of float
         Band of the whole-record fits.
     name : str
@@ -109,6 +111,7 @@ class SessionResult:
     warnings: tuple[str, ...]
     headline: Mapping[str, Any] | None = None
     settings: WelchSettings = _USUAL
+    segments: int = 0
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
     name: str = ""
     digests: frozenset[bytes] = frozenset()
@@ -125,6 +128,7 @@ class SessionResult:
             response=_NO_RESPONSE.response,
             peaks=(),
             welch_fits=(),
+            segments=0,
         )
 
     @property
@@ -214,6 +218,9 @@ def _session_result(
     record, whole, welch = result.record, result.whole, result.welch
     measured = _NO_RESPONSE if welch is None else welch.response
     delay_s = record.torque_delay_s - record.angle_delay_s
+    settings = welch_settings(record, task.settings, task.band_hz)
+    if welch is not None:
+        settings = replace(settings, **asdict(welch.segmentation))
     return SessionResult(
         path=record.path,
         experiment=experiment,
@@ -230,7 +237,8 @@ def _session_result(
         verdict=None if whole is None else whole.verdict,
         warnings=warnings,
         headline=None if whole is None else whole.headline_json(),
-        settings=welch_settings(record, task.settings, task.band_hz),
+        settings=settings,
+        segments=measured.segments,
         record_band_hz=record_band_hz(record, task.band_hz),
         digests=sample_digests(record.angle_rad, record.torque_nm),
         validity=result.validity,

@@ -90,7 +90,8 @@ def parameter_statistics(sessions: Sequence[SessionResult]) -> tuple[ParameterSt
 
 # Nominal models
 
-_BEST: Final = (("III", "omega"), ("VI", "omega"))
+BEST: Final = (("III", "omega"), ("VI", "omega"))
+"""Types and weightings of the paper's two best models: its Table 5 and Figure 8."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +169,8 @@ def nominal_models(sessions: Sequence[SessionResult]) -> tuple[NominalModel, ...
 
 def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
     """Those of Table 5 and Figure 8: the paper's two, or without them the two of least WMSE."""
-    named = tuple(m for m in models if (m.structure, m.weighting) in _BEST)
-    return named if len(named) == len(_BEST) else tuple(sorted(models, key=_wmse)[:2])
+    named = tuple(m for m in models if (m.structure, m.weighting) in BEST)
+    return named if len(named) == len(BEST) else tuple(sorted(models, key=_wmse)[:2])
 
 
 def mean_deviations(

@@ -12,6 +12,7 @@ from analysis.campaigns import _sentences as sentences
 from analysis.campaigns import _sentences as specimen_sentences
 from analysis.campaigns._orders import PooledOrder, freest_estimate, pooled_order, rivals
 from analysis.identify import EVEN, STRONG
+from rigd.units import interval_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
     from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.campaigns._welch_bias import WelchBias
     from analysis.identify import Finding
 
 
@@ -62,8 +64,8 @@ class CommonFinding:
         if self.span is None or count == 1:
             return words
         factor, unit = _SHOWN.get(self.example.unit, (1.0, self.example.unit))
-        low, high = (f"{factor * end:.3g}" for end in self.span)
-        return f"{words} (Median session; range over all sessions: {low} to {high} {unit}.)"
+        span = interval_text(self.span, factor)
+        return f"{words} (Median session; range over all sessions: {span} {unit}.)"
 
 
 def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, ...]:
@@ -169,6 +171,7 @@ def campaign_verdict(
     alike: Homogeneity,
     validation: Sequence[LeftOutError],
     lost: Sequence[LostTrial],
+    biases: Sequence[WelchBias] = (),
 ) -> CampaignVerdict | None:
     """Judge a campaign; None if fewer than two sessions determine any structure's damping.
 
@@ -181,6 +184,8 @@ def campaign_verdict(
         Whether they are of one specimen.
     validation : sequence of LeftOutError
     lost : sequence of LostTrial
+    biases : sequence of WelchBias, optional
+        Differences of the Welch fits from the pooled estimates.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
@@ -208,12 +213,14 @@ def campaign_verdict(
         dissent=dissent,
         sentences=(
             *specimen_sentences.specimens(alike),
+            sentences.answer(freest, alpha, lambda_, validation),
             sentences.headline(freest, best),
             sentences.left_over(freest, adequate, len(verdicts)),
             *sentences.sizes(freest),
             *sentences.modes(freest, mixed=alike.mixed),
             sentences.order(alpha),
             sentences.order(lambda_),
+            *sentences.welch_bias(freest, biases, _withheld(alpha, lambda_), mixed=alike.mixed),
             sentences.selected(pooled, close, alone, len(verdicts)),
             *(finding.sentence for finding in found),
             *sentences.dissenting([(each.file, each.structure) for each in dissent], best),

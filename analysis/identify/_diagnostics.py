@@ -15,8 +15,9 @@ from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._residual_tests import SURE
 from analysis.identify._rig_findings import of_rig
-from analysis.identify._verdict import EVEN, STRONG, rivals
+from analysis.identify._verdict import STRONG, rivals
 from analysis.statistics import NORMAL_95, chi_square_deviate
+from rigd.units import interval_text, to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -115,12 +116,14 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
     """Find a delay and an inertia that the file does not state."""
     fit = field.best.fit
     if "delay_s" in differing:
-        value, low, high = _difference(field, "delay_s")
+        value, *interval = _difference(field, "delay_s")
+        low, high = interval
+        (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
         yield Finding(
             kind="delay",
             sentence=(
-                f"The torque is {1e3 * abs(value):.3f} ms {'later' if value > 0 else 'earlier'} "
-                f"than the file states ({1e3 * low:.3f} to {1e3 * high:.3f} ms; 95 %): an "
+                f"The torque is {size} ms {'later' if value > 0 else 'earlier'} "
+                f"than the file states ({interval_text(interval, 1e3)} ms; 95 %): an "
                 "undeclared delay between the channels. It was fitted and is not damping."
             ),
             value=value,
@@ -130,19 +133,23 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
                 "Declare the delay between the channels as "
                 f"{1e3 * fit.parameters['delay_s']:.3f} ms."
             ),
+            parameters=("delay_s",),
         )
     if "tool_inertia_kg_m2" in differing:
-        value, low, high = _difference(field, "tool_inertia_kg_m2")
+        value, *interval = _difference(field, "tool_inertia_kg_m2")
+        low, high = interval
+        (size,) = to_uncertainty((value,), (high - low) / 2, 1e6)
         yield Finding(
             kind="tool inertia",
             sentence=(
-                f"The inertia between torque sensor and beam is {value:.3g} kg·m² larger than the "
-                f"file states ({low:.3g} to {high:.3g}; 95 %): clamp or flange."
+                f"The inertia between torque sensor and beam is {size}·10⁻⁶ kg·m² larger than the "
+                f"file states ({interval_text(interval, 1e6)}; 95 %): clamp or flange."
             ),
             value=value,
             interval=(low, high),
             unit="kg·m²",
             remedy="A run without the beam measures it; declare it as tool inertia.",
+            parameters=("tool_inertia_kg_m2",),
         )
 
 
@@ -157,16 +164,20 @@ def _of_beam(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
         off = _difference(field, name)
         if name not in differing or abs(off[0]) < _BEAM_OFF * stated:
             continue
-        share, low, high = (100 * part / stated for part in off)
+        share, *interval = (part / stated for part in off)
+        low, high = interval
+        (size,) = to_uncertainty((abs(share),), (high - low) / 2, 100)
         yield Finding(
             kind="beam data",
             sentence=(
-                f"{words} is {abs(share):.2f} % {'higher' if share > 0 else 'lower'} than the "
-                f"file states ({low:+.2f} to {high:+.2f} %; 95 %){_or_else(field, name)}."
+                f"{words} is {size} % {'higher' if share > 0 else 'lower'} than the "
+                f"file states ({interval_text(interval, 100, '+')} %; 95 %)"
+                f"{_or_else(field, name)}."
             ),
-            value=share / 100,
-            interval=(low / 100, high / 100),
+            value=share,
+            interval=(low, high),
             remedy="Weigh and measure the link again, or take the value found.",
+            parameters=(name,),
         )
 
 
@@ -208,7 +219,7 @@ def _rings(field: CandidateSet) -> bool:
     hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
     return loudest > hum and all(
         chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) > SURE
-        for ringing in (c.fit.ringing for c in (field.best, *rivals(field, EVEN)))
+        for ringing in (c.fit.ringing for c in (field.best, *rivals(field, STRONG)))
         if ringing.degrees_of_freedom
     )
 
@@ -227,10 +238,10 @@ def _stated(field: CandidateSet, name: Setting) -> float:
 def _apart(field: CandidateSet, name: Setting) -> bool:
     """Whether a setting differs from what the file states by more than chance allows.
 
-    So it must in every structure that the data cannot tell from the best.
+    So it must in every structure that is not dismissed.
     """
     stated = _stated(field, name)
-    for candidate in (field.best, *rivals(field, EVEN)):
+    for candidate in (field.best, *rivals(field, STRONG)):
         fit = candidate.fit
         std = fit.std.get(name)
         if not std or fit.interval.get(name) is None:
@@ -392,18 +403,21 @@ def _air(field: CandidateSet) -> Iterator[Finding]:
     drag = field.drag
     if drag is None:
         return
-    low, high = (1e3 * end for end in drag.interval_95_m)
+    low, high = drag.interval_95_m
+    (size,) = to_uncertainty((drag.value_m,), (high - low) / 2, 1e3)
     yield Finding(
         kind="air drag",
         sentence=(
-            f"Air drag acts on the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
-            f"{high:.4g} mm; 95 %) at {drag.speed_m_s:.2g} m/s, so damping grows with the "
-            "amplitude. Drag was fitted too; the beam's parameters are those without air."
+            f"Air drag acts on the beam: C_D d = {size} mm "
+            f"({interval_text(drag.interval_95_m, 1e3)} mm; 95 %) at {drag.speed_m_s:.2g} "
+            "m/s, so damping grows with the amplitude. Drag was fitted too; the beam's parameters "
+            "are those without air."
         ),
         value=drag.value_m,
         interval=drag.interval_95_m,
         unit="m",
         remedy="Sweep at a quarter of the amplitude, where drag is negligible, or in vacuum.",
+        parameters=("drag",),
     )
 
 

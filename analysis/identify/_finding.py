@@ -53,6 +53,8 @@ class Finding:
     unit : str
     remedy : str
         What to do, or which experiment tells more; may be empty.
+    parameters : tuple of str
+        Fitted parameters that it is about: it is no fact where one of them is flagged.
     """
 
     kind: Kind
@@ -61,6 +63,7 @@ class Finding:
     interval: tuple[float, float] | None = None
     unit: str = "1"
     remedy: str = ""
+    parameters: tuple[str, ...] = ()
 
 
 SEEN: Final[frozenset[Kind]] = frozenset(

@@ -47,7 +47,7 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
     from analysis.identify._candidate import Candidate, Kind
     from analysis.identify._data import Measurement
@@ -237,7 +237,8 @@ def _selected(
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        along = tuple(changing(changes))
+        found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
         said = of_headline(numbers, orders, alone=alone)
@@ -323,12 +324,6 @@ def _freest_alone(
     kinds = {finding.kind for finding in found}
     explained = white.white and not related.related
     wrong = _wrong(kinds, explained=explained)
-    if wrong == MISREAD:
-        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
-    else:
-        doubt = wrong or _doubt((), clipped="clipping" in kinds)
-        found = _as_sure(found, (), wrong, doubt, explained=explained)
-        found = _with_knocks_and_rest(field, found, white, related)
     told = of_fit(
         field.best.name,
         field.best.fit,
@@ -337,6 +332,12 @@ def _freest_alone(
         unexplained=wrong,
         both=None if misread else field.with_both_dampings(field.best),
     )
+    if wrong == MISREAD:
+        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    else:
+        doubt = wrong or _doubt((), clipped="clipping" in kinds)
+        found = _as_sure(found, (), wrong, doubt, told.flags, explained=explained)
+        found = _with_knocks_and_rest(field, found, white, related)
     told = told.doubted(_CLIPPED) if "clipping" in kinds else told
     others = (each.fit for each in field.candidates if each.structure is INTEGER)
     analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
@@ -383,6 +384,7 @@ def _as_sure(
     along: tuple[Finding, ...],
     wrong: str | None,
     doubt: str | None,
+    flags: Mapping[str, str],
     *,
     explained: bool,
 ) -> tuple[Finding, ...]:
@@ -394,14 +396,20 @@ def _as_sure(
         Beside the beam, and what changes along the record, which says itself how sure it is.
     wrong, doubt : str or None
         Why the model is not to be believed, and why no number of it.
+    flags : mapping of str to str
+        Reasons against single parameters, as the headline has them.
     explained : bool
         Whether harmonics are all that remains: then they are what they seem to be.
     """
-    if doubt is not None:
-        beside = tuple(
-            each if each.kind == "harmonics" and explained else doubted(each, doubt)
-            for each in beside
-        )
+
+    def as_sure(each: Finding) -> Finding:
+        flag = next((flags[name] for name in each.parameters if name in flags), None)
+        reason = doubt or flag
+        if reason is None or (each.kind == "harmonics" and explained):
+            return each
+        return doubted(each, reason)
+
+    beside = tuple(map(as_sure, beside))
     if wrong is not None:
         along = tuple(doubted(each, wrong) for each in along)
     return (*beside, *along)

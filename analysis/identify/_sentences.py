@@ -9,8 +9,9 @@ from analysis.identify._candidate import MODES_FREE
 from analysis.identify._headline import ONE_MODE
 from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
+from analysis.statistics import NORMAL_95
 from rigd.printable import listed
-from rigd.units import decimals
+from rigd.units import decimals, to_uncertainty
 
 if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
@@ -79,7 +80,9 @@ def order(verdict: OrderVerdict) -> str:
     profile = verdict.profile
     low, high = profile.interval
     name, of = verdict.order, _OF[verdict.order]
-    value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
+    std = (high - low) / (2 * NORMAL_95)
+    estimate, first, last = to_uncertainty((profile.estimate, low, high), std)
+    value = f"{estimate} (95 %: {first} to {last})"
     if verdict.status == "absent":
         return f"No {of} was found, so its order {name} has no meaning."
     if verdict.status == "not identifiable":

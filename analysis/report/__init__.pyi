@@ -1,3 +1,4 @@
+from ._bands import dense_grid as dense_grid
 from ._bands import loss_factors as loss_factors
 from ._bands import response_band as response_band
 from ._campaign_document import campaign_document as campaign_document

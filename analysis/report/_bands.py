@@ -117,6 +117,7 @@ def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Re
     first_hz, last_hz : float
         Ends of the band, positive.
     peaks_hz : sequence of float
+        Frequencies of the peaks; those outside of the band are left out.
 
     Returns
     -------

@@ -52,6 +52,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
                     "file": str(each.path),
                     "validity": each.validity.as_json(),
                     "warnings": each.warnings,
+                    "welch_segments": each.segments or None,
                     "verdict": None if each.verdict is None else each.verdict.as_json(),
                 }
                 for each in campaign.sessions

@@ -15,9 +15,10 @@ from analysis.campaigns import (
     title,
     with_unit,
 )
-from analysis.models import ESTIMATOR_WORDS, STRUCTURES
+from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
+from analysis.report._paper_tables import welch_text
 from analysis.report._pooled_tables import used
 from analysis.report._table import MARK, unreported
 from rigd.view import magnitude_db, phase_deg
@@ -243,10 +244,9 @@ def best_figure(campaign: CampaignResult) -> Figure:
 def _figure(campaign: CampaignResult, width_in: float, height_in: float, what: str) -> Figure:
     count = len(campaign.sessions)
     drawn = "" if count <= _MOST_LINES else f", {_MOST_LINES} of them drawn"
-    estimator = ESTIMATOR_WORDS[campaign.settings.estimator]
     return style.new_figure(
         width_in, height_in, f"{count} sessions — {what}",
-        f"coupling torque over motor angle, {estimator}{drawn}  ·  "
+        f"coupling torque over motor angle, {welch_text(campaign)}{drawn}  ·  "
         "a nominal model has the mean of the sessions' parameters",
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
 from analysis.report._folder import write_new
-from analysis.report._paper_tables import paper_tables
+from analysis.report._paper_tables import paper_tables, welch_text
 from analysis.report._table import csv_text
 from analysis.report._text import as_text, spaced
 from analysis.results import DEFAULT_FORMATS
@@ -196,7 +196,7 @@ def _how(campaign: CampaignResult) -> list[Facts]:
         (
             "Welch method (as in the paper)",
             [
-                ("estimator", settings.estimator),
+                ("estimator", welch_text(campaign)),
                 ("band", f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz"),
                 ("types", ", ".join(settings.types)),
                 ("weights", ", ".join(settings.weightings)),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.models import ESTIMATOR_WORDS
+from analysis.models import ESTIMATOR_WORDS, estimate_text
 from analysis.report import _style as style
 from rigd.view import magnitude_db, phase_deg
 
@@ -78,15 +78,10 @@ def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 
 def _estimate_text(analysis: WelchAnalysis) -> str:
-    settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
+    settings, response = analysis.settings, analysis.response
     band = f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
-    if settings.estimator == "fft":
-        return f"{ESTIMATOR_WORDS['fft']}  ·  {band}"
-    return (
-        f"{ESTIMATOR_WORDS[settings.estimator]}, {response.segments} Hamming segments of "
-        f"{segmentation.segment_length}, overlap {segmentation.overlap}, "
-        f"nfft {segmentation.nfft}  ·  {band}"
-    )
+    how = estimate_text(settings.estimator, analysis.segmentation, response.segments)
+    return f"{how}  ·  {band}"
 
 
 def _panel(

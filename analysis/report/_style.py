@@ -12,6 +12,7 @@ import logging
 import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -337,7 +338,7 @@ def type_panels(
         cell = cells[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
         magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
         symbols = ", ".join(QUANTITIES[each][0] for each in STRUCTURES[name].free)
-        magnitude.set_title(f"Type {name}   {symbols}")
+        magnitude.set_title(f"({ascii_lowercase[number]}) Type {name}   {symbols}")
         magnitude.set_ylim(db_limits)
         response_axes(magnitude, phase, labels=column == 0)
         frequency_axis(magnitude, band_hz, labels=False)

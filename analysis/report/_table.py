@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import COEFFICIENT_OF
-from rigd.units import decimals
+from rigd.units import to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -335,11 +335,12 @@ def estimate(
     values: Sequence[float | None], std: float | None, factor: float = 1.0
 ) -> tuple[Cell, ...]:
     """Show numbers that are uncertain by `std`, all to its second digit."""
-    if std is None or not math.isfinite(std) or std <= 0:
-        return tuple(number(value, ".5g", factor) for value in values)
-    digits = decimals(factor * std)
-    form = f".{digits}f" if digits <= 7 else ".4g"
-    return tuple(number(value, form, factor) for value in values)
+    return tuple(
+        number(value, factor=factor)
+        if value is None or not math.isfinite(value)
+        else Cell(value, to_uncertainty((value,), std or 0.0, factor)[0].replace("-", "−"))
+        for value in values
+    )
 
 
 MARK: Final = "†"

@@ -106,7 +106,10 @@ NOT_BESIDE_FORCES = (
     "clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz", "stiffness_drift_per_s",
 )  # fmt: skip
 """Keys of ``[simulation]`` with which no force along the beam is simulated, whatever exerts it."""
-NOT_BESIDE_OBSTACLES = (*NOT_BESIDE_FORCES, "air_drag_m")
+NOT_BESIDE_OBSTACLES = (
+    *NOT_BESIDE_FORCES, "air_drag_m", "zeta_scatter_percent", "gamma_scatter_percent",
+    "stiffness_scatter_percent",
+)  # fmt: skip
 """Keys of ``[simulation]`` with which no obstacle is simulated."""
 
 

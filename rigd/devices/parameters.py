@@ -126,6 +126,14 @@ class Simulation:
     crosstalk_percent: Annotated[float, Ge(0), Le(20)] = field(default=0.0, metadata=OPTIONAL)
     """Error of the sensor's calibration: the largest share of its range that an axis shows of the
     full range of another."""
+    zeta_scatter_percent: Annotated[float, Ge(0), Le(50)] = field(default=0.0, metadata=OPTIONAL)
+    """Standard deviation between sessions of the logarithm of zeta."""
+    gamma_scatter_percent: Annotated[float, Ge(0), Le(50)] = field(default=0.0, metadata=OPTIONAL)
+    """The same of gamma."""
+    stiffness_scatter_percent: Annotated[float, Ge(0), Le(50)] = field(
+        default=0.0, metadata=OPTIONAL
+    )
+    """The same of the bending stiffness."""
     obstacles: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
     """What the beam meets, each as `rigd.devices.parse_obstacle` reads it."""
 

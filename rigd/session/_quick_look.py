@@ -35,6 +35,7 @@ _TIMES: Final = ("start_utc_ns", "made_utc_ns")
 _LINES: Final = ("flags", "text")
 _UNREADABLE: Final = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError)
 _CURVES: Final = ("frequency_hz", "magnitude", "phase_rad")
+_BAND: Final = ("magnitude_low_95", "magnitude_high_95")
 
 
 def look_path(path: Path) -> Path:
@@ -62,7 +63,8 @@ def read_look(path: Path) -> Document | None:
     -------
     dict or None
         As docs/quick_look.md has it, what is missing being empty: all numbers are finite, texts
-        printable, `modes` those that can be used, and `response` None if it cannot be. None if
+        printable, `modes` those that can be used, and `response` and `model` None if they cannot
+        be. None if
         there is no such file, it cannot be read, or is of another version.
     """
     try:
@@ -75,6 +77,7 @@ def read_look(path: Path) -> Document | None:
             "modes": modes_of(found.get("modes")),
             "validity": Validity.of_document(found.get("validity")).as_json(),
             "response": _response(found.get("response")),
+            "model": _curves(found.get("model"), (*_CURVES, *_BAND)),
             **{name: [_text(line) for line in found.get(name) or []] for name in _LINES},
         }
     except _UNREADABLE:
@@ -254,15 +257,27 @@ def _quantity(document: object) -> Document | None:
 
 
 def _response(document: object) -> Document | None:
-    """Return a response with curves of one length, which is not 0."""
+    """Return a response with its coherence and resolution, None for what cannot be used."""
+    curves = _curves(document, _CURVES)
+    if curves is None or not isinstance(document, dict):
+        return None
+    coherence = _finite_numbers(document.get("coherence"))
+    return {
+        **curves,
+        "coherence": coherence if len(coherence) == len(curves["frequency_hz"]) else None,
+        "resolution_hz": finite_number(document.get("resolution_hz")),
+    }
+
+
+def _curves(document: object, names: tuple[str, ...]) -> Document | None:
+    """Return curves of one length, which is not 0."""
     if not isinstance(document, dict):
         return None
-    curves = {name: _finite_numbers(document.get(name)) for name in _CURVES}
-    coherence = _finite_numbers(document.get("coherence"))
+    curves = {name: _finite_numbers(document.get(name)) for name in names}
     points = len(curves["frequency_hz"])
     if not points or any(len(curve) != points for curve in curves.values()):
         return None
-    return {**curves, "coherence": coherence if len(coherence) == points else None}
+    return curves
 
 
 def _finite_numbers(values: object) -> list[float]:

@@ -28,6 +28,7 @@ from rigd.devices import (
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
+from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
 
 T = TypeVar("T")
 
@@ -64,15 +65,17 @@ class Stuck:
 def open_simulated_rig(rig: RigParameters) -> Devices:
     """Make the devices of a simulated rig; a seed gives the same noise again."""
     simulated = SimulatedRig(rig)
-    sensor = simulated.sensor
 
     def renew_noise(seed: int | None) -> int:
         chosen = fresh_seed() if seed is None else seed
-        sensor.renew_noise(chosen)
+        simulated.begin_session(chosen)
         return chosen
 
     return Devices(
-        SimulatedDrive(simulated, rig.rate_hz), sensor, simulated=True, renew_noise=renew_noise
+        SimulatedDrive(simulated, rig.rate_hz),
+        simulated.sensor,
+        simulated=True,
+        renew_noise=renew_noise,
     )
 
 
@@ -121,6 +124,20 @@ class SimulatedRig:
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
         self._resolution_rad = rig.encoder.resolution_rad
         self.stuck_encoder: Stuck | None = None
+
+    def begin_session(self, seed: int) -> None:
+        """Begin the noise anew, and take the beam of this session where it differs between them.
+
+        The drive is off. A beam takes a tenth of a second to make.
+
+        Parameters
+        ----------
+        seed
+            Seed of the session.
+        """
+        self.sensor.renew_noise(seed)
+        if scatters_between_sessions(self._parameters):
+            self.plant.become(SimulatedPlant(session_parameters(self._parameters, seed)))
 
     def advance(self, n_periods: int) -> None:
         """Move on by whole periods, the torque held."""

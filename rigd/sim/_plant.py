@@ -100,6 +100,7 @@ class SimulatedPlant:
         "_peak_nm",
         "_period_s",
         "_periods",
+        "_rest_per_angle",
         "_sensed_angles",
         "_sensed_jump_gain",
         "_sensed_shear_jump_gain",
@@ -147,6 +148,8 @@ class SimulatedPlant:
         if self._contact is not None:
             (free, on_free), (locked, on_locked) = map(self._contact.attached, (free, locked))
         n = free.b.size
+        self._rest_per_angle = np.eye(1, n)[0]
+        self._rest_per_angle[2:] = -np.linalg.solve(locked.a[2:, 2:], locked.a[2:, 0])
         step, locked_step, friction = steps_of(free, locked, period, instants)
         self._friction_effects: list[float] = friction[n:].tolist()
         points = 0
@@ -247,6 +250,22 @@ class SimulatedPlant:
     def elapsed_s(self) -> float:
         """Time since the drive was first enabled, from which obstacles count; 0 before."""
         return max(self._periods, 0) * self._period_s
+
+    def become(self, other: "SimulatedPlant") -> None:
+        """Become another plant, at rest at the angle of this one, the drive off.
+
+        Parameters
+        ----------
+        other
+            A plant of the same rates and delays, not used any more.
+        """
+        angle_rad = self.angle_rad
+        for name in self.__slots__:
+            if hasattr(other, name):  # parts of a kind of plant are there if it is of that kind
+                setattr(self, name, getattr(other, name))
+        self._vectors[0][0][: self._states] = self._rest_per_angle * angle_rad
+        self._sensed_angles.extend([angle_rad] * len(self._sensed_angles))
+        self.angle_rad = self.sensed_angle_rad = angle_rad
 
     def meet(self, prepared: "SimulatedPlant") -> None:
         """Meet the obstacles of another plant from here on, in the state of this one.

@@ -122,7 +122,7 @@ class Library:
         )
 
     async def _responses(self, request: web.Request) -> web.Response:
-        """Return the responses of several sessions, for an overlay."""
+        """Return fitted models and measured responses of several sessions, for an overlay."""
         ids = [name for name in request.query.get("ids", "").split(",") if name]
         if not 1 <= len(ids) <= _MOST_CURVES:
             return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
@@ -132,7 +132,8 @@ class Library:
             if look is None or look["response"] is None:
                 errors.append(f"{name}: there is no quick look of it, and so no response.")
             else:
-                responses.append({"id": name, "specimen": look["specimen"], **look["response"]})
+                about = {"id": name, "specimen": look["specimen"], "model": look["model"]}
+                responses.append({**about, **look["response"]})
         return web.json_response({"responses": responses, "errors": errors})
 
     # Downloads

@@ -16,6 +16,7 @@ from analysis.identify import Measurement, freest_alone
 from analysis.quick_look import LookError, look_at, write_look
 from analysis.record import load_record
 from analysis.results import whole_record
+from rigd.beam import transfer
 from rigd.session import look_path
 
 
@@ -61,7 +62,8 @@ def test_the_response_keeps_the_height_of_the_resonances(chirps):
     hz, magnitude = (np.array(response[name]) for name in ("frequency_hz", "magnitude"))
     assert 200 < hz.size <= 400
     assert (np.diff(hz) > 0).all()
-    assert {len(values) for values in response.values()} == {hz.size}
+    assert {len(values) for values in response.values() if isinstance(values, list)} == {hz.size}
+    assert 0.01 < response["resolution_hz"] < 1.0
     for mode in look["modes"][:2]:
         near = np.abs(hz - mode["frequency_hz"]["value"]) < 1.0
         assert magnitude[near].max() > 3 * np.median(magnitude)
@@ -157,6 +159,23 @@ def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, f
     look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
     found = quick_look._last_look(tmp_path / "now.mcap", "a", 8)
     assert found["file"] == file
+
+
+def test_the_fitted_model_has_a_band_that_holds_it(chirps, selection):
+    """Its peak is the mode's, which Welch's segments do not resolve."""
+    _, (look, _) = chirps
+    model = {name: np.array(values) for name, values in look["model"].items()}
+    hz, magnitude = model["frequency_hz"], model["magnitude"]
+    assert (np.diff(hz) > 0).all()
+    assert {values.size for values in model.values()} == {hz.size}
+    assert (model["magnitude_low_95"] <= magnitude).all()
+    assert (magnitude <= model["magnitude_high_95"]).all()
+    (mode, *_) = selection.headline.modes
+    s = 2j * np.pi * mode.frequency_hz.value
+    plant = selection.headline.fit.plant
+    peak = abs(transfer(np.array([s]), plant.beam, plant.damping)[0])
+    near = np.abs(hz / mode.frequency_hz.value - 1) < 0.01
+    assert magnitude[near].max() == pytest.approx(peak, rel=0.02)
 
 
 def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):

@@ -131,7 +131,21 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert content["pooled"][0].keys() >= {"type", "parameter", "value", "between_std"}
     assert len(content["errors"]) == 2
     assert len(content["sessions_welch"]) == len(found.sessions) * 4
+    settings, used = content["settings"], found.sessions[0].settings
+    for name in ("segment_length", "overlap", "nfft"):
+        assert settings[name] == getattr(used, name) > 0
+    assert [file["welch_segments"] for file in content["files"]] == [
+        session.segments for session in found.sessions
+    ]
+    indices = {(row["type"], row["weighting"]): row for row in content["nominal_indices"]}
+    model = found.nominal[0]
+    row = indices[model.structure, model.weighting]
+    assert row["wmse"] == pytest.approx(model.mean_wmse)
+    assert row["md_median"] == pytest.approx(np.median([each.md for each in model.indices]))
     page = (tmp_path / "report.html").read_text()
+    how = f"Hamming segments of {used.segment_length}, overlap {used.overlap}, nfft {used.nfft}"
+    assert how in page
+    assert how in " ".join((tmp_path / "tables.txt").read_text().split())
     assert (
         page.index("type VI: internal damping") < page.index("<figure") < page.index('id="table3"')
     )
@@ -148,7 +162,7 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
         assert of_file["validity"]["predicted_peak_tip_slope_rad"] > 0.14
     for words in ("Table 3", "Table 4", "Table 5", "Pooled", "Leave-one-out", "torn"):
         assert words in text
-    for name in ("table5", "pooled", "validation", "session_list"):
+    for name in ("table5", "nominal_indices", "welch_bias", "pooled", "validation", "session_list"):
         assert (tables / f"{name}.csv").stat().st_size > 100
 
 
@@ -163,13 +177,18 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
         assert order.status == "compatible"
         assert order.interval[0] < 1 < order.interval[1]
     assert verdict.dissent == ()
-    stated, structure, *_ = verdict.sentences
+    stated, answer, structure, *_ = verdict.sentences
     assert stated.startswith("The files state 2 different specimens: beam_length_m 0.98")
+    assert answer.startswith("Internal damping of integer order (alpha = ")
+    assert "and external damping of integer order (lambda = " in answer
+    assert "for an unseen session: types III and VI with " in answer
     assert structure.startswith(
         "The numbers are those of type VI: internal damping (alpha free) and external"
     )
     assert not found.homogeneity.mixed
-    assert any("No between-session variance" in sentence for sentence in verdict.sentences)
+    assert any(
+        "No significant between-session variance" in sentence for sentence in verdict.sentences
+    )
     assert "\nThe numbers are those of type VI: internal" in campaign_text(found)
     document = campaign_document(found)
     assert document["verdict"]["structure"] == "III"
@@ -219,7 +238,7 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
 def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(done):
     found, _ = done
     short = as_text(campaign_tables(found, verbose=False))
-    assert found.verdict.sentences[1][:60] in short
+    assert found.verdict.sentences[2][:60] in short
     assert "Modes with locked hub" in short
     assert "Pooled over 4 sessions: type VI" in short
     for more in ("Table 3", "Leave-one-out validation", "Sessions, as their files"):

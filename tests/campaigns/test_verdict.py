@@ -154,8 +154,11 @@ def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_o
     both = ranked(six, seven)
     found = campaign_verdict(sessions, both, ALIKE, (), ())
     assert (found.headline, found.structure) == ("VI", "VII")
-    assert found.sentences[0].startswith("The numbers are those of type VI: internal damping (")
-    assert "Type VII has the lowest BIC" in found.sentences[0]
+    first, second, *_ = found.sentences
+    assert "(alpha = 0.9960 ± 0.0159)" in first
+    assert "and external damping of fractional order (lambda = 0.6000 ± 0.0159)" in first
+    assert second.startswith("The numbers are those of type VI: internal damping (")
+    assert "Type VII has the lowest BIC" in second
     assert found.alpha.value == pytest.approx(0.996)
     # Not if it is of two sessions where the other is of all.
     few = replace(pooled(six), sessions=2)
@@ -193,7 +196,7 @@ def test_findings_are_counted_over_the_sessions(make_session):
     assert late.files == ("0.mcap", "1.mcap", "2.mcap")
     assert late.span == pytest.approx((0.29e-3, 0.31e-3))
     assert late.sentence.startswith("In 3 of 3 sessions: The torque comes 0.300 ms later")
-    assert "0.29 to 0.31 ms" in late.sentence
+    assert "0.290 to 0.310 ms" in late.sentence
     # Of two modes: two things, though the sentences differ by a figure only.
     assert {first.files, second.files} == {("1.mcap",), ("2.mcap",)}
     assert first.sentence.startswith("In 1 of 3 sessions (1.mcap):")
@@ -220,7 +223,10 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
 
 def test_words_about_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
-    assert "No between-session variance" in sentences.scatter(best)
+    assert "No significant between-session variance" in sentences.scatter(best)
+    assert "τ" not in sentences.scatter(best)
+    some = replace(best, parameters=(replace(best.parameters[0], between_std=0.1, chance=0.2),))
+    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.scatter(some)
     shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
     assert "Between-session variance in ζ" in sentences.scatter(shaken)
     assert "no structure fitted" in sentences.left_over(replace(best, misfit=9.0), 4, 4)

@@ -3,6 +3,7 @@
 import pytest
 
 from analysis.identify._finding import SEEN, Finding, doubted
+from analysis.identify._select import _as_sure
 
 
 @pytest.mark.parametrize(
@@ -32,3 +33,16 @@ def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
 def test_what_is_seen_in_the_record_stays_a_fact(kind):
     found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
     assert doubted(found, "it rains") is found
+
+
+def test_a_finding_on_a_flagged_parameter_is_no_fact():
+    """What the headline flags is flagged in the findings as well, for the same reason."""
+    late, mass = (
+        Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), parameters=(name,))
+        for kind, name in (("delay", "delay_s"), ("tip mass", "tip_mass_kg"))
+    )
+    first, second = _as_sure(
+        (late, mass), (), None, None, {"delay_s": "type VII fits as well"}, explained=True
+    )
+    assert first.sentence == "Not established, because type VII fits as well: it is there."
+    assert (first.interval, second) == (None, mass)

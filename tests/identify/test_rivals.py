@@ -1,5 +1,6 @@
 """Kinds of rig against each other: what is said alone, what beside another, and what is open."""
 
+import math
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -13,6 +14,9 @@ from analysis.identify._verdict import order_verdict
 from analysis.models import STRUCTURES
 
 CLAMP = ("root_compliance_rad_per_nm",)
+FILTER = ("filter_time_constant_s",)
+SECOND = "second_order_filter_time_constant_s"
+CONSTANT_S = {hz: 1 / (2 * math.pi * hz) for hz in (98.0, 98.7, 99.5, 120.0)}
 ALPHA = Profile(
     "alpha", "VI", (0.8, 0.9, 1.0), (9.0, 0.0, 12.0), 0.9, (0.9,), (0.85, 0.95), False, False, 0.0
 )
@@ -32,8 +36,10 @@ class Fitted:
     fit: object = field(init=False)
 
     def __post_init__(self):
-        parameters = {"alpha": self.alpha, CLAMP[0]: 0.01}
-        fit = SimpleNamespace(parameters=parameters, interval={CLAMP[0]: (0.008, 0.0125)})
+        parameters = {"alpha": self.alpha, CLAMP[0]: 0.01, FILTER[0]: CONSTANT_S[98.7]}
+        corner = CONSTANT_S[99.5], CONSTANT_S[98.0]
+        interval = {CLAMP[0]: (0.008, 0.0125), FILTER[0]: corner}
+        fit = SimpleNamespace(parameters=parameters, interval=interval)
         object.__setattr__(self, "fit", fit)
 
     @property
@@ -45,9 +51,13 @@ class Fitted:
         return self.structure.name
 
 
-def field_of(*fitted):
+def field_of(*fitted, first_s=0.0, second_s=0.0):
+    measurement = SimpleNamespace(**{FILTER[0]: first_s, SECOND: second_s})
     ranked = tuple(sorted(fitted, key=lambda each: each.bic))
-    return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
+    return CandidateSet(
+        comparison=SimpleNamespace(measurement=measurement), noise=None, free=(),
+        candidates=ranked, columns=(),
+    )  # fmt: skip
 
 
 def fitted(name, bic, deviance, **more):
@@ -71,6 +81,21 @@ def test_a_clamp_that_is_no_better_with_the_orders_free_is_named_beside_the_beam
     (found,) = of_rig(rig)
     assert found.kind == "rival explanations"
     assert "100 N·m/rad (type III)" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ({}, "95 %) that the file does not state."),
+        ({"first_s": CONSTANT_S[120.0]}, "95 %); the file states one of first order at 120 Hz."),
+        ({"second_s": CONSTANT_S[120.0]}, "95 %); the file states one of second order at 120 Hz."),
+    ],
+)
+def test_a_filter_is_compared_with_the_one_that_the_file_states(stated, words):
+    (found,) = of_rig(field_of(fitted("VI", 0.0, -80.0, extras=FILTER), **stated))
+    assert "its corner at 98.70 Hz (98.00 to 99.50 Hz; 95 %)" in found.sentence
+    assert words in found.sentence
+    assert found.parameters == FILTER
 
 
 @pytest.mark.parametrize(

@@ -322,12 +322,19 @@ class FakeWebServer:
         return web.json_response({"ok": True, "job": 1}, status=202)
 
     async def _frf(self, request):
-        return web.json_response({
-            "responses": [
-                {**response("last", shift=1 + 0.02 * k), "id": name, "specimen": "antenna 3"}
-                for k, name in enumerate(request.query["ids"].split(","))
-            ],
-        })  # fmt: skip
+        names = request.query["ids"].split(",")
+        responses = [
+            {"id": name, "specimen": "antenna 3", "model": None, **response(shift=1 + 0.02 * k)}
+            for k, name in enumerate(names)
+        ]
+        # Of the first there is a fitted model, and of the third not even the coherence.
+        first = response("model")
+        limits = {"magnitude_low_95": 0.9, "magnitude_high_95": 1.1}
+        band = {name: [x * value for value in first["magnitude"]] for name, x in limits.items()}
+        responses[0]["model"] = {**first, **band}
+        if len(responses) > 2:
+            responses[2]["coherence"] = None
+        return web.json_response({"responses": responses, "errors": []})
 
 
 @contextmanager

@@ -71,7 +71,8 @@ def test_one_panel_a_type(paper_analysis):
     with style.styled():
         figure = frf_figure(paper_analysis)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [t.split()[1] for t in titles if t.startswith("Type")] == ["I", "III", "VI"]
+    panels = [t.split()[:3] for t in titles if "Type" in t]
+    assert panels == [["(a)", "Type", "I"], ["(b)", "Type", "III"], ["(c)", "Type", "VI"]]
     assert titles[-1] == "Coherence"
     # Noise about 180° must not jump to the other edge of the panel.
     phase_deg = np.concatenate([dots.get_path().vertices[:, 1] for dots in figure.axes[1].patches])

@@ -40,7 +40,7 @@ def two(served, record_briefly, write_look, monkeypatch):
     report.mkdir(exist_ok=True)
     (report / "report.html").write_text("<style>p {}</style><p>A report")
     (report / "fits.csv").write_text("a,b")
-    return response
+    return response | {"resolution_hz": None}
 
 
 def get(served, target):
@@ -82,7 +82,7 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert get(served, "/api/sessions/first/report/fits.csv")[2] == b"a,b"
     assert get(served, "/api/sessions/second/report/")[0] == 404
     _, _, overlay = get(served, "/api/frf?ids=first,second")
-    assert overlay["responses"] == [{"id": "first", "specimen": "antenna", **two}]
+    assert overlay["responses"] == [{"id": "first", "specimen": "antenna", "model": None, **two}]
     assert "second" in overlay["errors"][0]
 
 

@@ -403,12 +403,15 @@ def test_files_and_report_of_a_session(server, page):
 @pytest.mark.further
 def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
     assert page.is_disabled("#overlay")
-    for row in (1, 3):
+    for row in (1, 3, 5):
         page.check(f"#rows tr:nth-child({row}) input")
-    says(page, "#ticked", "2 selected")
+    says(page, "#ticked", "3 selected")
     page.click("#overlay")
     page.wait_for_selector("#comparison", state="visible")
     assert page.locator("#comparison-keys .key").count() == 2
+    says(page, "#comparison-keys .key:nth-child(1)", "fitted model, 95 % band")
+    says(page, "#comparison-keys .key:nth-child(2)", "Welch's method, coherence above 0.8")
+    says(page, "#sessions-result", "the coherence of the measured response is not known")
     assert drawn(page, "#comparison-plot") > 0.02
     page.click("#campaign")
     says(page, "#sessions-result", "Campaign: running")

@@ -545,7 +545,7 @@ class _Process:
         if seed is None:
             self._sessions += 1
             seed = session_seed(self._seed, self._sessions)
-        self._simulated.sensor.renew_noise(seed)
+        self._simulated.begin_session(seed)
         return seed
 
 

@@ -6,7 +6,7 @@ import { digits, minus } from "./format.js";
 
 const FIRST_HZ = 0.5;  // below it the antenna's torque is lost in the sensor's noise
 const LAST_HZ = 60;
-const LOW_COHERENCE = 0.8;
+export const LOW_COHERENCE = 0.8;
 const PHASE_FROM = -90;  // phases lie about 0° and 180°; cut here, they do not jump
 const LEFT = 52;
 const RIGHT = 6;
@@ -44,7 +44,8 @@ export class ResponsePlot {
   /**
    * @param {{name: string, colour: string, dashed: boolean, width: number, response: object}[]}
    *   curves - with `frequency_hz`, `magnitude` (N·m/rad), `phase_rad` and perhaps `coherence`;
-   *   `reached_hz` of the first: how far its sweep is
+   *   `reached_hz` of the first: how far its sweep is; `low` and `high`: limits of a band of the
+   *   magnitude
    */
   show(curves) {
     this.#curves = curves.filter(({ response }) => response?.frequency_hz.length > 1);
@@ -119,6 +120,7 @@ export class ResponsePlot {
       surface.within(LEFT, panel.top, inner, panel.height, (context) => {
         // The first one last: what is measured lies on top.
         for (const curve of [...this.#curves].reverse()) {
+          if (member === "magnitude") this.#band(context, curve, x, y);
           this.#curve(context, curve, member, x, y, panel.height);
         }
       });
@@ -157,7 +159,7 @@ export class ResponsePlot {
   /** Grey what the sweep has not reached, and where the coherence is low. */
   #shade(panel, x, inner) {
     const response = this.#curves[0]?.response;
-    if (!response) return;
+    if (!response || (!response.coherence && !known(response.reached_hz))) return;
     const surface = this.#surface;
     surface.within(LEFT, panel.top, inner, panel.height, (context) => {
       context.fillStyle = surface.colour("shade");
@@ -175,6 +177,19 @@ export class ResponsePlot {
         context.fillRect(from, panel.top, LEFT + inner - from, panel.height);
       }
     });
+  }
+
+  /** Fill the band of the magnitude, of a curve that has one. */
+  #band(context, { colour, response }, x, y) {
+    const { frequency_hz: at, low, high } = response;
+    if (!low || !high) return;
+    context.fillStyle = this.#surface.colour(colour);
+    context.globalAlpha = 0.25;
+    context.beginPath();
+    at.forEach((frequency, k) => context.lineTo(x(frequency), y(high[k])));
+    for (let k = at.length - 1; k >= 0; k -= 1) context.lineTo(x(at[k]), y(low[k]));
+    context.fill();
+    context.globalAlpha = 1;
   }
 
   #curve(context, { colour, dashed, width, response }, member, x, y, height) {

@@ -1,8 +1,8 @@
 // The library of sessions: filters, quick looks, reports, downloads, campaigns and comparisons.
 
 import { byId, make, setText, show } from "./dom.js";
-import { clock, date, megabytes, unitOf, whole, withUnit, wordsOf } from "./format.js";
-import { ResponsePlot } from "./response.js";
+import { clock, date, digits, megabytes, unitOf, whole, withUnit, wordsOf } from "./format.js";
+import { LOW_COHERENCE, ResponsePlot } from "./response.js";
 import { lookElements, modesInShort } from "./quick_look.js";
 
 const PAGE = 50;
@@ -176,14 +176,22 @@ export class Sessions {
       this.#say("The responses cannot be computed at the moment.");
       return;
     }
-    this.#say(...(found.errors ?? []));
-    const responses = found.responses ?? found;
+    const errors = [...(found.errors ?? [])];
+    const curves = [];
+    for (const response of found.responses) {
+      const name = [this.#ticked.get(response.id) ?? response.id, response.specimen]
+        .filter(Boolean).join(", ");
+      const curve = modelCurve(response) ?? measuredCurve(response);
+      if (curve) {
+        curves.push({ ...curve, name: `${name}: ${curve.name}`, colour: `curve-${curves.length + 1}` });
+      } else {
+        errors.push(`${name}: there is no fitted model, and the coherence of the measured response `
+          + "is not known: it is not shown.");
+      }
+    }
+    this.#say(...errors);
     show(byId("comparison"), true);
-    this.#plot.show(responses.map((response, k) => ({
-      name: [this.#ticked.get(response.id) ?? response.id, response.specimen].filter(Boolean).join(", "),
-      // Each on its own: what one of them does not know is not shaded for all.
-      colour: `curve-${k + 1}`, response: { ...response, coherence: undefined, reached_hz: null },
-    })));
+    this.#plot.show(curves);
     byId("comparison").scrollIntoView({ block: "nearest" });
   }
 
@@ -215,6 +223,27 @@ export class Sessions {
         make("a", { href: address, target: "_blank", rel: "noopener" }, "open the report")));
     }
   }
+}
+
+/** The fitted model of a session with its band; null if there is none. */
+function modelCurve({ model }) {
+  if (!model) return null;
+  const { magnitude_low_95: low, magnitude_high_95: high, ...curves } = model;
+  return { name: "fitted model, 95 % band", response: { ...curves, low, high } };
+}
+
+/** The measured response where its coherence is high; null if that is not known. */
+function measuredCurve({ frequency_hz, magnitude, phase_rad, coherence, resolution_hz: width }) {
+  if (!coherence) return null;
+  const coherent = (value, k) => (coherence[k] < LOW_COHERENCE ? null : value);
+  return {
+    name: `measured by Welch's method, coherence above ${LOW_COHERENCE}`
+      + (Number.isFinite(width) ? `, resolution ${digits(width)} Hz` : ""),
+    dashed: true,
+    response: {
+      frequency_hz, magnitude: magnitude.map(coherent), phase_rad: phase_rad.map(coherent),
+    },
+  };
 }
 
 const samples = ({ recorded, scheduled, missed, late, lost }) =>

@@ -1,0 +1,155 @@
+"""Bias of the Welch fits: their means over the sessions less the pooled whole-record estimates.
+
+Windows and leakage shift the parameters of a fit to Welch's response by the same amount in every
+session: their scatter does not show it, and more sessions do not reduce it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns._statistics import fits_by_model
+from analysis.models import STRUCTURES
+from analysis.statistics import student_t_quantile
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.campaigns._pooling import PooledEstimate
+    from analysis.campaigns._session import SessionResult
+
+LARGEST_MISFIT: Final = 1.5
+"""Residual, in units of the noise, above which a structure does not describe the records."""
+
+_LEVEL: Final = 0.999
+_FEWEST: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterBias:
+    """One parameter of a Welch fit against the same structure's pooled whole-record estimate.
+
+    Attributes
+    ----------
+    parameter : str
+    welch, welch_std : float
+        Mean of the Welch fits, and their standard deviation between sessions.
+    record, record_std : float
+        Pooled whole-record estimate, and its standard deviation.
+    bias : float
+        `welch` minus `record`.
+    bias_std : float
+        Standard deviation of that difference.
+    significant : bool
+        Whether it is not zero at the level of 0.1 % (Student's t).
+    at_bounds : int
+        Sessions in which the Welch fit has it at the edge of the range searched.
+    """
+
+    parameter: str
+    welch: float
+    welch_std: float
+    record: float
+    record_std: float
+    bias: float
+    bias_std: float
+    significant: bool
+    at_bounds: int
+
+
+@dataclass(frozen=True, slots=True)
+class WelchBias:
+    """Bias of the Welch fits of one type and weighting.
+
+    Attributes
+    ----------
+    structure, weighting : str
+    parameters : tuple of ParameterBias
+        The free parameters.
+    wmse : float
+        Mean WMSE of the Welch fits, in (N·m/rad)².
+    record_wmse : float
+        The same of the whole-record fits: both against Welch's response, which has the bias too.
+    """
+
+    structure: str
+    weighting: str
+    parameters: tuple[ParameterBias, ...]
+    wmse: float
+    record_wmse: float
+
+    @property
+    def significant(self) -> tuple[ParameterBias, ...]:
+        """Parameters with a significant bias."""
+        return tuple(each for each in self.parameters if each.significant)
+
+
+def welch_biases(
+    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
+) -> tuple[WelchBias, ...]:
+    """Compare the Welch fits with the pooled estimates that describe the records.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionResult
+    pooled : sequence of PooledEstimate
+
+    Returns
+    -------
+    tuple of WelchBias
+        By type, then by weighting. None of a type whose whole-record residual is more than noise:
+        neither of its estimates is then a reference for the other.
+    """
+    found = []
+    by_name = {each.name: each for each in pooled if each.misfit <= LARGEST_MISFIT}
+    for (structure, weighting), fits in fits_by_model(sessions).items():
+        estimate = by_name.get(structure)
+        if estimate is None or len(fits) < _FEWEST:
+            continue
+        limit = student_t_quantile(_LEVEL, len(fits) - 1)
+        parameters = []
+        for name in STRUCTURES[structure].free:
+            if name not in estimate.by_name:
+                continue
+            record = estimate.by_name[name]
+            values = np.array([fit.parameters[name] for fit in fits])
+            mean, std = float(values.mean()), float(values.std(ddof=1))
+            bias, bias_std = mean - record.value, math.hypot(std / len(fits) ** 0.5, record.std)
+            parameters.append(
+                ParameterBias(
+                    parameter=name,
+                    welch=mean,
+                    welch_std=std,
+                    record=record.value,
+                    record_std=record.std,
+                    bias=bias,
+                    bias_std=bias_std,
+                    significant=abs(bias) > limit * bias_std,
+                    at_bounds=sum(name in fit.at_bounds for fit in fits),
+                )
+            )
+        found.append(
+            WelchBias(
+                structure,
+                weighting,
+                tuple(parameters),
+                _mean([fit.indices.wmse for fit in fits if fit.indices]),
+                _mean(
+                    [
+                        each.indices.wmse
+                        for session in sessions
+                        for each in session.record_estimates
+                        if each.name == structure
+                    ]
+                ),
+            )
+        )
+    return tuple(found)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else math.nan

@@ -1,0 +1,69 @@
+"""Scatter of the simulated beam between sessions, drawn from the seed of each session."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigd.devices.parameters import RigParameters
+
+_STREAM = 1
+"""Tells these draws from those of the noise, which has the same seed."""
+
+
+def scatters_between_sessions(rig: RigParameters) -> bool:
+    """Return whether the simulated beam differs between sessions.
+
+    Parameters
+    ----------
+    rig
+        Parameters of the rig.
+    """
+    return any(_percentages(rig))
+
+
+def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
+    """Return the parameters that the simulated rig has in one session.
+
+    zeta, gamma and the bending stiffness are multiplied by ``exp(0.01 p z)``: p is the percentage
+    that the profile states for each, z a standard normal number that follows from the seed.
+
+    Parameters
+    ----------
+    rig
+        Parameters of the rig, with a section ``simulation``.
+    seed
+        Seed of the session, `simulation_seed` in its file.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from rigd.profile import load_profile
+    >>> from rigd.sim import session_parameters
+    >>> rig = load_profile("sim").rig
+    >>> rig = replace(rig, simulation=replace(rig.simulation, gamma_scatter_percent=5.0))
+    >>> print(*(f"{session_parameters(rig, seed).damping.gamma:.4f}" for seed in (1, 2, 3)))
+    0.0585 0.0498 0.0536
+    """
+    percentages = np.array(_percentages(rig))
+    simulation = rig.simulation
+    if simulation is None or not percentages.any():
+        return rig
+    normal = np.random.default_rng((seed, _STREAM)).standard_normal(percentages.size)
+    zeta, gamma, stiffness = np.exp(0.01 * percentages * normal).tolist()
+    damping = rig.damping
+    return replace(
+        rig,
+        damping=replace(damping, zeta=zeta * damping.zeta, gamma=gamma * damping.gamma),
+        simulation=replace(simulation, stiffness_ratio=stiffness * simulation.stiffness_ratio),
+    )
+
+
+def _percentages(rig: RigParameters) -> tuple[float, float, float]:
+    simulation = rig.simulation
+    if simulation is None:
+        return 0.0, 0.0, 0.0
+    return (
+        simulation.zeta_scatter_percent,
+        simulation.gamma_scatter_percent,
+        simulation.stiffness_scatter_percent,
+    )
