@@ -15,6 +15,7 @@
      |    +-- RealisationError      the beam's damping has no stable state space
      |    +-- RefusedError          the predicted angle exceeds limits.angle_rad
      |    |    +-- NoRoomError          the disk is too full for the session
+     |    +-- TipSlopeError         --tip-slope 0
      |    +-- MetadataError         --meta temperature_c=warm: the name's unit asks for a number
      |    +-- LibraryError          rigd list of a folder that does not exist
      |    +-- UnknownGroupError     --group names no group of this computer
@@ -22,6 +23,7 @@
      +-- FailureError          the same request may succeed later: exit code 1
      |    +-- DeviceError           the drive does not answer, or reports a fault
      |    +-- CheckFailedError      rigd check fails without a device: the worst travel is too long
+     |    +-- ProbeFailedError      the probing move contradicts a scale of the profile
      |    +-- ChildError            the control process was killed
      |    +-- RigError              the rig is not connected, or its zero is lost
      |    +-- SessionFailedError    the recorder died; part of the record is kept

@@ -56,7 +56,7 @@ def test_digits_beyond_the_interpreter_s_limit():
         (b"[" * 200_000, "nested too deeply"),
         (b"9" * 5000, "not a JSON document"),
         (b"{", "not a JSON document"),
-        (b"\xff\xfe", "UTF-8"),
+        (b"\xff", "UTF-8"),
         (b" " * 2000, "at most 0.001 MB"),
     ],
 )

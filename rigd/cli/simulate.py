@@ -89,6 +89,8 @@ def inject(
     busoff[,for=0.5]                          the host's CAN controller is off the bus
     saturate,gauge=0..5[,for=0.5]             a strain gauge is at the end of its range
     status,bits=0x0080[,for=0.5]              the sensor reports errors
+    stuck,what=encoder|sensor|gauge[,gauge=2][,every=2][,for=0.5]
+                                              it repeats readings: all, or every second one
     jump,counts=-500                          the encoder slips
     cut[,device=bus|sensor]                   the bus, or a sensor's serial line, is cut
     restart,device=drive|sensor               the device restarts by itself

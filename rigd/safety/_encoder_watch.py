@@ -42,8 +42,8 @@ _VIBRATION_S = 0.25
 """Time constant of that rms."""
 _RAMP_S = 0.02
 """Time in which the torque of a test grows by the breakaway torque."""
-_RAMP_LIMIT = 4.0
-"""Torque at which a test ends, in breakaway torques."""
+_RAMP_LIMIT = 2.0
+"""Torque, in breakaway torques, at which a test begins again in the other direction."""
 _ANSWER_STEPS = 1.5
 """Encoder steps above which a movement answers a test."""
 _PAUSE_S = 0.5
@@ -144,7 +144,7 @@ class EncoderWatch:
         # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
         self._long = inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
         self._decay = 1.0 / (_VIBRATION_S * rate_hz)
-        longest = lengths[-1] + 1
+        longest = lengths[-1] + 2
         # Cumulative sums, of which two give the mean over a window.
         self._torques: deque[tuple[float, float]] = deque(maxlen=longest)
         self._errors: deque[float] = deque(maxlen=longest)
@@ -168,7 +168,7 @@ class EncoderWatch:
         self._noise_nm = noise_nm
         for history in (self._torques, self._errors, self._angles, self._repeats, self._pending):
             history.clear()
-        self._torques.append((0.0, 0.0))
+        self._torques.extend([(0.0, 0.0)] * 2)
         self._errors.append(0.0)
         self._angles.append(angle_rad)
         self._pending.extend([0.0] * (self._pending.maxlen or 0))
@@ -244,9 +244,10 @@ class EncoderWatch:
                 return violation
         if self._test_step_nm:
             self.test_nm += self._test_step_nm
-            limit_nm = _RAMP_LIMIT * self._breakaway_nm
-            if abs(self.test_nm) > limit_nm:
-                return _violation("frozen encoder", self.test_nm, limit_nm)
+            if abs(self.test_nm) > _RAMP_LIMIT * self._breakaway_nm:
+                # The controller has taken the torque back, since its reference goes the other way.
+                self._test_step_nm = -self._test_step_nm
+                self.test_nm = 0.0
         return None
 
     def skip(self, ticks: int, angle_rad: float) -> None:
@@ -301,7 +302,7 @@ class EncoderWatch:
         moved_rad = angles[before] - angles[before - SPEED_TICKS]
         if abs(moved_rad) < _STOP_STEPS * SPEED_TICKS * self._resolution_rad or not moved_rad:
             return None
-        ticks = min(SPEED_TICKS + _STOP_TICKS, len(self._torques) - 1)
+        ticks = min(SPEED_TICKS + _STOP_TICKS, len(self._torques) - 2)
         net, motor = self._over(ticks)
         per_tick_nm = _MOMENTUM * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
         needed_nm = per_tick_nm * self._rate_hz**2 / _STOP_TICKS
@@ -361,7 +362,7 @@ class EncoderWatch:
         """Compare the acceleration over the last `WINDOW_TICKS` with the net torque."""
         angles, torques = self._angles, self._torques
         n = WINDOW_TICKS
-        if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 2:
+        if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 3:
             return None
         now_rad = angles[-1] - angles[-1 - SPEED_TICKS]
         before_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
@@ -371,9 +372,9 @@ class EncoderWatch:
         # The same weights as the difference of two mean speeds gives the acceleration.
         net = motor = 0.0
         for j in range(1, SPEED_TICKS + 1):
-            for last in (torques[-1 - j], torques[-j]):
+            for last in (torques[-1 - j], torques[-2 - j]):
                 net, motor = net + last[0], motor + last[1]
-            for first in (torques[-1 - j - n], torques[-j - n]):
+            for first in (torques[-1 - j - n], torques[-2 - j - n]):
                 net, motor = net - first[0], motor - first[1]
         net, motor = net / (2 * SPEED_TICKS * n), motor / (2 * SPEED_TICKS * n)
         acceleration_rad_s2 = (now_rad - before_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
@@ -381,9 +382,12 @@ class EncoderWatch:
         return scales.add(acceleration_rad_s2, speed_rad_s, motor - net, net)
 
     def _over(self, ticks: int) -> tuple[float, float]:
-        """Return the sums of net torque and motor torque over the last ticks."""
-        net, motor = self._torques[-1]
-        net_before, motor_before = self._torques[-1 - ticks]
+        """Return the sums of net torque and motor torque over the ticks that the angle shows.
+
+        The torque of this tick turns the shaft from now on.
+        """
+        net, motor = self._torques[-2]
+        net_before, motor_before = self._torques[-2 - ticks]
         return net - net_before, motor - motor_before
 
     def _end_test(self) -> None:

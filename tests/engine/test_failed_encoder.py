@@ -22,6 +22,7 @@ RATE_HZ = 1000.0
 BEFORE_RECORD = 1500
 """Ticks of tare and settling."""
 ENCODER = r"Net torque while the encoder|Torque that the sudden stop of the encoder"
+BY_OBSTACLES = r"Tracking error|Torque command|After the record: Drift of"
 REPEATS = r"Number of encoder readings that repeat"
 
 
@@ -98,6 +99,18 @@ def run_with_failing_encoder(make_session, reference_rad, at, friction_nm, stuck
 
 def further(*case):
     return pytest.param(*case, marks=pytest.mark.further)
+
+
+class ScaledDrive(FailingDrive):
+    """A drive that works, whose motor exerts another torque than it reports."""
+
+    def __init__(self, inner, scale):
+        super().__init__(inner, np.inf, None)
+        self.scale = scale
+
+    def command(self, torque_nm):
+        self.inner.command(self.scale * torque_nm)
+        return torque_nm
 
 
 CASES = [
@@ -188,3 +201,53 @@ def test_no_working_encoder_is_called_failed(make_session, name, friction_nm):
     session.obey(session.order(excitation))
     assert session.finished.outcome == "complete", session.finished.reason
     assert session.finished.counts["scheduled"] == reference_rad.size
+
+
+def draw_obstacles(random, seconds):
+    """Draw what the beam meets: nothing, an obstacle, or knocks."""
+    x = random.uniform(0.2, 0.95)
+    match random.integers(4):
+        case 0:
+            angle = random.choice([-1, 1]) * 10 ** random.uniform(-3, -0.5)
+            stiffness = 10 ** random.uniform(1.5, 4.5)
+            return (f"x={x:.3f},angle={angle:.5f},stiffness={stiffness:.0f}",)
+        case 1:
+            times = random.uniform(0.2, seconds, 3)
+            return tuple(
+                f"x={x:.3f},force={random.uniform(-1, 1):.3f},at={at:.2f},duration=0.02"
+                for at in times
+            )
+    return ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_fifty_sound_sessions_end_well(make_session, seed):
+    """Friction, one quantity of the motor, or a product of two are not those of the profile."""
+    random = np.random.default_rng(seed)
+    damper = None
+    for number in range(50):
+        name = str(random.choice(list(REFERENCES)))
+        reference_rad = REFERENCES[name]
+        session = make_session()
+        damper = damper or design_damper(close_loop(session.profile.loop_model()))
+        rig = session.profile.rig
+        error, part = random.uniform(0.75, 1.25), random.choice([0.0, 1.0, random.uniform()])
+        motor = replace(
+            rig.motor,
+            coulomb_nm=random.uniform(0.02, 0.1),
+            inertia_kg_m2=rig.motor.inertia_kg_m2 * error**part,
+        )
+        met = draw_obstacles(random, reference_rad.size / RATE_HZ)
+        simulation = replace(rig.simulation, seed=1000 * seed + number, obstacles=met)
+        devices = open_devices(replace(rig, motor=motor, simulation=simulation))
+        drive = ScaledDrive(devices.drive, error ** (1.0 - part))
+        session.devices = Devices(drive, devices.sensor, simulated=True)
+        excitation = Excitation("file", {}, RATE_HZ, reference_rad, {})
+        order = session.order(excitation, seed=1000 * seed + number)
+        session.obey(replace(order, ending=Ending(damper=damper)))
+        finished = session.finished
+        if finished.reason:
+            # An obstacle may hold the motor back: that is no false fault.
+            assert met, (name, number, error, part, motor, finished.reason)
+            assert re.match(BY_OBSTACLES, finished.reason), (name, number, met, finished.reason)

@@ -175,7 +175,7 @@ def sound_arguments(ground, words):
         return [*own, *simulated, "--fast", "--no-look", "--output", str(ground.folder / "out")]
     of_daemon = ["--profile", str(ground.served)]
     return {
-        "rigd check": simulated,
+        "rigd check": simulated, "rigd probe": [*simulated, "--fast"],
         "rigd serve": [*simulated, "--output", str(ground.folder / "out"), "--no-look"],
         "rigd live": of_daemon, "rigd status": of_daemon, "rigd stop": of_daemon,
         "rigd tare": of_daemon, "rigd zero": of_daemon, "rigd reset": of_daemon,

@@ -30,6 +30,10 @@ OPTIONAL = {
     "busoff": ({}, {"for": positive}),
     "saturate": ({"gauge": whole(0, 5)}, {"for": positive}),
     "status": ({"bits": whole(0, 0xFFFF)}, {"for": positive}),
+    "stuck": (
+        {"what": st.sampled_from(["encoder", "sensor", "gauge"])},
+        {"gauge": whole(0, 5), "every": whole(2, 1000), "for": positive},
+    ),
     "jump": ({"counts": whole(-(2**31), 2**31 - 1)}, {}),
     "cut": ({}, {"device": st.sampled_from(["bus", "sensor"])}),
     "restart": ({"device": device}, {}),

@@ -297,6 +297,7 @@ ENDLESS = [
     ("busoff", "world", "bus_off", False),
     ("saturate,gauge=4", "sensor", "saturate", None),
     ("status,bits=0x0080", "sensor", "status_bits", 0),
+    ("stuck,what=encoder", "simulated", "stuck_encoder", None),
     ("lag,ms=3", "drive", "torque_lag_s", 0.0),
     ("no_bit_12", "drive", "never_follows", False),
     ("no_pre_operational", "drive", "stays_operational", False),
