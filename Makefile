@@ -42,7 +42,8 @@ bench: $(VENV)/ready
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
 
 # The long run of what the tests do briefly: other examples of each property, a million frames at
-# each parser, 1200 damaged session files, and 1000 that are hostile; half an hour.
+# each parser, 1200 damaged session files, 1000 that are hostile, and a hostile value for each option
+# and key; an hour.
 fuzz: $(VENV)/ready
 	$(PYTEST) -m hypothesis --hypothesis-profile=others
 	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
@@ -51,6 +52,7 @@ fuzz: $(VENV)/ready
 	$(BIN)/python tests/sim/wire/ati/fuzz_ati_nodes.py 1000000
 	$(BIN)/python tests/recovery/fuzz_recovery.py 200
 	$(BIN)/python tests/recovery/fuzz_hostile.py 1000
+	$(BIN)/python tests/recovery/fuzz_options.py
 
 # The processes of two hundred sessions killed, suspended and asked to end at random moments, each
 # followed by another session: half an hour.

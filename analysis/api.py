@@ -6,6 +6,7 @@ errors are those of the command; nothing is printed, drawn or written.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, overload
 
@@ -218,7 +219,8 @@ def select(
     """
     from analysis.results import whole_record
 
-    return whole_record(record, tuple(fixed), band_hz).selection
+    whole = whole_record(record, tuple(fixed), band_hz)
+    return replace(whole.selection, verdict=whole.verdict)
 
 
 def campaign(

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,6 +26,7 @@ from rigd.session import (
     EstimateRequest,
     Session,
     SessionError,
+    Validity,
     read_frames,
     read_start,
     segments_until,
@@ -85,6 +86,8 @@ class OnlineEstimate:
         Sentences on the samples: missing, stale, saturated.
     problem : str
         Why there was no fit; else empty.
+    validity : Validity
+        How exact the linear model is for the record.
     """
 
     tick: int
@@ -97,6 +100,7 @@ class OnlineEstimate:
     analysis: RecordAnalysis | None = None
     warnings: tuple[str, ...] = ()
     problem: str = ""
+    validity: Validity = field(default_factory=Validity)
 
     @property
     def doubt(self) -> str | None:
@@ -165,7 +169,7 @@ class OnlineEstimate:
         }
         told, fit = self.headline, self.predicting
         if told is not None and fit is not None and self.analysis is not None:
-            content |= headline_json(None, told, self.orders, self.findings)
+            content |= headline_json(None, told, self.orders, self.findings, self.validity)
             for mode, shown in zip(content["modes"], told.modes, strict=True):
                 mode["shown"] = shown.shown
             content |= {
@@ -314,6 +318,7 @@ class OnlineFit:
         from analysis.identify import Measurement, MeasurementError, freest_alone, select
         from analysis.record import RecordError
         from analysis.suited import record_band_hz
+        from analysis.validity import record_validity
 
         began_s = time.monotonic()
         tick, duration_s = up_to_tick or 0, 0.0
@@ -340,6 +345,7 @@ class OnlineFit:
             took_s = time.monotonic() - began_s
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
         shows = bool(told.visible_modes)
+        plant = told.fit.plant
         estimate = OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
@@ -353,6 +359,9 @@ class OnlineFit:
             analysis=analysis if shows else None,
             warnings=record.warnings,
             problem="" if shows else "No mode has been excited enough yet.",
+            validity=record_validity(
+                record.metadata, record.angle_rad, record.rate_hz, (plant.beam, plant.damping)
+            ),
         )
         if whole:
             fit = estimate.predicting

@@ -23,7 +23,15 @@ from typing import TYPE_CHECKING, Any, Final
 from rigd.library import change_between
 from rigd.printable import listed
 from rigd.runtime import begin_background, raise_on
-from rigd.session import LOOK_VERSION, SessionError, last_look, look_path, mode_line, read_look
+from rigd.session import (
+    LOOK_VERSION,
+    SessionError,
+    Validity,
+    last_look,
+    look_path,
+    mode_line,
+    read_look,
+)
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -90,6 +98,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     response, coherence, model = None, _no_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     flags: list[str] = []
+    validity = Validity()
     compared = None
     try:
         record = load_record(path)
@@ -101,7 +110,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         session_id = about.get("id", path.stem)
         start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
         flags += record.warnings
-        told, more = _headline(record)
+        told, validity, more = _headline(record)
         modes = [] if told is None else [_mode(each) for each in told.modes]
         flags += more
         response, coherence, more = _response(record)
@@ -120,6 +129,7 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         "specimen": specimen,
         "excitation": excitation,
         "modes": modes,
+        "validity": validity.as_json(),
         "coherence": coherence,
         "flags": flags,
         "against_last": compared,
@@ -130,11 +140,12 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
     return dict(finite(document))
 
 
-def _headline(record: Record) -> tuple[Headline | None, list[str]]:
-    """Fit the record; return the numbers, None without any, and the sentences on them."""
+def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
+    """Fit the record; return the numbers, None without any, their validity, and the sentences."""
     from analysis.identify import Measurement, MeasurementError, freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
+    from analysis.validity import record_validity, stated_validity
 
     said = []
     length_s = record.time_s.size / record.rate_hz
@@ -142,21 +153,24 @@ def _headline(record: Record) -> tuple[Headline | None, list[str]]:
     found: tuple[Finding, ...]
     try:
         if length_s <= _JUDGED_S:
-            selection = whole_record(record).selection
-            told, found = selection.headline, selection.verdict.findings
+            whole = whole_record(record)
+            told, found, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
             told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            model = told.fit.plant.beam, told.fit.plant.damping
+            validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
             said.append(
                 f"The record is long ({length_s:.0f} s): type {told.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
     except MeasurementError as error:
-        return None, [f"No modes: {_without_name(str(error), record.path)}"]
+        no_modes = f"No modes: {_without_name(str(error), record.path)}"
+        return None, stated_validity(record.metadata), [no_modes]
     said += [each.sentence for each in found]
     if not told.modes:
         said.append("No modes: none lies in the excited band.")
-    return told, said
+    return told, validity, said
 
 
 def _mode(mode: Mode) -> dict[str, Any]:
@@ -369,6 +383,8 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     shown = [mode for mode in document["modes"] if mode["shown"]]
     for mode in shown:
         yield f"  {mode_line(mode)}"
+    if shown:
+        yield f"  {Validity.of_document(document.get('validity')).sentence}"
     doubts = dict.fromkeys(
         flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
     )

@@ -7,7 +7,7 @@ needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.Campa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
+    from rigd.beam import Beam, Damping
+    from rigd.session import Validity
 
 _ORDERS: Final = frozenset({"alpha", "lambda"})
 
@@ -74,12 +76,20 @@ class WholeRecord:
         Band of the fits.
     fixed : tuple of str
         Settings that stayed at the file's values in them.
+    validity : Validity
+        How exact the linear model is for the record.
     """
 
     record: Record
     selection: Selection
     band_hz: tuple[float, float]
     fixed: tuple[Setting, ...] = ()
+    validity: Validity = field(init=False)
+
+    def __post_init__(self) -> None:
+        plant = self.fit.plant
+        validity = _validity(self.record, (plant.beam, plant.damping))
+        object.__setattr__(self, "validity", validity)
 
     @property
     def analysis(self) -> RecordAnalysis:
@@ -104,8 +114,13 @@ class WholeRecord:
 
     @property
     def verdict(self) -> Verdict:
-        """What can be told from the data and what cannot, in the operator's words."""
-        return self.selection.verdict
+        """What can be told from the data and what cannot, in the operator's words.
+
+        Its second sentence is on the validity of the numbers.
+        """
+        verdict = self.selection.verdict
+        first, others = verdict.sentences[:1], verdict.sentences[1:]
+        return replace(verdict, sentences=(*first, self.validity.sentence, *others))
 
     @property
     def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
@@ -145,7 +160,7 @@ class WholeRecord:
 
         file, findings = str(self.record.path), self.verdict.findings
         return {
-            **headline_json(file, self.headline, self.orders, findings),
+            **headline_json(file, self.headline, self.orders, findings, self.validity),
             "scale_uncertainty": dict(self.record.uncertainty),
             "combined": {name: each.as_json() for name, each in self.combined.items()},
         }
@@ -167,11 +182,24 @@ class RecordResult:
         Fits to the whole record; None if they were not run.
     welch : WelchAnalysis or None
         Fits to Welch's estimate, as in the paper; None if they were not run.
+    validity : Validity
+        How exact the linear model is for the record.
     """
 
     record: Record
     whole: WholeRecord | None = None
     welch: WelchAnalysis | None = None
+    validity: Validity = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.whole is not None:
+            validity = self.whole.validity
+        else:
+            # Welch's fits differ: the slope is up to the largest of theirs.
+            models = () if self.welch is None else self.welch.models
+            dampings = [each.fit.damping for each in models]
+            validity = _validity(self.record, *((self.record.beam, each) for each in dampings))
+        object.__setattr__(self, "validity", validity)
 
     @property
     def name(self) -> str:
@@ -187,6 +215,12 @@ class RecordResult:
     def warnings(self) -> tuple[str, ...]:
         """What an analyst should read beside the results."""
         return self.record.warnings if self.welch is None else self.welch.warnings
+
+
+def _validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
+    from analysis.validity import record_validity
+
+    return record_validity(record.metadata, record.angle_rad, record.rate_hz, *models)
 
 
 def whole_record(

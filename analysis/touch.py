@@ -7,7 +7,7 @@ is then estimated as it is during a session (`rigd.touch`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, pi, sqrt
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -25,8 +25,9 @@ from analysis.record_checks import (
     stated_tool_inertia_kg_m2,
     stated_torque_filter_s,
 )
+from analysis.validity import record_validity
 from rigd.beam import Damping
-from rigd.session import Session, SessionError, Status, read_session
+from rigd.session import Session, SessionError, Status, Validity, read_session, readable_texts
 from rigd.touch import (
     CONTACT_S,
     FINAL_S,
@@ -150,6 +151,8 @@ class TouchedSession:
         The file tells the base shear.
     warnings
         What should be known of the result, in sentences.
+    validity
+        How exact the linear model is for the session.
     """
 
     path: Path
@@ -159,6 +162,7 @@ class TouchedSession:
     rate_hz: float
     has_shear: bool
     warnings: tuple[str, ...]
+    validity: Validity = field(default_factory=Validity)
 
 
 class TouchAnalysis:
@@ -227,9 +231,14 @@ class TouchAnalysis:
             part = around_touch(samples, tick, rate_hz, free_from)
             touches.append(self._touch(part, number, tick, model, rate_hz, shear))
         warnings += _doubts(touches)
+        validity = record_validity(
+            readable_texts(session.metadata, "keys of the metadata")[0],
+            samples["angle_rad"], rate_hz, (model.beam, model.damping),
+        )  # fmt: skip
         return TouchedSession(
-            path, tuple(touches), found, model, rate_hz, shear is not None, tuple(warnings)
-        )
+            path, tuple(touches), found, model, rate_hz, shear is not None, tuple(warnings),
+            validity,
+        )  # fmt: skip
 
     def _touch(
         self,
@@ -304,8 +313,8 @@ def _checked_rate_hz(session: Session) -> float:
     rate_hz = stated_rate_hz(session)
     ticks = samples["tick"].astype(np.int64)
     check_span(path, ticks)
-    for field in ("angle_rad", "coupling_torque_nm"):
-        check_finite(path, field, samples[field], ticks)
+    for name in ("angle_rad", "coupling_torque_nm"):
+        check_finite(path, name, samples[name], ticks)
     check_sensor(path, samples["coupling_torque_nm"])
     return rate_hz
 

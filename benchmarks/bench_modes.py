@@ -10,7 +10,9 @@ sessions), their ratio, and the ratio of the scatter over the sessions.
 Without ``--engine`` the sessions are made in the frequency domain: the reference through the loop
 1/(1 + s/80)^2, exact torque, encoder steps of 7e-5 rad, torque noise of 1e-2 N·m and steps of
 1.25e-4 N·m. With ``--engine`` they are runs of ``rigd run --fast`` on the profile ``sim``.
-``--amplitude`` is that of the narrow sweeps: more than the chirp's uses what the limits leave.
+``--amplitude`` is that of the narrow sweeps, which keep the slope of the tip within
+``--tip-slope``; ``--chirp-amplitude`` is the chirp's. The paper's chirp slopes by 0.6 rad, one of
+0.0058 rad by 0.14 rad.
 """
 
 import argparse
@@ -28,7 +30,7 @@ from numpy.typing import NDArray
 
 from analysis.identify import Measurement, Plant, RecordFit, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import transfer
+from rigd.beam import SMALL_SLOPE_RAD, transfer
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview
@@ -129,6 +131,8 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=20, help="of each kind")
     parser.add_argument("--plant", choices=PLANTS, action="append", help="only this one")
     parser.add_argument("--amplitude", type=float, action="append", help="of the narrow sweeps")
+    parser.add_argument("--tip-slope", type=float, default=SMALL_SLOPE_RAD, help="of them")
+    parser.add_argument("--chirp-amplitude", type=float, default=0.025, help="of the peer")
     parser.add_argument("--widths", type=float, default=1.0, help="to either side of a mode")
     parser.add_argument("--engine", action="store_true", help="rigd run --fast, type VI only")
     given = parser.parse_args()
@@ -139,19 +143,23 @@ def main() -> None:
         for name in plants:
             truth = Plant(LINK, PLANTS[name])
             if given.engine:
-                peer = fitted(recorded(["chirp"], Path("sim"), given.sessions, folder), name)
+                kind = ["chirp", "--amplitude", str(given.chirp_amplitude)]
+                peer = fitted(recorded(kind, Path("sim"), given.sessions, folder), name)
             else:
-                session = response(truth, chirp(rate_hz=RATE_HZ).reference_rad)
+                sweep = chirp(rate_hz=RATE_HZ, amplitude_rad=given.chirp_amplitude)
+                session = response(truth, sweep.reference_rad)
                 peer = fitted([session.measured(seed) for seed in range(given.sessions)], name)
             write_modes(peer[0], document)
             for amplitude_rad in given.amplitude or [0.025, 0.1]:
                 options = {"amplitude_rad": amplitude_rad, "widths": given.widths}
+                options["tip_slope_rad"] = given.tip_slope
                 rig = LoopPreview(profile_of(name))
                 excitation = modes(rate_hz=RATE_HZ, path=document, rig=rig, **options)
                 print(f"\nUp to {amplitude_rad:g} rad: {excitation.parameters['bands']}")
                 if given.engine:
                     command = ["modes", str(document), "--amplitude", str(amplitude_rad)]
                     command += ["--widths", str(given.widths)]
+                    command += ["--tip-slope", str(given.tip_slope)]
                     sessions = recorded(command, Path("sim"), given.sessions, folder)
                 else:
                     session = response(truth, excitation.reference_rad)

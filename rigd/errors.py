@@ -5,6 +5,8 @@
     RigdError
      +-- UserError             the request has to be another: exit code 2
      |    +-- ProfileError          a key of the profile is missing, or its value is out of range
+     |    +-- UnknownValueError     motor.peak_torque_nm has source = "unknown" in the profile
+     |    +-- UnknownRowError       --accept names no row of rigd check
      |    +-- UnknownDeviceError    [devices] names a driver that does not exist
      |    +-- ExcitationError       --amplitude 0, or a CSV file with semicolons
      |    +-- IdentifiedBeamError   --model of a file that holds no beam
@@ -19,6 +21,7 @@
      |    +-- WrongUseError         rigd inject with a fault that does not exist
      +-- FailureError          the same request may succeed later: exit code 1
      |    +-- DeviceError           the drive does not answer, or reports a fault
+     |    +-- CheckFailedError      rigd check fails without a device: the worst travel is too long
      |    +-- ChildError            the control process was killed
      |    +-- RigError              the rig is not connected, or its zero is lost
      |    +-- SessionFailedError    the recorder died; part of the record is kept

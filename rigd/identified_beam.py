@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.beam import Beam, Damping, LoadedBeam
+from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
-from rigd.runtime import open_plain_file
-from rigd.units import finite_number
+from rigd.units import finite_number, is_usable_size
 
-_MOST_BYTES: Final = 64_000_000
 _NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 _TWO_SIDED_95: Final = 1.959964
 _REMEDY: Final = "write it with analyze session.mcap --json model.json"
@@ -236,12 +235,9 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
 def _headline(path: Path) -> tuple[str, Mapping[str, Any]]:
     """Return the headline of a document, and what messages call it."""
     try:
-        with open_plain_file(path, _MOST_BYTES) as file:
-            document = json.load(file)
-    except OSError as error:
-        raise IdentifiedBeamError(f"{path}: cannot be read ({error.strerror}).") from error
-    except (ValueError, RecursionError) as error:
-        raise IdentifiedBeamError(f"{path}: is not a JSON document; {_REMEDY}.") from error
+        document = read_json(path)
+    except DocumentError as error:
+        raise IdentifiedBeamError(f"{path}: {error}; {_REMEDY}.") from error
     headlines = document.get("headlines") if isinstance(document, dict) else None
     if not isinstance(headlines, list):
         headlines = []
@@ -268,7 +264,7 @@ def _value(where: str, name: str, entry: object) -> float:
         )
     given = entry.get("value") if isinstance(entry, dict) else None
     value = finite_number(given)
-    in_range = value is not None and known.least <= value < known.below
+    in_range = value is not None and known.least <= value < known.below and is_usable_size(value)
     if value is not None and in_range and (value > 0.0 or name not in _NEEDED):
         return value
     bound = "any size"

@@ -1,6 +1,7 @@
 """What terminals show: text from outside made harmless, counts, progress with the time left."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -11,6 +12,11 @@ UNPRINTABLE: Final = "?"
 
 _FROM: Final = 10_000
 """Numbers of four digits are read without help."""
+
+_MOST_LINES: Final = 40
+_LONGEST_LINE: Final = 2000
+_LINE_ENDING: Final = 500
+"""Characters of its end that a line which is cut keeps: the remedy is there."""
 
 _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
 """Theme of rich for a progress bar: its own is red, which on a rig is for alarms."""
@@ -33,6 +39,49 @@ def printable(text: str, most: int | None = None) -> str:
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
     return shown if len(shown) == len(text) else f"{shown}…"
+
+
+def readable_message(message: str) -> str:
+    r"""Return an error message of harmless text and readable length, whatever it quotes.
+
+    Lines beyond the fortieth are counted, and the middle of a line of more than 2000 characters is
+    left out.
+
+    Parameters
+    ----------
+    message
+        Lines of text, each with its remedy at the end.
+
+    Examples
+    --------
+    >>> from rigd.printable import readable_message
+    >>> print(readable_message("a.toml: x = \x1b[2J is unknown."))
+    a.toml: x = ?[2J is unknown.
+    """
+    # An end of line in a quotation is not told from one of the message; either is harmless.
+    lines = message.split("\n", _MOST_LINES)
+    shown = [_readable_line(line) for line in lines[:_MOST_LINES]]
+    if len(lines) > _MOST_LINES:
+        shown.append(f"… and {grouped(lines[-1].count(chr(10)) + 1)} more lines.")
+    return "\n".join(shown)
+
+
+def _readable_line(line: str) -> str:
+    if len(line) > _LONGEST_LINE:
+        line = f"{line[: _LONGEST_LINE - _LINE_ENDING]} … {line[-_LINE_ENDING:]}"
+    return printable(line)
+
+
+@contextlib.contextmanager
+def readable_errors() -> Iterator[None]:
+    """Make the message of a command line's usage error readable, whatever value it quotes."""
+    try:
+        yield
+    except Exception as error:
+        # Typer's click is its own in some versions and the package of that name in others.
+        if hasattr(error, "exit_code") and isinstance(getattr(error, "message", None), str):
+            error.message = readable_message(error.message)  # type: ignore[attr-defined]
+        raise
 
 
 def grouped(count: int) -> str:

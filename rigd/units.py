@@ -169,6 +169,23 @@ def decimals(uncertainty: float) -> int:
     return max(1 - floor(log10(uncertainty)), 0)
 
 
+_SMALLEST, _LARGEST = 1e-12, 1e12
+
+
+def is_usable_size(value: float) -> bool:
+    """Whether a number in the unit of its key is 0, or of a size that some rig can have.
+
+    Beyond it the powers and products of a model overflow, or vanish.
+
+    Examples
+    --------
+    >>> from rigd.units import is_usable_size
+    >>> is_usable_size(0.98), is_usable_size(0.0), is_usable_size(1e300), is_usable_size(-5e-324)
+    (True, True, False, False)
+    """
+    return value == 0.0 or _SMALLEST <= abs(value) <= _LARGEST
+
+
 def finite_number(value: object) -> float | None:
     """Return a number that a document holds; None of anything else, and if it is not finite.
 

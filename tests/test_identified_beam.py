@@ -59,7 +59,9 @@ def test_what_is_wrong_with_the_document_is_said(analysed, other, says):
     assert "model.json" in str(refused.value)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"headlines": []}', '{"headlines": [{}]}', "\x00"])
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"headlines": []}', '{"headlines": [{}]}', '{"headlines": 3}', "\x00"]
+)
 def test_a_file_that_is_no_document_is_refused(tmp_path, text):
     path = tmp_path / "model.json"
     path.write_text(text)

@@ -1,8 +1,36 @@
-"""Counts in the operator's words."""
+"""Counts in the operator's words, and errors of readable length."""
 
-from rigd.printable import counts_text
+import pytest
+
+from rigd.printable import counts_text, readable_errors, readable_message
 
 
 def test_counts_that_nobody_could_read_are_unknown():
     counts = {"recorded": None, "scheduled": 12_000, "missed": 2, "late": 0, "lost": None}
     assert counts_text(counts) == "unknown of 12 000 samples, 2 missed, 0 late, unknown lost"
+
+
+def test_an_error_keeps_its_beginning_and_its_remedy_whatever_it_quotes():
+    shown = readable_message(f"a.toml: {'x' * 1_000_000} is unknown; remove it.")
+    assert len(shown) < 2100
+    assert shown.startswith("a.toml: xxx")
+    assert shown.endswith("xxx is unknown; remove it.")
+    assert readable_message("a\x1b[2J\r.\nb.") == "a?[2J?.\nb."
+
+
+def test_of_very_many_lines_the_first_are_shown_and_the_others_counted():
+    lines = readable_message("\n".join(f"line {i}." for i in range(100_000))).split("\n")
+    assert lines[39:] == ["line 39.", "… and 99 960 more lines."]
+    assert readable_message("\n".join(["a"] * 40)).count("\n") == 39
+
+
+def test_a_usage_error_is_made_readable_and_no_other():
+    class UsageError(Exception):
+        exit_code = 2
+        message = "y" * 10_000
+
+    for error in (UsageError(), ValueError("y" * 10_000)):
+        with pytest.raises(type(error)), readable_errors():
+            raise error
+        assert len(getattr(error, "message", "")) < 2100
+    assert len(str(error)) == 10_000

@@ -36,6 +36,7 @@ from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns._workers import Lost, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
+from analysis.validity import worst
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._workers import Workers
     from analysis.identify import Setting
+    from rigd.session import Validity
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,11 @@ class CampaignResult:
     def headline(self) -> PooledEstimate | None:
         """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
         return freest_estimate(self.pooled)
+
+    @property
+    def validity(self) -> Validity:
+        """How exact the linear model is for the sessions: that of the worst."""
+        return worst(each.validity for each in self.sessions)
 
     @property
     def trials(self) -> int:

@@ -63,7 +63,7 @@ def _shared(
     named = (
         replace(each.example, sentence=each.sentence, interval=None) for each in verdict.findings
     )
-    return headline_json(None, told, orders, named)
+    return headline_json(None, told, orders, named, campaign.validity)
 
 
 def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from analysis.campaigns._experiment import Experiment, task_errors
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
 from analysis.results import RecordResult, whole_record
-from rigd.session import sample_digests
+from rigd.session import Validity, sample_digests
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -93,6 +93,8 @@ class SessionResult:
         What tables and sentences call it: see `told_apart`; by itself the name of its file.
     digests : frozenset of bytes
         Digests of its samples: see `rigd.session.sample_digests`.
+    validity : Validity
+        How exact the linear model is for the session.
     """
 
     path: Path
@@ -113,6 +115,7 @@ class SessionResult:
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
     name: str = ""
     digests: frozenset[bytes] = frozenset()
+    validity: Validity = field(default_factory=Validity)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
@@ -238,6 +241,7 @@ def _session_result(
         segments=measured.segments,
         record_band_hz=record_band_hz(record, task.band_hz),
         digests=sample_digests(record.angle_rad, record.torque_nm),
+        validity=result.validity,
     )
 
 

@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
-from analysis.cli.standard_streams import standard_streams
+from analysis.cli.standard_streams import complain, standard_streams
 from analysis.cli.touch import TOUCH_EPILOG, touch_command
 from analysis.cli.welch_options import (
     Band,
@@ -30,6 +30,7 @@ from analysis.cli.welch_options import (
     welch_settings,
 )
 from analysis.results import FIGURE_FORMATS, Routes
+from rigd.printable import readable_errors
 from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:
@@ -60,13 +61,15 @@ class DefaultCommandGroup(TyperGroup):
         **extra: Any,  # noqa: ANN401
     ) -> Any:  # noqa: ANN401
         """Parse the arguments for the subcommand named first, or for the default command."""
-        if args and args[0] in self.commands and args[0] != DEFAULT:
-            return super().make_context(info_name, args, parent, **extra)
-        return self.commands[DEFAULT].make_context(info_name, args, parent, **extra)
+        with readable_errors():
+            if args and args[0] in self.commands and args[0] != DEFAULT:
+                return super().make_context(info_name, args, parent, **extra)
+            return self.commands[DEFAULT].make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run what `make_context` has parsed the arguments for."""
-        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
+        with readable_errors():
+            return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
 class CommandBesideOthers(TyperCommand):
@@ -265,7 +268,7 @@ def analyze(
     try:
         files = session_files(files)
     except NoSessionsError as error:
-        _complain(str(error))
+        complain(str(error))
         raise typer.Exit(1) from None
     is_campaign = len(files) > 1 and not each
     if not is_campaign:
@@ -315,13 +318,13 @@ def analyze(
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, outputs)
             except CampaignError as error:
-                _complain(str(error))
+                complain(str(error))
                 code = 1
     except OutputExistsError as error:
-        _complain(str(error))
+        complain(str(error))
         code = 2
     except OutputError as error:
-        _complain(str(error))
+        complain(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -362,7 +365,7 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
 def _lone_session(lone: LoneSessionError, routes: Routes, outputs: Outputs) -> int:
     """Tell what is wrong with the other files of a campaign, and report the one that is left."""
     for failure in lone.failures:
-        _complain(failure.message)
+        complain(failure.message)
     typer.echo(f"A campaign needs two sessions: {lone.path} is reported alone.", err=True)
     others = {str(failure.path): failure.message for failure in lone.failures}
     return max(1, session_command([lone.path], routes, outputs, others=others))
@@ -401,7 +404,3 @@ def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
             f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
         )
     check_rerun_file(rerun)
-
-
-def _complain(message: str) -> None:
-    typer.echo(f"Error: {message}", err=True)

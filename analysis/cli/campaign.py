@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from analysis.cli.standard_streams import print_readable
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def _analysed(
                 found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
-    tell = partial(progress.console.print, markup=False, soft_wrap=True)
+    tell = partial(print_readable, progress.console)
     for failure in found.failures:
         tell(f"Error: {failure.message}")
     for lost in found.lost_trials:

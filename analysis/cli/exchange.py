@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer.models import OptionInfo
 
+from analysis.cli.standard_streams import complain
 from analysis.cli.welch_options import (
     Band,
     Estimator,
@@ -259,10 +260,10 @@ def _explained(run: Callable[[], None]) -> int:
     try:
         run()
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         return 2
     except (ExchangeError, SessionError, RecordError, EstimateError, OutputError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         return 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -279,14 +280,19 @@ def _choice(option: str, text: str, quantity: str) -> ChannelChoice:
         raise typer.BadParameter(str(error), param_hint=option) from error
 
 
+_LATEST_S: Final = 1e6
+"""More than any record that is read."""
+
+
 def _interval(option: str, text: str) -> tuple[float, float]:
     try:
         begin_s, end_s = (float(part) for part in text.split(","))
     except ValueError:
         begin_s = end_s = math.nan
-    if not 0.0 <= begin_s < end_s < math.inf:
+    if not 0.0 <= begin_s < end_s <= _LATEST_S:
         raise typer.BadParameter(
-            f"'{text}' is not two times in s with 0 <= T0 < T1, such as 1,121.", param_hint=option
+            f"'{text}' is not two times in s with 0 <= T0 < T1 <= 1e6, such as 1,121.",
+            param_hint=option,
         )
     return begin_s, end_s
 

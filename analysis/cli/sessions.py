@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
+from analysis.cli.standard_streams import print_readable
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
@@ -183,7 +185,7 @@ def _analyse_all(
     errors: dict[str, str] = {}
     code = 0
     with progress_bar() as progress:
-        tell = partial(progress.console.print, markup=False, soft_wrap=True)
+        tell = partial(print_readable, progress.console)
         steps = _steps(routes, rerun)
         task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):

@@ -8,11 +8,27 @@ import sys
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
+import typer
+
+from rigd.printable import readable_message
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rich.console import Console
+
 _NAMES: Final = ("stdout", "stderr")
 _EXIT_FAILED: Final = 1
+
+
+def complain(message: str) -> None:
+    """Write an error to standard error."""
+    typer.echo(f"Error: {readable_message(message)}", err=True)
+
+
+def print_readable(console: Console, message: str) -> None:
+    """Write a message about a file above a line of progress."""
+    console.print(readable_message(message), markup=False, soft_wrap=True)
 
 
 class StandardStreamError(OSError):

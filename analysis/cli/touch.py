@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from analysis.cli.sessions import NoSessionsError, Outputs, session_files
+from analysis.cli.standard_streams import complain, print_readable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,10 +63,10 @@ def touch_command(
             report_folders(files[:1], report)
         code = _analyse(files, model, outputs)
     except (OutputExistsError, IdentifiedBeamError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         code = 2
     except (NoSessionsError, OutputError) as error:
-        typer.echo(f"Error: {error}", err=True)
+        complain(str(error))
         code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
@@ -131,6 +132,6 @@ def _sessions(
             except (SessionError, RecordError, MemoryError) as error:
                 message = str(error) or f"{file}: not enough memory; close other programs."
                 errors[str(file)] = message
-                progress.console.print(f"Error: {message}", markup=False, soft_wrap=True)
+                print_readable(progress.console, f"Error: {message}")
             progress.update(task, completed=number + 1)
     return found, errors

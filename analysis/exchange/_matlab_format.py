@@ -260,15 +260,24 @@ def _hdf5_channel(
 
 
 def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
-    variable, fields, column = _split(name, file)
-    place = "/".join([variable, *fields])
-    dataset = file.get(place)
-    if dataset is None:
-        raise no_such_channel(path, name, (each for each in file if not each.startswith("#")))
+    variables = list(file)  # their names alone: a link may lead into another file
+    variable, fields, column = _split(name, variables)
+    dataset = file
+    for part in (variable, *fields):
+        link = _hdf5_link(dataset, part, h5py)
+        if link is None:
+            raise no_such_channel(
+                path, name, (each for each in variables if not each.startswith("#"))
+            )
+        if not isinstance(link, h5py.HardLink):
+            raise _stored_elsewhere(path, name)
+        dataset = dataset[part]
     if not isinstance(dataset, h5py.Dataset):
         listed = ", ".join(f"{name}.{each}" for each in list(dataset)[:12])
         raise ExchangeError(f"{path}: '{name}' is a struct; choose one of its fields: {listed}.")
-    check_samples(path, f"'{name}'", max(dataset.shape, default=0))
+    if dataset.is_virtual or dataset.external:
+        raise _stored_elsewhere(path, name)
+    check_samples(path, f"'{name}'", max(dataset.shape or (), default=0))
     kind = dataset.attrs.get("MATLAB_class", b"double")
     kind = kind.decode("ascii", "replace") if isinstance(kind, bytes) else str(kind)
     if kind not in _NUMERIC or dataset.dtype.kind == "O" or "MATLAB_empty" in dataset.attrs:
@@ -278,6 +287,21 @@ def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  
         )
     # MATLAB's columns are the rows of HDF5, which counts its dimensions from the other end.
     return _column(path, name, dataset[()].T, column)
+
+
+def _hdf5_link(group: Any, name: str, h5py: Any) -> object:  # noqa: ANN401
+    """Return how a member of a group is linked, without following it; None: there is none."""
+    if not isinstance(group, h5py.Group) or "/" in name or name in ("", "."):
+        return None
+    return group.get(name, getlink=True)
+
+
+def _stored_elsewhere(path: Path, name: str) -> ExchangeError:
+    """Make the error for a channel whose samples are in another place or file, unlike MATLAB's."""
+    return ExchangeError(
+        f"{path}: '{name}' is a link or refers to samples stored elsewhere, which are not read; "
+        "save the channel itself with save('-v7', …)."
+    )
 
 
 # Writing

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from analysis.exchange._source import ExchangeError
 from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
 from rigd.beam import Beam
-from rigd.text_table import decode_text
+from rigd.documents import DocumentError, parse_toml, read_text
 from rigd.units import finite_number, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
-
-_MOST_BYTES: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +53,9 @@ def read_specimen(path: Path) -> Specimen:
     0.98
     """
     try:
-        with path.open("rb") as stream:
-            text = stream.read(_MOST_BYTES + 1)
-        if len(text) > _MOST_BYTES:
-            raise ExchangeError(f"{path}: is too large for a profile; give a TOML file.")
-        content = tomllib.loads(decode_text(text))
-    except OSError as error:
-        raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ExchangeError(f"{path}: is not a TOML file ({error}).") from error
+        content = parse_toml(read_text(path))
+    except DocumentError as error:
+        raise ExchangeError(f"{path}: {error}.") from error
     beam, sensor, uncertainty = (
         _section(path, content, name) for name in ("beam", "sensor", "uncertainty")
     )

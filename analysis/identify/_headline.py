@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._verdict import OrderVerdict
+    from rigd.session import Validity
 
 UNEXPLAINED: Final = "part of the record is unexplained"
 MISREAD: Final = "the record contradicts its file"
@@ -609,6 +610,7 @@ def headline_json(
     told: Numbers,
     orders: Iterable[JudgedOrder],
     findings: Iterable[Finding],
+    validity: Validity,
 ) -> dict[str, Any]:
     """Write a headline as the JSON document has it.
 
@@ -619,6 +621,8 @@ def headline_json(
     told : Numbers
     orders : iterable of JudgedOrder
     findings : iterable of Finding
+    validity : Validity
+        How exact the linear model is for the record.
 
     Returns
     -------
@@ -628,6 +632,7 @@ def headline_json(
     return {
         "file": file,
         "type": told.name,
+        "validity": validity.as_json(),
         "parameters": {name: each.as_json() for name, each in told.parameters.items()},
         "drag_speed_m_s": told.drag_speed_m_s,
         "sizes": [

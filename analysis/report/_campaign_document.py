@@ -32,7 +32,8 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     Returns
     -------
     dict
-        ``headlines`` of each session and, with ``file`` null, of all together; ``verdict`` on all
+        ``headlines`` of each session and, with ``file`` null, of all together; ``validity`` of the
+        linear model for the worst of the sessions; ``verdict`` on all
         sessions (null without whole-record estimates), ``files`` with each one's own, ``errors``
         (files left out, and why), ``one_specimen`` and the ``groups`` in which sessions lie if they
         are not, ``trials`` of the validation asked, done and lost, ``fits`` and ``modes`` as of
@@ -43,11 +44,13 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         {
             "versions": versions(),
             "headlines": headlines(campaign),
+            "validity": campaign.validity.as_json(),
             "verdict": None if campaign.verdict is None else asdict(campaign.verdict),
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [
                 {
                     "file": str(each.path),
+                    "validity": each.validity.as_json(),
                     "warnings": each.warnings,
                     "welch_segments": each.segments or None,
                     "verdict": None if each.verdict is None else each.verdict.as_json(),

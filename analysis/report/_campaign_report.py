@@ -40,7 +40,15 @@ _NO_VERDICT: Final = (
 
 
 def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
-    """Return the verdict; without one, what it would have said first, and why there is none."""
+    """Return the verdict; without one, what it would have said first, and why there is none.
+
+    The second sentence, or the only one, is on the validity of the numbers.
+    """
+    said = _verdict_sentences(campaign)
+    return (*said[:1], campaign.validity.sentence, *said[1:])
+
+
+def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     if campaign.verdict is not None:
         return campaign.verdict.sentences
     asked = any(each.record_estimates for each in campaign.sessions)

@@ -251,9 +251,9 @@ def document(
     -------
     dict
         ``versions``, ``headlines`` (what each whole record says, with flags), ``files`` (what was
-        read, and how the Welch method estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
-        ``errors``: lists of objects that name their file.
-        Finite numbers only.
+        read, how exact the linear model is for it, and how the Welch method estimated it),
+        ``fits``, ``modes``, ``peaks``, ``records``, ``errors``: lists of objects that name their
+        file. Finite numbers only.
     """
     of_records = [record_entries(each.whole, each.welch) for each in results if each.whole]
     by_welch = [(each.welch, each.unsupported) for each in results if each.welch]
@@ -261,12 +261,15 @@ def document(
         {
             "versions": versions(),
             "files": [
-                *(_file(analysis) for analysis, _ in by_welch),
-                *(
-                    _record_facts(each.record, each.warnings)
-                    for each in results
-                    if each.welch is None
-                ),
+                {**facts, "validity": each.validity.as_json()}
+                for each, facts in (
+                    *((each, _file(each.welch)) for each in results if each.welch),
+                    *(
+                        (each, _record_facts(each.record, each.warnings))
+                        for each in results
+                        if each.welch is None
+                    ),
+                )
             ],
             "fits": [
                 *(fit for analysis, withheld in by_welch for fit in _fits(analysis, withheld)),

@@ -8,16 +8,19 @@ removed.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from rigd.documents import DocumentError, read_json, read_text
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+_LONGEST_LIST: Final = 10_000_000
+"""Bytes: a hundred thousand files."""
 LIST: Final = "SHA256SUMS"
 """Name of the list of a report's files."""
 
@@ -119,8 +122,8 @@ def _holds_results(path: Path) -> bool:
     if path.is_symlink() or not path.is_file():
         return False
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path)
+    except DocumentError:
         return False
     return isinstance(content, dict) and content.keys() >= _KEYS_OF_RESULTS
 
@@ -273,11 +276,11 @@ def _read_list(folder: Path) -> dict[str, set[str]]:
     """Read SHA-256 by name; of a file that was just being replaced there are two."""
     found: dict[str, set[str]] = {}
     try:
-        for line in (folder / LIST).read_text(encoding="utf-8").splitlines():
+        for line in read_text(folder / LIST, _LONGEST_LIST).splitlines():
             checksum, _, name = line.partition("  ")
             found.setdefault(name, set()).add(checksum)
-    except (OSError, UnicodeDecodeError) as error:
-        raise OutputError(f"{folder / LIST} cannot be read ({error}).") from error
+    except DocumentError as error:
+        raise OutputError(f"{folder / LIST} {error}.") from error
     return found
 
 

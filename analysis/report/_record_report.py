@@ -11,7 +11,7 @@ from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._folder import write_new
-from analysis.report._table import Table, csv_text, latex_table
+from analysis.report._table import Table, csv_text, latex_table, with_validity
 from analysis.report._text import damping_sentences, tables_text
 from analysis.results import DEFAULT_FORMATS
 
@@ -241,7 +241,8 @@ def _write_page(
             pictures.append(style.save_picture(shown.figure, stem, shown.description, formats))
             on_step(f"figure {shown.name}")
     modes, of_record, of_paper = report_tables(result)
-    for table in (modes, *of_record, *of_paper):
+    for each in (modes, *of_record, *of_paper):
+        table = with_validity(each, result.validity)
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
         if table.name in _FOR_PAPERS:
             write_new(folder / "tables" / f"{table.name}.tex", latex_table(table))

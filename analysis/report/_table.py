@@ -10,7 +10,7 @@ import io
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import COEFFICIENT_OF
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import rich.table
 
     from analysis.models import Structure
+    from rigd.session import Validity
 
 ABSENT: Final = "–"
 WORDS: Final = ""
@@ -175,6 +176,16 @@ class Table:
         return tuple(
             tuple(column.shown(row.get(column.key, "")) for column in columns) for row in self.rows
         )
+
+
+def with_validity(table: Table, validity: Validity) -> Table:
+    """State in a table that stands alone how exact the linear model is for its numbers.
+
+    People read it under the table; programs have it in each row.
+    """
+    stated = asdict(validity)
+    rows = tuple({**row, **stated} for row in table.rows)
+    return replace(table, rows=rows, notes=(*table.notes, validity.sentence))
 
 
 def csv_text(table: Table) -> str:

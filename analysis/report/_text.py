@@ -54,6 +54,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         shown.append(analysis_tables(result))
     elif welch is not None:
         if whole is None:
+            shown.append(Text(result.validity.sentence))
             shown += spaced((tables.welch_fits_table(welch),))
         shown += _warnings(result.warnings)
     else:
@@ -116,6 +117,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
     modes = tables.welch_modes_table(welch)
     return Group(
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
+        Text(result.validity.sentence),
         "",
         *spaced(
             (
@@ -131,7 +133,9 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
     """Return the Welch fits of several files in one table: those that were made."""
     found = [each.welch for each in results if each.welch is not None]
-    return terminal_table(tables.summary_table(found))
+    table = tables.summary_table(found)
+    notes = [f"{each.name}: {each.validity.sentence}" for each in results if each.welch is not None]
+    return terminal_table(replace(table, notes=(*table.notes, *notes)))
 
 
 def record_text(whole: WholeRecord) -> RenderableType:

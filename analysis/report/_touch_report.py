@@ -105,8 +105,9 @@ def session_lines(session: TouchedSession) -> list[str]:
     what = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
     by = "during the session" if session.found == "loop" else "in the record"
     detected = f", detected {by}" if count else ""
+    validity = f" {session.validity.sentence}" if count else ""
     return [
-        f"{session.path.name}: {what}{detected}. Model: {model_words(session)}.",
+        f"{session.path.name}: {what}{detected}. Model: {model_words(session)}.{validity}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]
 
@@ -137,7 +138,12 @@ def touches_document(
         {
             "versions": versions(),
             "touches": [
-                {"file": str(session.path), "detected": session.found, **touch.as_dict()}
+                {
+                    "file": str(session.path),
+                    "detected": session.found,
+                    "validity": session.validity.as_json(),
+                    **touch.as_dict(),
+                }
                 for session in sessions
                 for touch in session.touches
             ],

@@ -34,6 +34,7 @@ from ._realisation import state_output as state_output
 from ._realisation import with_filter as with_filter
 from ._tip import SMALL_SLOPE_RAD as SMALL_SLOPE_RAD
 from ._tip import TipMotion as TipMotion
+from ._tip import linear_model_error as linear_model_error
 from ._tip import tip_motion as tip_motion
 from ._tip import tip_response as tip_response
 from ._tip_mass import LoadedBeam as LoadedBeam

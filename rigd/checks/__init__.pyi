@@ -1,5 +1,11 @@
 from ._check import check_beside as check_beside
 from ._check import check_rig as check_rig
+from ._gate import ACCEPTABLE as ACCEPTABLE
+from ._gate import CheckFailedError as CheckFailedError
+from ._gate import Clearance as Clearance
+from ._gate import FailedCheck as FailedCheck
+from ._gate import UnknownRowError as UnknownRowError
+from ._gate import check_on_paper as check_on_paper
 from ._machine import settings_granted as settings_granted
 from ._on_paper import eds_rows as eds_rows
 from ._rows import OF_A_RIG as OF_A_RIG

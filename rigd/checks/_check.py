@@ -1,32 +1,31 @@
 """The whole check of a rig, in the order in which one thing rules out the next."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rigd.checks._devices import calibration_rows, inspect_devices
+from rigd.checks._gate import paper_rows
 from rigd.checks._machine import machine_rows, rights_rows
-from rigd.checks._on_paper import (
-    eds_rows,
-    loop_rows,
-    profile_rows,
-    record_row,
-    travel_rows,
-    wiring_rows,
-)
-from rigd.checks._rows import Row, Verdict
+from rigd.checks._on_paper import wiring_rows
+from rigd.checks._rows import Row, Verdict, grade
+from rigd.devices import unknown_values
+from rigd.errors import UserError
 from rigd.profile import Profile
+from rigd.runner import LoopPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[Row]:
     """Check the rig of a profile without a torque: on paper, this computer, then the devices.
 
     Where the identifiers meet or the bus cannot carry the frames, nothing is connected: devices
-    might obey what is not meant for them.
+    might obey what is not meant for them. Nor is it while a value of the profile is unknown.
     """
     rows = _rows_without_devices(profile)
     if any(row.verdict is Verdict.FAIL for row in wiring_rows(profile.rig)):
         why = "not connected: first the bus has to be right"
+        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+    if unknown_values(profile.rig):
+        why = "not connected: first the unknown values have to be entered"
         return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
     return rows + inspect_devices(profile)
 
@@ -50,18 +49,32 @@ def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> lis
 
 def _rows_without_devices(profile: Profile) -> list[Row]:
     return [
-        *_drive_rows(profile),
-        *profile_rows(profile),
-        record_row(profile),
-        *wiring_rows(profile.rig),
-        *loop_rows(profile),
-        *travel_rows(profile),
+        *paper_rows(profile),
+        *default_session_rows(profile),
         *rights_rows(profile.realtime),
         *machine_rows(profile.realtime),
     ]
 
 
-def _drive_rows(profile: Profile) -> list[Row]:
-    """Hold the EDS that a profile names against what is asked of a drive."""
-    settings = profile.rig.cia402
-    return list(eds_rows(Path(settings.eds), profile.rig)) if settings and settings.eds else []
+def default_session_rows(profile: Profile) -> Iterator[Row]:
+    """Say whether `rigd run chirp` without options stays within the limits of the profile.
+
+    Advice, since another session may: a hold moves nothing.
+    """
+    try:
+        chirp = excitation_for(profile, "chirp", {})
+        percent = 100 * LoopPreview(profile).share_of_limits(chirp.reference_rad)
+    except UserError:  # an unstable loop or an unknown value, which have rows of their own
+        return
+    beyond = not percent <= 100
+    yield Row(
+        "session",
+        "chirp without options",
+        f"predicted peaks reach {percent:.0f} % of a limit",
+        "at most 100 %",
+        grade(fail=False, warn=beyond),
+        "Session: rigd run chirp is refused with its default amplitude; it names the limit and the "
+        "largest amplitude (--amplitude)."
+        if beyond
+        else "",
+    )

@@ -26,7 +26,10 @@ from rigd.devices import (
 from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
 from rigd.engine import RealClock
 from rigd.profile import Profile
+from rigd.safety import MEASURED
 
+_SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
+"""What a drive need not state of its position, and the objects."""
 _IN_HEX = ("vendor_id", "product_code", "supported_modes")
 
 
@@ -69,6 +72,8 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
         "supported_modes": "0x200 (cyclic torque) among them",
     }
     if settings is not None:
+        wanted["gear_ratio"] = f"{settings.gear_ratio:.5g}"
+        wanted["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
         wanted["vendor_id"] = f"{settings.vendor_id:#x}" if settings.vendor_id else "any"
         wanted["product_code"] = f"{settings.product_code:#x}" if settings.product_code else "any"
     for key, value in drive.identity().items():
@@ -76,7 +81,11 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
             found = f"{value:#x}"
         else:
             found = "not stated by the drive" if value in (None, "") else value_of(key, value)
-        yield Row("drive", name_of(key), found, wanted.get(key, ""), Verdict.OK)
+        verdict = Verdict.OK
+        if key in _SCALES and value is None:
+            found = f"unknown: the drive does not state it (object {_SCALES[key]})"
+            verdict = Verdict.SKIPPED
+        yield Row("drive", name_of(key), found, wanted.get(key, ""), verdict)
     outfit = drive.outfit() if isinstance(drive, OutfittedDrive) else None
     if outfit is not None:
         yield from _safeguard_rows(outfit)
@@ -317,6 +326,29 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row
     return Row(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
 
 
+# Probing move
+
+
+def probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
+    """Say whether scales and signs are known, or verified before the first session."""
+    if moves is WhatMoves.SIMULATED:
+        return
+    missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
+    if not missing:
+        found, verdict = "motor and encoder are measured", Verdict.OK
+    else:
+        found = "scales and signs: verified by the probing move before the first session"
+        verdict = Verdict.SKIPPED
+    detail = (
+        f"Probing move: sessions begin with it because {', '.join(missing)} "
+        f"{'is' if len(missing) == 1 else 'are'} not measured; rigd probe makes it by itself "
+        "(docs/safety.md)."
+        if missing
+        else ""
+    )
+    yield Row("drive", "probing move", found, "", verdict, detail)
+
+
 # All devices
 
 
@@ -347,6 +379,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
         yield Row("drive", "connection", _answer(moves), "an answer, no fault", Verdict.OK)
         if isinstance(drive, InspectableDrive):
             yield from drive_rows(drive, rig)
+        yield from probing_rows(profile, moves)
 
     def about_sensor() -> Iterator[Row]:
         sensor.connect()

@@ -29,21 +29,26 @@ friction alone.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from inspect import signature
-from math import degrees, inf, isinf, log10, radians
+from math import degrees, inf, isfinite, isinf, log1p, log10, radians
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rigd.beam import RealisationError
 from rigd.checks._rows import Row, Verdict, grade
-from rigd.control import ControlDesignError, Margins, check_stability, close_loop, loop_margins
-from rigd.devices import AtiSerial, EdsError, RigParameters, read_eds
-from rigd.devices.ati import RECORD_BITS
-from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
-from rigd.devices.cia402 import Grade, judge
+from rigd.control import ControlDesignError, stable_loop
+from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values
 from rigd.excitation import chirp
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S, Limits
 from rigd.session import MAX_SAMPLES
+
+# Modules of devices that a rig does not have are not loaded: these checks precede every session.
+if TYPE_CHECKING:
+    from rigd.control import Margins
+    from rigd.devices import AtiSerial, Motor
+    from rigd.devices.canbus import BusLoad
 
 # Closed loop
 
@@ -54,33 +59,45 @@ LEAST_PHASE_RAD = radians(20.0)
 LEAST_DELAY_PERIODS = 1.0
 
 
-def loop_rows(profile: Profile) -> Iterator[Row]:
-    """Judge the loop of a profile's rig."""
+STABILITY = "loop_stability"
+
+
+def stability_rows(profile: Profile) -> Iterator[Row]:
+    """Judge whether the loop of a profile's rig is stable."""
     try:
-        loop = close_loop(profile.loop_model())
-        warning = check_stability(loop)
+        loop, warning = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
-        yield Row("loop", "stability", str(error), "stable", Verdict.FAIL)
-        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
+        yield Row("loop", "stability", str(error), "stable", Verdict.FAIL, name=STABILITY)
         return
-    if warning is not None:
-        yield Row("loop", "stability", warning, "stable", Verdict.WARNING)
-        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
-        return
+    found = f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s"
     yield Row(
         "loop",
         "stability",
-        f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s",
+        warning or found,
         "stable",
-        Verdict.OK,
+        grade(fail=False, warn=warning is not None),
+        name=STABILITY,
     )
+
+
+def margin_rows(profile: Profile) -> Iterator[Row]:
+    """Judge the margins of a stable loop."""
+    from rigd.control import loop_margins
+
+    try:
+        loop, warning = stable_loop(profile.loop_model())
+    except (ControlDesignError, RealisationError) as error:
+        warning = str(error)
+    if warning is not None:
+        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
+        return
     period_s = 1.0 / profile.rig.rate_hz
     for margins in loop_margins(loop):
         least_gain = LEAST_ANGLE_GAIN if margins.cut == "angle reading" else TOLERANCE
         yield from _margin_rows(margins, least_gain, LEAST_DELAY_PERIODS * period_s)
 
 
-def _margin_rows(margins: Margins, least_gain: float, least_delay_s: float) -> Iterator[Row]:
+def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) -> Iterator[Row]:
     group = f"loop, {margins.cut}"
     too_strong = "any" if margins.gain_up == inf else _at(_db(margins.gain_up), margins.gain_up_hz)
     too_weak = (
@@ -130,8 +147,14 @@ def _at(value: str, frequency_hz: float) -> str:
 
 _STEP_S = 5e-5
 _FOR_EVER_RAD = 100.0
+_NO_VISCOUS = 1e-6
+"""Viscous over Coulomb friction below which only the latter counts."""
 _GROUP = "travel"
 _LOOP_FAILS = "if the loop fails"
+TRAVEL_LOOP_FAILS = "travel_loop_fails"
+TRAVEL_ENCODER_FAILS = "travel_encoder_fails"
+TRAVEL_NO_ANGLE = "travel_no_angle"
+TRAVEL_MISSED_TICKS = "travel_missed_ticks"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +172,7 @@ class Travel:
         return self.driven_rad + self.coasting_rad
 
 
+@lru_cache(maxsize=64)
 def worst_travel(
     rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
 ) -> Travel:
@@ -188,20 +212,27 @@ def worst_travel(
             break
     if driven_rad > _FOR_EVER_RAD:
         return Travel(inf, inf)
-    coasting_rad = 0.0
-    while speed_rad_s > 0.0:
-        slower_rad_s = speed_rad_s - _friction_nm(rig, speed_rad_s) / heavy_kg_m2 * _STEP_S
-        coasting_rad += 0.5 * (speed_rad_s + max(0.0, slower_rad_s)) * _STEP_S
-        if coasting_rad > _FOR_EVER_RAD or slower_rad_s == speed_rad_s:
-            return Travel(driven_rad, inf)
-        speed_rad_s = slower_rad_s
-    return Travel(driven_rad, coasting_rad)
+    coasting_rad = _coasting_rad(heavy_kg_m2, motor, speed_rad_s)
+    return Travel(driven_rad, coasting_rad if coasting_rad <= _FOR_EVER_RAD else inf)
+
+
+def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
+    """Return the angle in which friction alone stops an inertia; infinite without friction."""
+    viscous, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
+    ratio = viscous * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
+    if ratio < _NO_VISCOUS:
+        return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
+    if viscous == 0.0:
+        return inf if speed_rad_s > 0.0 else 0.0
+    braked = log1p(ratio) / ratio if isfinite(ratio) else 0.0
+    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - braked)
 
 
 @dataclass(frozen=True, slots=True)
 class _Blindness:
     """One way in which the torque stays on while nothing controls the shaft."""
 
+    name: str
     what: str
     duration_s: float
     ended_by: str
@@ -217,6 +248,7 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
     watchdog = "cia402.own_watchdog_s" if own else "cia402.heartbeat_timeout_s"
     return (
         _Blindness(
+            TRAVEL_LOOP_FAILS,
             _LOOP_FAILS,
             drive.watchdog_s,
             f"of the drive's watchdog ({watchdog})",
@@ -224,18 +256,21 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
         ),
         # The tick that finds one too many switches off, and its command has its own delay.
         _Blindness(
+            TRAVEL_NO_ANGLE,
             "if no angle comes",
             (stale + 1) / rig.rate_hz + rig.actuation.delay_s,
             f"of {stale} old angles (limits.stale_ticks_in_a_row)",
             "limits.stale_ticks_in_a_row",
         ),
         _Blindness(
+            TRAVEL_ENCODER_FAILS,
             "if the encoder fails",
             ENCODER_FAILURE_S + 2 / rig.rate_hz + rig.actuation.delay_s,
             "of the encoder watch",
             "limits.standstill_torque_nm",
         ),
         _Blindness(
+            TRAVEL_MISSED_TICKS,
             "if ticks are missed",
             (missed + 1) / rig.rate_hz + rig.actuation.delay_s,
             f"of {missed} missed ticks (limits.missed_ticks_in_a_row)",
@@ -249,7 +284,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     if drive is None:
         why = "the drive is part of this program and ends with it"
-        yield Row(_GROUP, _LOOP_FAILS, why, "", Verdict.SKIPPED)
+        yield Row(_GROUP, _LOOP_FAILS, why, "", Verdict.SKIPPED, name=TRAVEL_LOOP_FAILS)
         return
     ways = _ways(profile)
     margin_rad = limits.stop_angle_rad - limits.angle_rad
@@ -265,6 +300,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
             Verdict.WARNING,
             f"Travel {_LOOP_FAILS}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
+            TRAVEL_LOOP_FAILS,
         )
     limited = drive.max_speed_rad_s > 0
     most_rad_s = drive.max_speed_rad_s if limited else inf
@@ -298,6 +334,7 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
             bound,
             grade(fail=too_far),
             detail.strip(),
+            way.name,
         )
 
 
@@ -311,14 +348,7 @@ def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
 
 # EDS file
 
-_VERDICTS = {
-    Grade.FITS: Verdict.OK,
-    Grade.STANDS_IN: Verdict.OK,
-    Grade.ASK: Verdict.SKIPPED,
-    Grade.ACCEPTED: Verdict.WARNING,
-    Grade.DOUBT: Verdict.WARNING,
-    Grade.REFUSED: Verdict.FAIL,
-}
+EDS = "eds"
 
 
 def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
@@ -331,22 +361,41 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
     rig
         Parameters of the profile that the drive is to serve, or None.
     """
+    from rigd.devices import EdsError, read_eds
+    from rigd.devices.cia402 import Grade, judge
+
+    verdicts = {
+        Grade.FITS: Verdict.OK,
+        Grade.STANDS_IN: Verdict.OK,
+        Grade.ASK: Verdict.SKIPPED,
+        Grade.ACCEPTED: Verdict.WARNING,
+        Grade.DOUBT: Verdict.WARNING,
+        Grade.REFUSED: Verdict.FAIL,
+    }
     try:
         node_id = rig.cia402.node_id if rig is not None and rig.cia402 is not None else 1
         eds = read_eds(path, node_id)
     except EdsError as error:
-        yield Row("EDS", "file", str(error), "", Verdict.FAIL)
+        yield Row("EDS", "file", str(error), "", Verdict.FAIL, name=EDS)
         return
-    yield Row("EDS", "file", str(path), "", Verdict.OK)
+    yield Row("EDS", "file", str(path), "", Verdict.OK, name=EDS)
     for finding in judge(eds, rig).findings:
         yield Row(
             "EDS",
             finding.what,
             finding.found,
             finding.wanted,
-            _VERDICTS[finding.grade],
+            verdicts[finding.grade],
             finding.sentence,
+            EDS,
         )
+
+
+def drive_file_rows(profile: Profile) -> Iterator[Row]:
+    """Compare the EDS file that a profile names with what is required of a drive."""
+    settings = profile.rig.cia402
+    if settings is not None and settings.eds:
+        yield from eds_rows(Path(settings.eds), profile.rig)
 
 
 # Profile and wiring
@@ -369,13 +418,13 @@ def profile_rows(profile: Profile) -> Iterator[Row]:
     )
 
 
-def record_row(profile: Profile) -> Row:
+def record_rows(profile: Profile) -> Iterator[Row]:
     """Return how long a record may be, and whether a chirp as it is by default fits into it."""
     options = signature(chirp).parameters
     limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
     usual_s = sum(float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s"))
     longest_s = MAX_SAMPLES / profile.rig.rate_hz
-    return Row(
+    yield Row(
         "profile",
         "longest record",
         f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
@@ -385,20 +434,41 @@ def record_row(profile: Profile) -> Row:
     )
 
 
+UNKNOWN_VALUES = "unknown_values"
+
+
+def unknown_rows(profile: Profile) -> Iterator[Row]:
+    """Name the values without which no session can be computed."""
+    for key in unknown_values(profile.rig):
+        remedy = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
+        yield Row("profile", key, "unknown", "a value", Verdict.FAIL, remedy, UNKNOWN_VALUES)
+
+
+CAN_IDENTIFIERS, CAN_LOAD, SERIAL_LOAD = "can_identifiers", "can_load", "serial_load"
+
+
 def wiring_rows(rig: RigParameters) -> Iterator[Row]:
     """Judge identifiers and load of what the profile connects."""
     if rig.can is not None:
+        from rigd.devices.canbus import bus_load, check_identifiers
+
         collisions = check_identifiers(rig)
         for collision in collisions:
-            yield Row("CAN bus", "identifiers", collision, "no collision", Verdict.FAIL)
+            yield _identifier_row(collision, Verdict.FAIL)
         if not collisions:
-            yield Row("CAN bus", "identifiers", "no collision", "no collision", Verdict.OK)
+            yield _identifier_row("no collision", Verdict.OK)
         yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
     if rig.ati_serial is not None:
         yield _line_row(rig.ati_serial)
 
 
-def _bus_row(load: BusLoad, bitrate_bit_s: int) -> Row:
+def _identifier_row(found: str, verdict: Verdict) -> Row:
+    return Row("CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS)
+
+
+def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> Row:
+    from rigd.devices.canbus import MAX_LOAD
+
     frames = ", ".join(
         f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in load.traffic
     )
@@ -409,10 +479,14 @@ def _bus_row(load: BusLoad, bitrate_bit_s: int) -> Row:
         f"at most {100 * MAX_LOAD:.0f} %",
         grade(fail=load.worst > MAX_LOAD, warn=load.worst > HIGH_LOAD),
         f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames}.",
+        CAN_LOAD,
     )
 
 
-def _line_row(serial: AtiSerial) -> Row:
+def _line_row(serial: "AtiSerial") -> Row:
+    from rigd.devices.ati import RECORD_BITS
+    from rigd.devices.canbus import MAX_LOAD
+
     load = RECORD_BITS * serial.stream_hz / serial.baud
     return Row(
         "serial line",
@@ -420,4 +494,5 @@ def _line_row(serial: AtiSerial) -> Row:
         f"{100 * load:.1f} % of {serial.baud} bit/s",
         f"at most {100 * MAX_LOAD:.0f} %",
         grade(fail=load > MAX_LOAD),
+        name=SERIAL_LOAD,
     )

@@ -5,11 +5,6 @@ from dataclasses import dataclass
 from enum import Enum
 from math import isfinite
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
 from rigd.units import UNITS, suffix_of
 
 # Values and their units
@@ -83,6 +78,9 @@ class Row:
     """Whether it will do."""
     detail: str = ""
     """Text that is too long for a table."""
+    name: str = ""
+    """Short name by which a session can accept a failure (`--accept`), of a check that needs no
+    device; else empty."""
 
     def as_dict(self) -> dict[str, str]:
         """Return the row for a JSON document."""
@@ -93,6 +91,7 @@ class Row:
             "wanted": self.wanted,
             "verdict": self.verdict.value,
             "detail": self.detail,
+            "name": self.name,
         }
 
 
@@ -144,12 +143,18 @@ def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG)
     consequences
         Verdict → what follows, said under the table.
     """
+    from rich.box import SIMPLE_HEAD  # late: a session prints no table
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), expand=False)
     table.add_column("what", ratio=5, overflow="fold")
     table.add_column("found", ratio=9, overflow="fold")
     table.add_column("wanted", ratio=5, overflow="fold")
     table.add_column("", no_wrap=True, width=7)
     group = ""
+    named: set[str] = set()
     for row in rows:
         if row.group != group:
             group = row.group
@@ -157,8 +162,10 @@ def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG)
                 table.add_row()
             table.add_row(Text(group, style="bold"))
         style = _STYLES[row.verdict]
+        new = {row.name} - named - {""}
+        named |= new
         table.add_row(
-            Text(f"  {row.what}"),
+            Text(f"  {row.what}").append("".join(f"\n  {name}" for name in new), style="dim"),
             Text(row.found),
             Text(row.wanted),
             Text(row.verdict.value, style=style),

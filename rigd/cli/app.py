@@ -13,9 +13,11 @@ from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import errors_told
+from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
+from rigd.printable import readable_errors
 
 
 def _tell(asked: bool) -> None:
@@ -37,7 +39,7 @@ _SECTIONS: Final = {
     "Sessions": ("run", "serve", "start", "status", "stop"),
     "Rig": ("check", "tare", "zero", "reset", "live"),
     "Session files": ("list", "info", "replay", "recover"),
-    "Set-up": ("profiles", "specimens", "identify", "bench"),
+    "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
 """Commands by what they are for, as the help lists them."""
@@ -60,9 +62,14 @@ class RigdGroup(TyperGroup):
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
+    def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
+        """Parse what stands before the command."""
+        with readable_errors():
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
-        with errors_told():
+        with readable_errors(), errors_told():
             return super().invoke(ctx)
 
 
@@ -92,6 +99,7 @@ app.command()(specimens)
 app.command()(info)
 app.command()(replay)
 app.command()(recover)
+app.command()(probe)
 app.add_typer(identify_app, name="identify")
 app.add_typer(profiles_app, name="profiles")
 app.command()(bench)

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 
+from rigd.printable import readable_message
 from rigd.runtime import raise_on
 
 EXIT_FAILED = 1
@@ -28,7 +29,7 @@ def run_command(command: Callable[[], object]) -> None:
         sys.exit(EXIT_INTERRUPTED)
     except OSError as error:
         with contextlib.suppress(OSError):  # standard error may be closed as well
-            sys.stderr.write(f"Error: {_explained(error)}\n")
+            sys.stderr.write(f"Error: {readable_message(_explained(error))}\n")
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)

@@ -163,6 +163,7 @@ def _run_sessions(
             quiet_stdout=quiet_stdout,
             hardware=hardware,
             prepare=prepare,
+            identifies_motor=True,
         )
         if stop.requested and not any(result.fault for result in results):
             raise typer.Exit(EXIT_INTERRUPTED)

@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
-from rigd.printable import printable
+from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_WRONG_USE,
+    SESSIONS,
+    AsJson,
+    complain,
+    fail,
+    progress,
+)
+from rigd.printable import printable, readable_message
 from rigd.units import with_half_width
 
 if TYPE_CHECKING:
@@ -112,7 +120,7 @@ def specimens() -> None:
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
                 f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
             )
-        typer.echo(printable(f"{name}: {told}"))
+        typer.echo(readable_message(f"{name}: {told}"))
 
 
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
@@ -147,7 +155,10 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
     if not rows:
         yield "No sessions."
         return
-    heads = ("date", "file", "specimen", "operator", "excitation", "outcome", "modes", "report")
+    heads = (
+        *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
+        *("tip slope", "report"),
+    )
     yield from _table(
         heads,
         [
@@ -159,6 +170,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
                     for text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode, row.modes)),
+                _validity(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
@@ -175,6 +187,12 @@ def _mode(mode: dict[str, Any]) -> str:
     return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flagged}"
 
 
+def _validity(row: "SessionRow") -> str:
+    from rigd.session import Validity
+
+    return Validity.of_document(row.validity).short if row.modes else ""
+
+
 # Trend
 
 
@@ -187,7 +205,10 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
             yield ""
         low, high = _ends(trend)
         yield from _table(
-            (f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", "", "file"),
+            (
+                *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
+                *("tip slope", "file"),
+            ),
             [
                 (
                     _local(point.row),
@@ -196,6 +217,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
                     _uncertain(point.damping_ratio, 100),
                     _relative(point.damping_change, trend.points[0].damping_ratio["value"]),
                     _interval(point, low, high),
+                    _validity(point.row),
                     printable(point.row.path.name),
                 )
                 for point in trend.points
@@ -204,7 +226,8 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "significant (3 standard deviations), ? is flagged in its report or quick look."
+        "significant (3 standard deviations), ? is flagged in its report or quick look. Tip slope: "
+        "the largest, and the error of the linear model at it."
     )
 
 
@@ -267,7 +290,7 @@ def info(
             found = describe(path)
         except SessionError as error:
             failed = True
-            typer.echo(f"Error: {error}", err=True)
+            complain(str(error))
             documents.append({"path": str(path), "error": str(error)})
         else:
             documents.append(found.as_dict())
@@ -306,7 +329,7 @@ def recover(
                 recovery = recover_file(path, on_progress)
         except SessionError as error:
             failed = True
-            typer.echo(f"Error: {error}", err=True)
+            complain(str(error))
             documents.append({"source": str(path), "path": None, "error": str(error)})
         else:
             documents.append(recovery.as_dict())

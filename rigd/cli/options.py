@@ -10,7 +10,7 @@ import typer
 
 from rigd.cli import entry
 from rigd.errors import RigdError
-from rigd.printable import progress_bar
+from rigd.printable import progress_bar, readable_message
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -22,8 +22,13 @@ EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 def fail(message: str, code: int) -> NoReturn:
     """Tell what is wrong on standard error and leave with an exit code."""
-    typer.echo(f"Error: {message}", err=True)
+    complain(message)
     raise typer.Exit(code)
+
+
+def complain(message: str) -> None:
+    """Write an error to standard error."""
+    typer.echo(f"Error: {readable_message(message)}", err=True)
 
 
 @contextlib.contextmanager
@@ -124,6 +129,24 @@ Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
 ]
 
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept",
+        metavar="ROW",
+        help="Run although this row of rigd check fails, for this start only; recorded in the "
+        "file; repeat for each row.",
+    ),
+]
+
+TipSlope = Annotated[
+    float | None,
+    typer.Option(
+        "--tip-slope",
+        help="Largest predicted slope of the antenna's tip (rad; default: limits.tip_slope_rad of "
+        "the profile). Beyond 0.14 the linear model is not exact.",
+    ),
+]
 
 NoLook = Annotated[
     bool,

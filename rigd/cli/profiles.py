@@ -128,9 +128,10 @@ def new(
     """Write a profile for a drive from its EDS file and from answers.
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
-    motor are asked for on the terminal; Enter keeps the value shown, which stays "assumed". What
-    the drive lacks needs your confirmation. Without a terminal nothing is asked or accepted, and
-    what has to be filled in is listed. No file is ever overwritten.
+    motor are asked for on the terminal; Enter keeps what is shown. Torques, inertia, gear ratio and
+    encoder step that are not given stay "unknown", and rigd moves nothing before they are filled
+    in. What the drive lacks needs your confirmation. Without a terminal nothing is asked or
+    accepted, and what has to be filled in is listed. No file is ever overwritten.
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
@@ -148,7 +149,7 @@ def new(
     if missing or lacks:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for question in missing:
-        typer.echo(f"  {question.key} = {draft.value(question.key)}: {question.text}", err=True)
+        typer.echo(f"  {question.key} = {draft.shown(question.key)}: {question.text}", err=True)
     if lacks:
         typer.echo(
             f"  cia402.accept_without: {', '.join(lacks)}: what the drive lacks; rigd refuses it "
@@ -167,7 +168,7 @@ def _asked(draft: "Draft") -> str:
     """Ask for what no file tells, until the answers make a profile; returns its text."""
     from rigd.profile import ProfileError
 
-    typer.echo("From data sheets; Enter keeps the value in brackets, as assumed.", err=True)
+    typer.echo("From data sheets; Enter keeps what is in brackets: assumed, or unknown.", err=True)
     try:
         while True:
             for question in draft.questions():
@@ -200,7 +201,7 @@ def _ask_for_acceptance(draft: "Draft") -> None:
 def _ask(draft: "Draft", key: str, text: str) -> None:
     """Ask until the answer is one that the key takes."""
     while True:
-        given = typer.prompt(text, default=str(draft.value(key)), err=True)
+        given = typer.prompt(text, default=draft.shown(key), err=True)
         try:
             draft.answer(key, given.strip())
             return

@@ -17,6 +17,7 @@ from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
     SESSIONS,
+    Accept,
     AsJson,
     Fast,
     Force,
@@ -31,6 +32,7 @@ from rigd.cli.options import (
     Repeat,
     Seed,
     Specimen,
+    TipSlope,
     WatchFit,
     fail,
     session_notes,
@@ -124,6 +126,8 @@ def run_sessions(
     fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
+    accept: Accept = None,
+    tip_slope_rad: TipSlope = None,
     hardware: Hardware = False,
     obstacle: Obstacles = None,
     no_look: NoLook = False,
@@ -150,6 +154,8 @@ def run_sessions(
             fast=fast,
             live=live,
             force=force,
+            accept=accept or (),
+            tip_slope_rad=tip_slope_rad,
             quiet_stdout=as_json,
             hardware=hardware,
             look=not no_look,
@@ -290,7 +296,8 @@ def modes(
 ) -> "dict[str, Value]":
     """Sweep narrow bands around the modes of an analysis.
 
-    The damping parameters are more precise than from a broad sweep of the same length.
+    The damping parameters are more precise than from a broad sweep of the same length and tip
+    slope.
 
     Example: rigd run modes fits.json --repeat 5
     """
@@ -385,13 +392,6 @@ def until(
         str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.01.")
     ] = None,
     at_most_s: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
-    tip_slope_rad: Annotated[
-        float,
-        typer.Option(
-            "--tip-slope",
-            help="Largest slope of the free end; beyond 0.14 the linear model is not exact (rad).",
-        ),
-    ] = 0.14,
     amplitude_rad: Annotated[
         float,
         typer.Option(
@@ -421,7 +421,6 @@ def until(
     return {
         "targets": "; ".join(f"{name} {text}" for name, text in asked if text is not None),
         "at_most_s": at_most_s,
-        "tip_slope_rad": tip_slope_rad,
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
         "stop_hz": stop_hz,

@@ -97,6 +97,7 @@ def inject(
     no_bit_12[,for=0.5]                       statusword bit 12 (follows command) stays 0
     no_pre_operational[,for=0.5]              the drive ignores NMT pre-operational
     no_watch[,for=0.5]                        the drive's watchdog does not act
+    object,index=0x608F,sub=1[,value=450000]  the drive states another value, or lacks the object
     obstacle,x=0.6,angle=0.3[,stiffness=3000][,damping=0][,side=1][,rate=0][,for=1]
                                               an obstacle is in the beam's way (m, rad, N/m)
     knock,x=0.5,force=2,duration=0.02         the beam is knocked (m, N, s)

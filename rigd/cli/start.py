@@ -18,6 +18,7 @@ from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
     EXIT_WRONG_USE,
+    Accept,
     AsJson,
     Force,
     Meta,
@@ -25,7 +26,9 @@ from rigd.cli.options import (
     Operator,
     Repeat,
     Specimen,
+    TipSlope,
     WatchFit,
+    complain,
     fail,
     session_notes,
 )
@@ -93,6 +96,8 @@ def start_sessions(
     note: Note = "",
     meta: Meta = None,
     force: Force = False,
+    accept: Accept = None,
+    tip_slope_rad: TipSlope = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
     ] = False,
@@ -108,7 +113,7 @@ def start_sessions(
             notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
         else:
             notes[key] = text
-    for name, value in parameters.items():
+    for name, value in {**parameters, "tip_slope_rad": tip_slope_rad}.items():
         if isinstance(value, float) and not isfinite(value):
             fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
     request = {
@@ -123,6 +128,10 @@ def start_sessions(
     }
     if watch_fit:  # an older daemon does not know the member
         request["watch_fit"] = True
+    if accept:  # likewise
+        request["accept"] = accept
+    if tip_slope_rad is not None:  # likewise
+        request["tip_slope_rad"] = tip_slope_rad
     with daemon_of(profile) as client:
         daemon = client.ask("status")["daemon"]
         typer.echo(daemon["what_moves"], err=True)
@@ -152,7 +161,7 @@ def start_sessions(
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
-        typer.echo(f"Error: {series['reason']}", err=True)
+        complain(series["reason"])
         raise typer.Exit(EXIT_FAILED)
     if series["stopped"]:
         raise typer.Exit(EXIT_INTERRUPTED)

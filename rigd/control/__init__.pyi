@@ -3,6 +3,7 @@ from ._closed_loop import LoopModel as LoopModel
 from ._closed_loop import LoopResponse as LoopResponse
 from ._closed_loop import check_stability as check_stability
 from ._closed_loop import close_loop as close_loop
+from ._closed_loop import stable_loop as stable_loop
 from ._damper import DamperSettings as DamperSettings
 from ._damper import VibrationDamper as VibrationDamper
 from ._damper import damped_poles as damped_poles

@@ -7,6 +7,7 @@ at the very moment a new torque takes effect sees the old one.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import exp, floor, pi
 
 import numpy as np
@@ -216,10 +217,14 @@ class ClosedLoop:
                 out = rows[row].reshape(blocks, _BLOCK)[first : first + len(part)]
                 np.matmul(part, forced[row], out=out)
                 out += states @ free[row]
+        del padded
         angle, velocity, torque, speed, coupling = rows[:, :n]
         settings = self.model.settings
-        speed = speed / settings.friction_velocity_rad_s
-        torque = torque + settings.friction_compensation_nm * np.tanh(speed)
+        # In place: an hour of record takes 30 MB a channel.
+        speed /= settings.friction_velocity_rad_s
+        np.tanh(speed, out=speed)
+        speed *= settings.friction_compensation_nm
+        torque += speed
         return LoopResponse(angle, velocity, torque, coupling)
 
     def response(self, frequency_hz: Real) -> Complex:
@@ -420,6 +425,40 @@ def check_stability(loop: ClosedLoop) -> str | None:
         f"{finding}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
         "damping does that, so keep sessions short."
     )
+
+
+def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
+    """Close the loop of a rig, and refuse an unstable one.
+
+    The result for the last few models is stored: what checks a rig and what plans a session need
+    the same one.
+
+    Parameters
+    ----------
+    model
+        From :meth:`rigd.profile.Profile.loop_model`.
+
+    Returns
+    -------
+    loop : ClosedLoop
+        The loop.
+    warning : str or None
+        As `check_stability` returns it.
+
+    Raises
+    ------
+    ControlDesignError
+        As `close_loop` and `check_stability`.
+    RealisationError
+        If the beam's damping cannot be realised.
+    """
+    return _stable_loop(model)
+
+
+@lru_cache(maxsize=4)
+def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
+    loop = close_loop(model)
+    return loop, check_stability(loop)
 
 
 def _remedy(settings: ControlSettings) -> str:

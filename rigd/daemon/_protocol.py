@@ -23,7 +23,9 @@ _LONGEST_TEXT = 1000
 _SHOWN = 60
 
 _LONGEST_ID = 64
+_MOST_ROWS = 32
 Note = Annotated[str, Field(max_length=1000)]
+RowName = Annotated[str, Field(max_length=_LONGEST_ID)]
 Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
@@ -134,6 +136,8 @@ class SessionRequest(Request):
     notes: Notes = Notes()
     force: bool = False
     watch_fit: bool = False
+    accept: list[RowName] = Field(default=[], max_length=_MOST_ROWS)
+    tip_slope_rad: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
 
 class Start(SessionRequest):
@@ -226,6 +230,14 @@ def _checked(request: SomeSession) -> SomeSession:
         request.notes.as_metadata()
     except MetadataError as error:
         raise RequestError(f"notes.meta: {error}") from None
+    update: dict[str, Any] = {}
+    given_parameters = dict(request.parameters)
+    # Older clients have it among the parameters of `until`.
+    if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
+        slope_rad = _number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
+        if slope_rad <= 0.0:
+            raise RequestError(f"tip_slope_rad = {slope_rad:g} rad must be more than 0 rad.")
+        update["tip_slope_rad"] = slope_rad
     function = KINDS[request.excitation]
     known = {
         name: parameter
@@ -233,7 +245,7 @@ def _checked(request: SomeSession) -> SomeSession:
         if name not in FROM_THE_RIG
     }
     values: dict[str, Value] = {}
-    for name, given in request.parameters.items():
+    for name, given in given_parameters.items():
         if name not in known:
             raise RequestError(
                 f"parameters: {_shown(name)} is not a parameter of {request.excitation}; there are "
@@ -243,7 +255,7 @@ def _checked(request: SomeSession) -> SomeSession:
     for name, parameter in known.items():
         if parameter.default is inspect.Parameter.empty and name not in values:
             raise RequestError(f"parameters.{name} is missing.")
-    return request.model_copy(update={"parameters": values})
+    return request.model_copy(update={**update, "parameters": values})
 
 
 def _value(name: str, given: object, wanted: object) -> Value:

@@ -116,6 +116,9 @@ class SeriesTeller:
         self._series.session, self._series.path = number, path
         self._series.fit = None
 
+    def says(self, level: str, text: str) -> None:
+        self._tell(level, text, notable=True)
+
     def shown(self, where: str) -> None:
         self._tell("info", where)
 

@@ -10,11 +10,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import asdict
 from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TypeVar
 
+from rigd.checks import check_on_paper
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import NAME
@@ -35,10 +37,10 @@ from rigd.daemon._states import (
     transition_document,
 )
 from rigd.devices import WhatMoves, what_moves
-from rigd.errors import RigdError, UserError
-from rigd.profile import Profile, with_specimen
+from rigd.errors import UserError
+from rigd.profile import Profile
 from rigd.runner import (
-    NoRoomError,
+    ProbeFailedError,
     QuickLook,
     QuickLooks,
     Rig,
@@ -46,7 +48,6 @@ from rigd.runner import (
     RigStatus,
     Series,
     SessionFailedError,
-    excitation_for,
     what_is_kept,
 )
 
@@ -115,6 +116,7 @@ class Service:
         self._publish = publish
         self._moving = moving
         self._began_moving = moving()
+        self._failed_checks = [asdict(each) for each in check_on_paper(profile).failed]
         self._fast = fast
         self._live = live
         self._states = StateMachine(self._tell_transition)
@@ -272,6 +274,7 @@ class Service:
                 web=self._page,
                 calibration=self._rig.calibration,
                 quick_looks=self._looks is not None,
+                failed_checks=self._failed_checks,
                 began_utc_ns=self._began_utc_ns,
             ),
             "state": self.state.value,
@@ -366,6 +369,8 @@ class Service:
             request.force,
             request.notes.specimen,
             self._start_rad(),
+            tuple(request.accept),
+            request.tip_slope_rad,
         )
         self._predictions += 1
         try:
@@ -403,7 +408,8 @@ class Service:
         series = self._series = ServedSeries(self._count, request, running=True)
         self._doing = "planning"
         try:
-            planned = await self._call(partial(self._plan, request))
+            job = background.PlanJob(self._profile, request, self._folder, self._start_rad())
+            planned = await (background.perform(job) if job.is_heavy else self._call(job.perform))
             if series.stop.requested or self._closing:
                 raise CommandError("It was stopped before it began.")
             refusal = self._states.refusal("start")
@@ -493,34 +499,13 @@ class Service:
         status = self._rig.status()
         return 0.0 if status is None else status.angle_rad
 
-    def _plan(self, request: protocol.Start) -> Series:
-        """Make the excitation and check that it may be run; in the second thread."""
-        notes = request.notes.as_metadata()
-        try:
-            profile = with_specimen(self._profile, notes.get("specimen", ""))
-            return Series(
-                profile,
-                excitation_for(profile, request.excitation, request.parameters, self._start_rad()),
-                self._folder,
-                repeat=request.repeat,
-                notes=notes,
-                force=request.force,
-                watch_fit=request.watch_fit,
-            )
-        except NoRoomError as error:  # the same request may succeed later
-            raise CommandError(str(error)) from error
-        except RigdError as error:
-            raise CommandError(str(error), wrong_use=error.wrong_use) from error
-        except MemoryError:
-            raise CommandError("There is not enough memory to plan such a session.") from None
-
     async def _follow(self, series: ServedSeries, planned: Series) -> None:
         """Run a series to its end, whatever that is."""
         fault = ""
         loop = asyncio.get_running_loop()
         try:
             await self._call(partial(self._run_series, series, planned, loop))
-        except (UserError, RigError, SessionFailedError) as error:
+        except (UserError, RigError, ProbeFailedError, SessionFailedError) as error:
             series.reason = str(error)
             if not error.wrong_use:
                 path = error.path if isinstance(error, SessionFailedError) else None

@@ -288,7 +288,7 @@ def _state(process: ProcessStatus, phase: Phase) -> str:
 
 _OF_A_FIT = (
     *("tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings"),
-    *("type", "modes", "parameters", "search", "text"),
+    *("type", "validity", "modes", "parameters", "search", "text"),
 )
 """Members of a fit that clients are told; those for computing, such as its covariance, are long."""
 _MOST_ITEMS, _LONGEST_TEXT = 16, 400
@@ -356,6 +356,7 @@ def daemon_document(
     web: str | None,
     calibration: Mapping[str, Any] | None,
     quick_looks: bool,
+    failed_checks: list[Document],
     began_utc_ns: int,
 ) -> Document:
     """Tell which daemon this is."""
@@ -379,6 +380,7 @@ def daemon_document(
             "age": str(calibration.get("calibration_date", "")),
         },
         "quick_looks": quick_looks,
+        "failed_checks": failed_checks,
         "since_utc_ns": began_utc_ns,
     }
 

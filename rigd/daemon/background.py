@@ -1,8 +1,8 @@
-"""Background jobs of the daemon: predictions and checks, each in its own process.
+"""Background jobs of the daemon: predictions, checks and heavy plans, each in its own process.
 
-They take processor time, and any client may ask for a prediction while a session runs. In the
-daemon's own process they would block the interpreter that supervises the session; theirs has the
-lowest priority of an ordinary program, and a part of the free memory.
+They take processor time and memory, and any client may ask for a prediction while a session runs.
+In the daemon's own process they would block the interpreter that supervises the session; theirs has
+the lowest priority of an ordinary program, and a part of the free memory.
 """
 
 import asyncio
@@ -15,26 +15,54 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from rigd.daemon._protocol import CommandError
+from rigd.checks import check_on_paper
+from rigd.daemon._protocol import CommandError, Start
 from rigd.errors import RigdError
 from rigd.excitation import Value
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
+from rigd.runner import (
+    NoRoomError,
+    Series,
+    excitation_for,
+    largest_amplitude,
+    plan_document,
+    predict_session,
+    with_tip_slope,
+)
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
 
-_PATIENCE_S: Final = 60.0
+_PATIENCE_S: Final = 50.0
+"""Shorter than that of a client, which could not say what has become of its request."""
 _MOST_BYTES: Final = 4 << 30
 _LEAST_BYTES: Final = 256 << 20
 """A session of two minutes takes 180 MiB, of which 120 MiB are the program."""
 _SHARE: Final = 0.25
 """Part of the available memory: of the processes of a session only control locks its own."""
 _LOWEST_PRIORITY: Final = 19
+_LIGHT_S: Final = 300.0
+"""Record that is planned in half a second, in 100 MB."""
+
+Done = TypeVar("Done")
+Done_co = TypeVar("Done_co", covariant=True)
+
+
+class Job(Protocol[Done_co]):
+    """Something to be done."""
+
+    beside_sessions: ClassVar[bool]
+    """Whether it may be done while a session runs, and gives way to it."""
+
+    def perform(self) -> Done_co:
+        """Do it; an error of the rig is for the client."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
     """A session to predict: see `rigd.runner.predict_session`."""
+
+    beside_sessions: ClassVar[bool] = True
 
     profile: Profile
     """Rig of the session."""
@@ -48,20 +76,17 @@ class PredictionJob:
     """Name of the specimen; empty: the profile's."""
     start_rad: float = 0.0
     """Where the motor stands, from the rig's zero."""
+    accept: tuple[str, ...] = ()
+    """Names of rows of `rigd check` that may fail."""
+    tip_slope_rad: float | None = None
+    """Largest slope of the tip in an identification; None: the profile's."""
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
-        from rigd.profile import with_specimen
-        from rigd.runner import (
-            excitation_for,
-            largest_amplitude,
-            plan_document,
-            predict_session,
-        )
-
         profile = with_specimen(self.profile, self.specimen)
+        profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
-        plan = predict_session(profile, excitation, force=self.force)
+        plan = predict_session(profile, excitation, force=self.force, accept=self.accept)
         return {
             "plan": plan_document(profile, excitation, plan),
             "largest_amplitude_rad": largest_amplitude(profile, excitation, force=self.force),
@@ -72,6 +97,7 @@ class PredictionJob:
 class CheckJob:
     """A rig to check whose devices are the daemon's: see `rigd.checks.check_beside`."""
 
+    beside_sessions: ClassVar[bool] = True
     profile: Profile
     """Rig to check."""
     calibration: Mapping[str, Any] | None
@@ -96,7 +122,55 @@ class CheckJob:
         }
 
 
-async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class PlanJob:
+    """Sessions to plan: see `rigd.runner.Series`."""
+
+    beside_sessions: ClassVar[bool] = False
+
+    profile: Profile
+    """Rig of the sessions."""
+    request: Start
+    """What was asked for."""
+    folder: Path
+    """Folder for the files."""
+    start_rad: float
+    """Where the motor stands, from the rig's zero."""
+
+    @property
+    def is_heavy(self) -> bool:
+        """Whether it may take more than a second, or much memory: a file, or a long record."""
+        values = self.request.parameters.items()
+        long_s = sum(value for name, value in values if name.endswith("_s"))
+        return long_s > _LIGHT_S or any(isinstance(value, Path) for _, value in values)
+
+    def perform(self) -> Series:
+        """Make the excitation, and check that it may be run."""
+        request = self.request
+        notes = request.notes.as_metadata()
+        try:
+            profile = with_specimen(self.profile, notes.get("specimen", ""))
+            check_on_paper(profile, request.accept).require()
+            profile = with_tip_slope(profile, request.tip_slope_rad)
+            return Series(
+                profile,
+                excitation_for(profile, request.excitation, request.parameters, self.start_rad),
+                self.folder,
+                repeat=request.repeat,
+                notes=notes,
+                force=request.force,
+                accept=request.accept,
+                watch_fit=request.watch_fit,
+            )
+        except NoRoomError as error:  # the same request may succeed later
+            raise CommandError(str(error)) from error
+        except RigdError as error:
+            raise CommandError(str(error), wrong_use=error.wrong_use) from error
+        except MemoryError:
+            raise CommandError("There is not enough memory to plan such a session.") from None
+
+
+async def perform(job: Job[Done]) -> Done:
     """Have a job done in its own process, without holding up the event loop.
 
     Parameters
@@ -107,7 +181,7 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
     Raises
     ------
     CommandError
-        If it is refused, fails, or takes longer than 60 s.
+        If it is refused, fails, or takes longer than 50 s.
     """
     try:
         process = await asyncio.create_subprocess_exec(
@@ -121,39 +195,45 @@ async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
         raise CommandError(f"No process can be started for it ({error.strerror}).") from None
     try:
         told, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
-        answer = json.loads(told)
+        answer = pickle.loads(told)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
-    except ValueError:
+    except (EOFError, pickle.UnpicklingError):
         raise CommandError(f"Its process ended with exit code {process.returncode}.") from None
     finally:
         if process.returncode is None:
             process.kill()
             await process.wait()
-    if "error" in answer:
-        raise CommandError(answer["error"], wrong_use=answer["wrong_use"])
-    done: dict[str, Any] = answer
+    if isinstance(answer, CommandError):
+        raise answer
+    done: Done = answer
     return done
 
 
 def main() -> None:
-    """Do the job that standard input brings; the result goes to standard output as JSON."""
-    os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
+    """Do the job that standard input brings; the result, or why there is none, goes to its output.
+
+    Both ends are this program's own.
+    """
     killed_first()
     most_bytes = _memory_limit()
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
     job = pickle.load(sys.stdin.buffer)
+    if job.beside_sessions:
+        os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     try:
         answer = job.perform()
     except RigdError as error:
-        answer = {"error": str(error), "wrong_use": error.wrong_use}
+        answer = CommandError(str(error), wrong_use=error.wrong_use)
     except MemoryError:
-        answer = {
-            "error": "There is not enough free memory to predict such a session; shorten it, or "
-            "close other programs.",
-            "wrong_use": True,
-        }
-    sys.stdout.write(json.dumps(answer, allow_nan=False))
+        answer = CommandError(
+            "There is not enough free memory to predict such a session; shorten it, or close other "
+            "programs.",
+            wrong_use=True,
+        )
+    if isinstance(answer, dict):
+        json.dumps(answer, allow_nan=False)  # a reply that is not JSON is none
+    pickle.dump(answer, sys.stdout.buffer)
 
 
 def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:

@@ -30,6 +30,9 @@ from ._simulator import described as described
 from ._simulator import find_simulator as find_simulator
 from ._simulator import forget as forget
 from ._simulator import unreachable_simulators as unreachable_simulators
+from ._unknown import MAY_BE_UNKNOWN as MAY_BE_UNKNOWN
+from ._unknown import describe_unknown_values as describe_unknown_values
+from ._unknown import unknown_values as unknown_values
 from ._wired_rig import reset_drive as reset_drive
 from .contracts import DeviceError as DeviceError
 from .contracts import Devices as Devices

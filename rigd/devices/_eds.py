@@ -42,6 +42,9 @@ _ACCESS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
 
 _OBJECT = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
 _MEMBER = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
+_QUOTED = re.compile(r"""(?s)^(["'])(.*)\1$""")
+"""Some editors quote every value."""
+_YES: Final = ("true", "yes", "on")
 _NODE_ID = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
 
@@ -163,9 +166,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
         product_code=_identity(entries, 2, device.get("productnumber", "")),
         revision=_identity(entries, 3, device.get("revisionnumber", "")),
         bit_rates_bit_s=tuple(
-            1000 * rate
-            for rate in _BIT_RATES_KBIT_S
-            if _integer(device.get(f"baudrate_{rate}", ""))
+            1000 * rate for rate in _BIT_RATES_KBIT_S if _is_set(device.get(f"baudrate_{rate}", ""))
         ),
         commissioned_node_id=_commissioned(sections),
         entries=entries,
@@ -239,7 +240,8 @@ def _sections(text: str, path: Path) -> Sections:
         key, equals, value = line.partition("=")
         if equals:
             # A comment may follow after white space, as canopen has it.
-            keys.setdefault(key.strip().lower(), re.split(r"\s;", value, maxsplit=1)[0].strip())
+            bare = _QUOTED.sub(r"\2", re.split(r"\s;", value, maxsplit=1)[0].strip())
+            keys.setdefault(key.strip().lower(), bare.strip())
     return sections
 
 
@@ -326,7 +328,7 @@ def _entries(
             name=_shown(keys["parametername"]),
             data_type=data_type,
             access=access if access in _ACCESS else "rw",
-            mappable=_integer(keys.get("pdomapping", "")) != 0,
+            mappable=_is_set(keys.get("pdomapping", "")),
             default=value if isinstance(value, int) else None,
             low=_signed(_whole(keys.get("lowlimit", "")), data_type),
             high=_signed(_whole(keys.get("highlimit", "")), data_type),
@@ -382,6 +384,11 @@ def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str
 def _integer(text: str) -> int:
     """Return a number as :func:`_whole` does; 0 of anything else."""
     return _whole(text) or 0
+
+
+def _is_set(text: str) -> bool:
+    """Whether a flag is set: 1 in CiA 306's notation, TRUE in that of some tools."""
+    return text.lower() in _YES or _integer(text) != 0
 
 
 def _whole(text: str) -> int | None:

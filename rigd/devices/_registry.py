@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import cast
 
 from rigd.devices._simulator import differences, find_simulator
+from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters, Selection
 from rigd.errors import UserError
@@ -137,9 +138,13 @@ def open_devices(rig: RigParameters, moving: WhatMoves | None = None) -> Devices
     UnknownDeviceError
         If the profile names drivers that do not exist.
     DeviceError
-        If the profile contradicts what these drivers can do, or something else would move now.
+        If the profile contradicts what these drivers can do, values of it are unknown, or something
+        else would move now.
     """
     check_selection(rig.devices)
+    unknown = describe_unknown_values(rig)
+    if unknown:
+        raise DeviceError(unknown)
     module, name = _OPENERS[rig.devices]
     opener = cast(
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)

@@ -32,6 +32,7 @@ from ._messages import FitTold as FitTold
 from ._messages import Measured as Measured
 from ._messages import Opened as Opened
 from ._messages import PieceTold as PieceTold
+from ._messages import Probe as Probe
 from ._messages import Ready as Ready
 from ._messages import RecordEnded as RecordEnded
 from ._messages import RecorderJob as RecorderJob
@@ -44,6 +45,7 @@ from ._messages import TouchOrder as TouchOrder
 from ._messages import TouchReady as TouchReady
 from ._messages import TouchTold as TouchTold
 from ._messages import Zero as Zero
+from ._probed_rig import probed_rig as probed_rig
 from ._realtime import LOCKED as LOCKED
 from ._realtime import REFUSED as REFUSED
 from ._realtime import WAKE_UP_US as WAKE_UP_US

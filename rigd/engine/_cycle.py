@@ -170,6 +170,8 @@ class Cycle:
         The torque that stands, after the limits.
     flags
         Status bits of the last tick.
+    encoder_watch
+        Comparison of the encoder with the torques; None: a probing move makes its own.
     """
 
     def __init__(
@@ -186,7 +188,7 @@ class Cycle:
         self._projection = projection
         self.controller = controller
         self.watch = watch
-        self.encoder_watch = observers.encoder
+        self.encoder_watch: EncoderWatch | None = observers.encoder
         self.sensor_watch = observers.sensor
         self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None
         self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -246,12 +248,13 @@ class Cycle:
         )
         violation = violation or self.check_stale() or self.check_sensor()
         encoder = self.encoder_watch
-        violation = violation or encoder.step(
-            self.angle_rad,
-            self.coupling_torque_nm,
-            self.torque_command_nm,
-            fresh=not flags & _UNUSABLE,
-        )
+        if encoder is not None and violation is None:
+            violation = encoder.step(
+                self.angle_rad,
+                self.coupling_torque_nm,
+                self.torque_command_nm,
+                fresh=not flags & _UNUSABLE,
+            )
         if violation is not None:
             self._recent.append((self.angle_rad, 0.0, 0.0))
             self.torque_off()
@@ -268,7 +271,7 @@ class Cycle:
                 self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
                 return violation
             flags |= _TORQUE_SATURATED | _LIMIT_WARNING
-        if encoder.test_nm:
+        if encoder is not None and encoder.test_nm:
             limit_nm = controller.torque_limit_nm
             torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder.test_nm))
         self._commanding = True
@@ -288,13 +291,19 @@ class Cycle:
         """
         self.controller.reset(self.angle_rad)
         self.watch.reset(self.angle_rad)
-        self.encoder_watch.reset(self.angle_rad, noise_nm)
+        if self.encoder_watch is not None:
+            self.encoder_watch.reset(self.angle_rad, noise_nm)
         self._recent.clear()
 
     def skip(self, missed: int) -> None:
         """Go on after ticks that were missed, with the torque held."""
         if missed:
             self.watch.skip(missed)
+            self.skip_encoder(missed)
+
+    def skip_encoder(self, missed: int) -> None:
+        """Let the encoder watch go on after missed ticks; the limits' watch knows of them."""
+        if self.encoder_watch is not None:
             self.encoder_watch.skip(missed, self.angle_rad)
 
     def turns_against_torque(
@@ -561,7 +570,7 @@ class Observers:
     """Compares each reading of the sensor with the one before."""
 
 
-def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -> Observers:
+def make_observers(profile: Profile, devices: Devices) -> Observers:
     """Return the observers of a profile's rig.
 
     Parameters
@@ -570,8 +579,6 @@ def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -
         Profile of the rig.
     devices
         Devices that are read.
-    scales
-        Whether the data of the motor are known; False: a session measures them.
     """
     rig = profile.rig
     prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
@@ -582,7 +589,7 @@ def make_observers(profile: Profile, devices: Devices, *, scales: bool = True) -
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
         delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
-        scales=ScaleWatch(rig.motor.inertia_kg_m2) if scales else None,
+        scales=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
     noisy = [True] * 6

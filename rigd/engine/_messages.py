@@ -5,7 +5,7 @@ The supervisor gives jobs and orders, the others answer:
 ============  =============================================  ================================
 process       is told                                        tells
 ============  =============================================  ================================
-control       ControlJob, then SessionJob, Tare, Zero        Connected, then Ready, Finished;
+control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Ready, Finished;
                                                              Measured or Refused; last Ended
 recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
 live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
@@ -101,6 +101,8 @@ class SessionJob:
     """What to look for; None: nothing."""
     seed: int | None = None
     """Seed of a simulated rig's noise; None: one of the rig's own."""
+    accepted: tuple[str, ...] = ()
+    """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,14 @@ class Tare:
 @dataclass(frozen=True, slots=True)
 class Zero:
     """Make the present angle the zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Make the probing move of a profile."""
+
+    profile: "Profile"
+    """The rig's; its beam may be another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +168,7 @@ class Measured:
     """What was measured between sessions."""
 
     values: dict[str, Any]
-    """Results by name, as :meth:`rigd.runner.Rig.tare` and :meth:`rigd.runner.Rig.zero` return."""
+    """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
 
 
 @dataclass(frozen=True, slots=True)

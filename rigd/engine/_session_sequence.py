@@ -518,7 +518,7 @@ class SessionSequence:
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
             return None
-        self._cycle.encoder_watch.skip(missed, self._cycle.angle_rad)
+        self._cycle.skip_encoder(missed)
         reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
         return None if reason is None else SessionEnd("fault", str(reason))
 
@@ -614,7 +614,7 @@ class SessionSequence:
         cycle = self._cycle
         for notice in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
             self._say("warning", notice)
-        tests = cycle.encoder_watch.tests
+        tests = 0 if cycle.encoder_watch is None else cycle.encoder_watch.tests
         if tests > self._encoder_tests:
             self.results["encoder_tests"] = str(tests)
             if not self._encoder_tests:

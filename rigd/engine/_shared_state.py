@@ -41,6 +41,8 @@ class Phase(IntEnum):
     """Torque is zero and the drive is disabled: between sessions, and at the end."""
     WAITING = 7
     """Waiting until the beam is at rest, before the tare."""
+    PROBING = 8
+    """Probing move before a session."""
 
     @property
     def words(self) -> str:
@@ -52,6 +54,7 @@ _WORDS = {
     Phase.RUNNING: "recording",
     Phase.OFF: "drive off",
     Phase.WAITING: "waiting for the beam to rest",
+    Phase.PROBING: "probing move",
 }
 
 

@@ -30,6 +30,7 @@ from rigd.engine._messages import (
     Ended,
     Finished,
     Measured,
+    Probe,
     Ready,
     Refused,
     SessionJob,
@@ -207,6 +208,9 @@ class _ControlServer:
                     self._answer(self._tare)
                 case Zero():
                     self._answer(self._zero)
+                case Probe():
+                    self._probe(order.profile)
+                    self.take_up_standstill()
 
     def _await_order(self) -> object | None:
         """Observe with the torque off until there is something to do; None: nothing any more.
@@ -272,6 +276,7 @@ class _ControlServer:
         ):
             board[word] = 0
         self._warn_of_refusals(job)
+        self._log_accepted(job)
         cycle = self._cycle = self._make_cycle(job.profile)
         reference = map_reference(job.reference)
         touch = None
@@ -354,6 +359,49 @@ class _ControlServer:
         """
         renew = self._devices.renew_noise
         return {} if renew is None else {"simulation_seed": str(renew(job.seed))}
+
+    def _probe(self, profile: Profile) -> None:
+        """Make the probing move of a profile and report it; the drive ends disabled.
+
+        Raises
+        ------
+        DeviceError
+            If a device failed.
+        """
+        from rigd.engine._probe_sequence import ProbeSequence  # late: few connections need it
+
+        cycle = self._cycle = self._make_cycle(profile)
+        sequence = ProbeSequence(
+            profile,
+            cycle,
+            self._clock,
+            self._metronome,
+            self._standstill,
+            self._channels,
+            self._display,
+            self._parent,
+            self._stop,
+        )
+        answer: Measured | Refused
+        failure = ""
+        name_this_process(SESSION_NAME)
+        try:
+            sequence.tare()
+            self._devices.drive.enable(sequence.stop_asked)
+            answer = Measured(sequence.move())
+        except SessionEnd as end:
+            answer = Refused(end.reason)
+            failure = end.reason if end.device_failed else ""
+        finally:
+            self._devices.drive.disable()
+            cycle.torque_off()
+            self._board[Word.PHASE] = Phase.OFF
+            self._show()
+        failure = f"{failure} {self._devices.drive.off_doubt}".strip()
+        if failure:
+            raise DeviceError(failure)
+        name_this_process(IDLE_NAME)
+        self._parent.send(answer)
 
     def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
         """Do something at rest and tell what came out, or why it could not be done."""
@@ -446,6 +494,11 @@ class _ControlServer:
                 names = ", ".join(f"{name} ({text})" for name, text in refused.items())
                 message = f"The system did not grant {names}: {what_follows}."
                 write_event(self._channels.events, Event(0, "warning", message))
+
+    def _log_accepted(self, job: SessionJob) -> None:
+        for text in job.accepted:
+            message = f"Accepted by the operator, though rigd check fails: {text}"
+            write_event(self._channels.events, Event(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

@@ -32,8 +32,8 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
 }
 """Functions by the names that the command line and session files use."""
 
-FROM_THE_RIG = frozenset({"rate_hz", "rig"})
-"""Arguments that are not options: the rig's own data."""
+FROM_THE_RIG = frozenset({"rate_hz", "rig", "tip_slope_rad"})
+"""Arguments that are not options of an excitation: data and limits of the rig."""
 
 
 def make_excitation(

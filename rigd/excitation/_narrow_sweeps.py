@@ -18,10 +18,18 @@ from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.beam import (
+    PARAMETERS,
+    SMALL_SLOPE_RAD,
+    Beam,
+    Damping,
+    transfer_and_gradient,
+    undamped_frequencies_rad_s,
+)
+from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
     Excitation,
@@ -32,7 +40,6 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
-from rigd.runtime import open_plain_file
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -43,7 +50,6 @@ _CLOSE_ENOUGH: Final = 1.005
 LEAST_SHARE: Final = 0.5
 """Least share of an equal part of the time for every band: a mode is never left out."""
 
-MOST_BYTES: Final = 64_000_000
 SAME_MODE: Final = 1.1
 """Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
 slender beam differ by more."""
@@ -75,7 +81,7 @@ class _Document(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    modes: list[_Entry]
+    modes: Annotated[list[_Entry], FailFast()]  # the errors of a million take gigabytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,16 +129,10 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        with open_plain_file(path, MOST_BYTES) as file:
-            return json.load(file)
-    except OSError as error:
-        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
-    except RecursionError:
-        raise ExcitationError(f"{path}: is nested too deeply.") from None
-    except ValueError as error:
+        return read_json(path)
+    except DocumentError as error:
         raise ExcitationError(
-            f"{path}: is not a JSON document ({error}); write one with analyze session.mcap "
-            "--json fits.json."
+            f"{path}: {error}; write one with analyze session.mcap --json fits.json."
         ) from error
 
 
@@ -209,6 +209,9 @@ class LoopPreview(Protocol):
 
     def share_of_limits(self, reference_rad: Real) -> float:
         """Largest share of a limit that a reference (n,) is predicted to take."""
+
+    def tip_slope_rad(self, reference_rad: Real) -> float:
+        """Largest slope of the free end that is predicted for a reference (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +343,7 @@ def modes(
     rest_s: float = 1.0,
     ring_down_s: float = 15.0,
     taper_s: float = 1.0,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
     rig: LoopPreview | None = None,
 ) -> Excitation:
     """Linear sweeps through narrow bands round modes, one after the other.
@@ -351,7 +355,7 @@ def modes(
     path
         JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
     amplitude_rad
-        Amplitude in each band; lower where the rig's limits ask for it.
+        Amplitude in each band; lower where the rig's limits or the slope of the tip require it.
     stop_hz
         Modes above are left out.
     widths
@@ -362,6 +366,8 @@ def modes(
         Time before and after them.
     taper_s
         Raised-cosine fade at both ends of every sweep: angle and speed are zero at the joints.
+    tip_slope_rad
+        Largest slope of the beam's free end, of which the sweeps use 90 %.
     rig
         Limits the amplitudes and splits the time by what each band tells of the damping. Without
         it neither happens.
@@ -376,6 +382,7 @@ def modes(
     frequency("stop_hz", stop_hz, rate_hz)
     positive("widths", widths, "half-power widths")
     positive("taper_s", taper_s, "s")
+    positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     first, end = segments["sweep"]
     bands = _bands(Path(path), stop_hz, widths, rate_hz)
@@ -390,10 +397,10 @@ def modes(
     amplitudes_rad = [amplitude_rad] * len(bands)
     sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
     if rig is not None:
-        eased_rad = _within_limits(sweeps, amplitude_rad, rig)
+        eased_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
         lengths = _lengths(_at_least(shares_of_time(bands, eased_rad, rig)), end - first)
         sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
-        amplitudes_rad = _within_limits(sweeps, amplitude_rad, rig)
+        amplitudes_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
     parameters: dict[str, float | int | str] = {
         "file": Path(path).name,
@@ -405,6 +412,7 @@ def modes(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "taper_s": taper_s,
+        "tip_slope_rad": tip_slope_rad,
         "bands": "; ".join(
             f"{band.start_hz:.6g}-{band.stop_hz:.6g} Hz, {amplitude:.4g} rad, "
             f"{ticks / rate_hz:.6g} s"
@@ -429,7 +437,9 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
     return bands
 
 
-def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: LoopPreview) -> list[float]:
+def _within_limits(
+    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: LoopPreview
+) -> list[float]:
     """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
 
     One after the other, since a mode still rings while the next is swept.
@@ -439,7 +449,10 @@ def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: LoopPrevie
     for sweep in sweeps:
         eased_rad = amplitude_rad
         for _ in range(_EASINGS):
-            share = rig.share_of_limits(np.concatenate([before_rad, eased_rad * sweep]))
+            so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
+            share = max(
+                rig.share_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
+            )
             if share <= SHARE_OF_LIMITS * _CLOSE_ENOUGH:
                 break
             eased_rad *= SHARE_OF_LIMITS / share

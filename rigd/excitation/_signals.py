@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rigd.errors import UserError
 from rigd.session import MAX_SAMPLES
+from rigd.units import is_usable_size
 
 if TYPE_CHECKING:
     from rigd.excitation._touch_passes import Approach
@@ -112,9 +113,13 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
 
 def finite(option: str, value: float, unit: str) -> None:
-    """Refuse what is not a finite number."""
+    """Refuse what is not a finite number, or of a size that no rig has."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
+    if not is_usable_size(value):
+        raise ExcitationError(
+            f"{option} = {value:g} {unit} is of no size that a rig can have; check its unit."
+        )
 
 
 def positive(option: str, value: float, unit: str) -> None:

@@ -1,7 +1,7 @@
 """Proposal of an estimate for the profile, and controllers for the sessions that it needs."""
 
 from dataclasses import dataclass, replace
-from math import floor, log10
+from math import floor, inf, log10
 from typing import Any
 
 from rigd.control import ControlDesignError, check_stability, close_loop
@@ -19,7 +19,11 @@ ones."""
 
 
 def cautious(profile: Profile) -> Profile:
-    """Return a profile with the slowest controller that holds its beam and tolerates errors."""
+    """Return a profile with the slowest controller that holds its beam and tolerates errors.
+
+    Its scales are not compared: they are what the sessions measure.
+    """
+    profile = replace(profile, limits=replace(profile.limits, torque_ratio=inf))
     for pole_rad_s in _CAUTIOUS_POLES_RAD_S:
         if pole_rad_s < profile.control.pole_rad_s:
             slow = replace(profile, control=replace(profile.control, pole_rad_s=pole_rad_s))
@@ -48,7 +52,8 @@ def tuned(profile: Profile, estimate: MotorEstimate) -> Profile:
         viscous_nm_s_per_rad=max(0.0, estimate.viscous_nm_s_per_rad.value) / scale,
     )
     control = replace(profile.control, feedforward_gain=profile.control.feedforward_gain / scale)
-    fitted = replace(profile, design_motor=motor, control=control)
+    limits = replace(profile.limits, torque_ratio=inf)
+    fitted = replace(profile, design_motor=motor, control=control, limits=limits)
     return fitted if _is_stable(fitted) else cautious(fitted)
 
 

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Final
 
 from rigd.library._row import SessionRow, usable_modes
+from rigd.session import Validity
 
 INDEX_NAME: Final = "library.sqlite"
 """Name of the index in its folder."""
 
 _APPLICATION: Final = 0x72696764  # "rigd"
-_VERSION: Final = 2
+_VERSION: Final = 3
 """Greater whenever the table, or what a row is made of, is another: older indexes are rebuilt."""
 _HEADER: Final = b"SQLite format 3\0"
 _APPLICATION_PLACE: Final = slice(68, 72)
@@ -52,11 +53,13 @@ _TYPES: Final = {
     "lost": "INTEGER",
     "size_bytes": "INTEGER",
     "modes": "TEXT",
+    "validity": "TEXT",
     "report": "TEXT",
     "meta": "TEXT",
     "problem": "TEXT",
 }
-"""Columns beside ``file`` and ``stamp``; modes and meta are JSON, times UTC in ISO 8601."""
+"""Columns beside ``file`` and ``stamp``; modes, validity and meta are JSON, times
+UTC in ISO 8601."""
 _KINDS: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
 _READ: Final = tuple(name for name in _TYPES if name != "start_utc")
 
@@ -178,6 +181,8 @@ class Index:
             if name != "report" and not isinstance(value, _KINDS[_TYPES[name]]):
                 raise TypeError(name)
         values["modes"] = usable_modes(json.loads(str(values["modes"])))
+        stated = json.loads(str(values["validity"]))
+        values["validity"] = None if stated is None else Validity.of_document(stated).as_json()
         values["meta"] = dict(json.loads(str(values["meta"])))
         values["report"] = None if report is None else self._folder / str(report)
         return SessionRow(path=self._folder / file, **values)  # type: ignore[arg-type]
@@ -187,6 +192,7 @@ def _values(row: SessionRow) -> list[object]:
     values: dict[str, object] = {each.name: getattr(row, each.name) for each in fields(row)}
     values["start_utc"] = None if row.start_utc_ns is None else _iso(row.start_utc_ns)
     values["modes"] = json.dumps(row.modes)
+    values["validity"] = json.dumps(row.validity)
     values["meta"] = json.dumps(row.meta)
     values["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
     return [values[name] for name in _TYPES]

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
-from rigd.session import modes_of, read_look
+from rigd.runtime import read_plain_file
+from rigd.session import Validity, modes_of, read_look
 
 SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
@@ -24,6 +25,7 @@ _MOST_META: Final = 100
 _MOST_DIGITS: Final = 18
 
 Mode = dict[str, Any]
+Document = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,9 @@ class SessionRow:
     modes: tuple[Mode, ...] = ()
     """Modes of the last report, or without one of the quick look: objects ``frequency_hz`` and
     ``damping_ratio``, each with ``value``, ``std``, ``interval_95`` and ``flag``."""
+    validity: Document | None = None
+    """How exact the linear model is for them, as `rigd.session.Validity.as_json` has it; None
+    without modes."""
     report: Path | None = None
     """Page of the last report."""
     meta: dict[str, float | str] = field(default_factory=dict)
@@ -114,7 +119,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[Sessio
 
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
-    results: dict[str, Any] = {"modes": _modes(look, report)}
+    results: dict[str, Any] = _modes(look, report)
     if report is not None and (report / REPORT_PAGE).is_file():
         results["report"] = report / REPORT_PAGE
     try:
@@ -188,21 +193,26 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes(look: Path | None, report: Path | None) -> tuple[Mode, ...]:
-    """Return the modes of the report, or else of the quick look; none if neither can be read."""
+def _modes(look: Path | None, report: Path | None) -> Document:
+    """Return modes and validity of the report, or else of the quick look; nothing without them."""
     if report is not None:
         for headline in _list(_document(report / NUMBERS), "headlines"):
             if modes := usable_modes(_list(headline, "modes")):
-                return modes
+                return _with_validity(modes, headline)
     found = None if look is None else read_look(look)
-    return () if found is None else usable_modes(found["modes"])
+    return {} if found is None else _with_validity(usable_modes(found["modes"]), found)
+
+
+def _with_validity(modes: tuple[Mode, ...], found: object) -> Document:
+    if not modes:
+        return {}
+    stated = found.get("validity") if isinstance(found, dict) else None
+    return {"modes": modes, "validity": Validity.of_document(stated).as_json()}
 
 
 def _document(path: Path) -> object:
     try:
-        if path.stat().st_size > _MOST_JSON_BYTES:
-            return None
-        return json.loads(path.read_bytes())
+        return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):  # a result less, no session less
         return None
 

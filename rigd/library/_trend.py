@@ -61,6 +61,7 @@ class ModeTrend:
                     "start_utc_ns": point.row.start_utc_ns,
                     "frequency_hz": point.frequency_hz,
                     "damping_ratio": point.damping_ratio,
+                    "validity": point.row.validity,
                     "frequency_change": _document(point.frequency_change),
                     "damping_change": _document(point.damping_change),
                 }

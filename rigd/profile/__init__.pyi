@@ -12,6 +12,7 @@ from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
 from ._schema import SessionSettings as SessionSettings
 from ._schema import Specimen as Specimen
+from ._schema import UnknownValueError as UnknownValueError
 from ._specimen import load_specimen as load_specimen
 from ._specimen import with_specimen as with_specimen
 from ._write import check_new as check_new

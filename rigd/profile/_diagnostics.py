@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.devices import (
+    MAY_BE_UNKNOWN,
     NOT_BESIDE_FORCES,
     NOT_BESIDE_OBSTACLES,
     AtiSerial,
@@ -24,10 +25,11 @@ from rigd.devices import (
 )
 from rigd.devices.ati import RECORD_BITS
 from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
+from rigd.printable import printable
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
 from rigd.safety import BUFFERED_S
 from rigd.session import NOTES, MetadataError, check_name
-from rigd.units import UNITS, suffix_of, unit_of
+from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 
 _UNITS_OF_SIX = {
     "sensor.resolution": "N, N, N, N·m, N·m, N·m",
@@ -50,6 +52,9 @@ _PER_MILLE_LIMIT = 32.767
 """Largest torque over rated torque that fits the 16 bits of object 6071."""
 _ROUNDING = 1e-9
 _PARALLEL = 1e-6
+_MOST_SHOWN = 200
+"""Characters of a value."""
+_MOST_ITEMS = 12
 
 
 def no_source(key: str, source: object) -> str:
@@ -59,12 +64,36 @@ def no_source(key: str, source: object) -> str:
     return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
 
 
+def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
+    """Complain about a source "unknown" of a key that has a value, or that needs one."""
+    if key in MAY_BE_UNKNOWN:
+        return (
+            f'{key} = {_show(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
+            f"remove the value, or choose {_choice(SOURCES)} as its source."
+        )
+    return (
+        f'{key} has source = "unknown", but needs a value; only {", ".join(MAY_BE_UNKNOWN)} may be '
+        "unknown."
+    )
+
+
 def bare_number(key: str, value: object) -> str:
     """Complain about a number that stands without a source."""
     return (
         f"{key} = {_show(value)}{_unit(key)} does not say where it comes from; write "
         f'{{ value = {_show(value)}, source = "…" }} with {_choice(SOURCES)}.'
     )
+
+
+def unusable_sizes(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield numbers in range that are too large or too small for any rig."""
+    for key, value in values.items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int | float) and not is_usable_size(number):
+                yield (
+                    f"{key} = {_show(number)}{_unit(key)} is of no size that a rig can have; check "
+                    "its unit."
+                )
 
 
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
@@ -326,12 +355,13 @@ def _show(value: object) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, str):
-        return f'"{value}"'
+        return f'"{printable(value, _MOST_SHOWN)}"'
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):
-        return "[" + ", ".join(_show(item) for item in value) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+        shown = [_show(item) for item in value[:_MOST_ITEMS]]
+        return f"[{', '.join(shown)}{', …' if len(value) > _MOST_ITEMS else ''}]"
+    return printable(f"{value:g}" if isinstance(value, float) else str(value), _MOST_SHOWN)
 
 
 def _choice(words: tuple[str, ...]) -> str:

@@ -1,5 +1,6 @@
 """Draft of a profile for a drive not yet connected: from its EDS and another profile."""
 
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from rigd.devices import Eds
+from rigd.devices import MAY_BE_UNKNOWN, Eds
 from rigd.devices.cia402 import (
     MAX_SPEED_RPM,
     RATED_TORQUE,
@@ -22,7 +23,7 @@ from rigd.devices.cia402 import (
 )
 from rigd.errors import FailureError
 from rigd.profile._load import ProfileError, profile_of
-from rigd.profile._schema import Profile, keys
+from rigd.profile._schema import UNKNOWN, Profile, keys
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
 _ACCEPT = "cia402.accept_without"
@@ -103,8 +104,12 @@ class Draft:
         self._findings = judgement.findings
         self._accepted: list[str] = []
         self._settings = {setting.key: setting for setting in self._told()}
+        # The motor, gear and encoder of the profile started from are others: no number of theirs.
+        for question in self.questions():
+            if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
+                self._settings[question.key] = Setting(question.key, math.nan, UNKNOWN)
 
-    def value(self, key: str) -> SettingValue:
+    def _value(self, key: str) -> SettingValue:
         """Return the value that a key has so far."""
         if key in self._settings:
             return self._settings[key].value
@@ -121,20 +126,36 @@ class Draft:
         key
             Dotted key of the profile.
         text
-            What was typed.
+            What was typed; ``unknown`` leaves the value to be filled in where that is possible.
 
         Raises
         ------
         ValueError
             If the key does not take it; the message says what it takes.
         """
+        if text == UNKNOWN and key in MAY_BE_UNKNOWN:
+            self._settings[key] = Setting(key, math.nan, UNKNOWN)
+            return
         annotation: Any = keys()[key]
         try:
             value = TypeAdapter(annotation).validate_strings(text)
         except ValidationError as error:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
-        if value != self.value(key):
+        if value != self._value(key):
             self._settings[key] = Setting(key, value, "datasheet")
+
+    def shown(self, key: str) -> str:
+        """Return the value that a key has so far as text, or ``unknown``.
+
+        Parameters
+        ----------
+        key
+            Dotted key of the profile.
+        """
+        return UNKNOWN if self._is_unknown(key) else str(self._value(key))
+
+    def _is_unknown(self, key: str) -> bool:
+        return key in self._settings and self._settings[key].source == UNKNOWN
 
     def unaccepted(self) -> list[Finding]:
         """Return what the drive lacks and the profile does not accept, so that rigd refuses it.
@@ -178,8 +199,12 @@ class Draft:
         return [each for each in (*QUESTIONS, *more) if each.key not in absent]
 
     def unanswered(self) -> list[Question]:
-        """Return the questions whose values are still those of the profile started from."""
-        answered = {key for key, setting in self._settings.items() if setting.reason != _OTHER}
+        """Return the questions without an answer: unknown, or as in the profile started from."""
+        answered = {
+            key
+            for key, setting in self._settings.items()
+            if setting.reason != _OTHER and setting.source != UNKNOWN
+        }
         return [each for each in self.questions() if each.key not in answered]
 
     def text(self) -> str:
@@ -196,7 +221,12 @@ class Draft:
 
     def _body(self) -> str:
         marked = [
-            Setting(question.key, self.value(question.key), reason="TO FILL IN: " + question.text)
+            Setting(
+                question.key,
+                self._value(question.key),
+                UNKNOWN if self._is_unknown(question.key) else "assumed",
+                reason="TO FILL IN: " + question.text,
+            )
             for question in self.unanswered()
         ]
         settings = [*self._settings.values(), *marked, *self._acceptance()]
@@ -296,6 +326,8 @@ class Draft:
             "  paper      printed in the paper (antenna, damping, encoder)",
             "  datasheet  told by the drive's file, or typed in from a data sheet",
             "  measured   on a rig or a computer, as said beside it",
+            "  unknown    no value yet: rigd moves nothing before all of these are filled in, as",
+            '             { value = 0.5, source = "datasheet" }',
             "  assumed    of the profile started from: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(

@@ -4,9 +4,11 @@ Every number stands as ``{ value = 2.0e-3, source = "assumed" }``, with its unit
 that an assumed number is not mistaken for a measured one. Ranges are declared where the number is
 used (``annotated_types`` on the dataclasses) and enforced here. All problems of a file are
 reported at once.
+
+A number that nobody knows yet is ``{ source = "unknown" }``, without a value.
 """
 
-import tomllib
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -14,7 +16,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from rigd.devices import RigParameters
+from rigd import documents
+from rigd.devices import MAY_BE_UNKNOWN, RigParameters
+from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._places import profile_files
@@ -22,13 +26,13 @@ from rigd.profile._schema import (
     OPTIONAL_SECTIONS,
     SECTIONS,
     SOURCES,
+    UNKNOWN,
     Profile,
     defaults,
     fields_of,
     is_number,
     keys,
 )
-from rigd.text_table import decode_text
 
 
 class ProfileError(UserError, ValueError):
@@ -75,11 +79,9 @@ def read_text(path: Path) -> str:
         If it cannot be read, or is not text.
     """
     try:
-        return decode_text(path.read_bytes())
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
+        return documents.read_text(path)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def profile_of(text: str, path: Path) -> Profile:
@@ -96,7 +98,8 @@ def profile_of(text: str, path: Path) -> Profile:
     absent = {
         name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
     }
-    values = validate(values, problems, frozenset(absent))
+    unknown = frozenset(key for key, source in sources.items() if source == UNKNOWN)
+    values = validate(values, problems, frozenset(absent), unknown)
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(diagnostics.contradictions(values))
@@ -104,7 +107,7 @@ def profile_of(text: str, path: Path) -> Profile:
     if problems:
         raise complaint(path, problems)
 
-    section = {name: _build(name, values) for name in SECTIONS if _present(name, document)}
+    section = {name: _build(name, values) for name in SECTIONS if name not in absent}
     return Profile(
         name=values["name"],
         description=values["description"],
@@ -146,9 +149,9 @@ def parse(text: str, path: Path) -> dict[str, Any]:
         If it is none.
     """
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
+        return documents.parse_toml(text)
+    except DocumentError as error:
+        raise ProfileError(f"{path}: {error}.") from error
 
 
 def complaint(path: Path, problems: Iterable[str]) -> ProfileError:
@@ -210,9 +213,15 @@ def flatten(
             if _is_number(key):
                 problems.append(diagnostics.bare_number(key, entry))
             continue
-        values[key] = entry.get("value")
         source = entry.get("source")
-        if source in SOURCES:
+        if source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
+            sources[key] = source
+            values[key] = math.nan
+            continue
+        values[key] = entry.get("value")
+        if source == UNKNOWN:
+            problems.append(diagnostics.not_unknown(key, entry))
+        elif source in SOURCES:
             sources[key] = source
         elif _is_number(key):
             problems.append(diagnostics.no_source(key, source))
@@ -233,7 +242,7 @@ def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (
-            dotted in SECTIONS or not entry.keys() & {"value", "source"}
+            dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
             yield from _entries(entry, dotted + ".")
         else:
@@ -241,7 +250,10 @@ def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
 
 
 def validate(
-    values: Mapping[str, Any], problems: list[str], absent: frozenset[str]
+    values: Mapping[str, Any],
+    problems: list[str],
+    absent: frozenset[str],
+    unknown: frozenset[str] = frozenset(),
 ) -> dict[str, Any]:
     """Check types and ranges; returns the values as their dataclasses take them.
 
@@ -253,11 +265,14 @@ def validate(
         Gets a sentence for each of them.
     absent
         Sections that the file does without; the top, with its texts, is an empty name.
+    unknown
+        Keys without a value: NaN, which is not checked.
     """
     # TOML knows only arrays, and strict validation wants tuples.
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
-        model = _schema(absent).model_validate(given)
+        known = {key: value for key, value in given.items() if key not in unknown}
+        model = _schema(absent, unknown).model_validate(known)
     except ValidationError as error:
         details = error.errors(include_url=False)
         missing = [str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]]
@@ -268,23 +283,21 @@ def validate(
             elif str(detail["loc"][0]) not in missing:
                 problems.append(diagnostics.wrong(detail))
         return given
-    return model.model_dump(by_alias=True)
+    usable: dict[str, Any] = model.model_dump(by_alias=True)
+    problems.extend(diagnostics.unusable_sizes(usable))
+    return usable | dict.fromkeys(unknown, math.nan)
 
 
 @cache
-def _schema(absent: frozenset[str]) -> type[BaseModel]:
+def _schema(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
     """One flat model for all keys: building one a section takes longer than all the rest."""
     definitions: dict[str, Any] = {
         f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
         for index, (key, annotation) in enumerate(keys().items())
-        if key.rpartition(".")[0] not in absent
+        if key.rpartition(".")[0] not in absent and key not in unknown
     }
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return create_model("Profile", __config__=config, **definitions)
-
-
-def _present(section: str, document: Mapping[str, Any]) -> bool:
-    return section not in OPTIONAL_SECTIONS or section in document
 
 
 def _build(section: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401

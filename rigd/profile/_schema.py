@@ -22,8 +22,10 @@ from rigd.devices import (
     Selection,
     ServoDrive,
     Simulation,
+    describe_unknown_values,
 )
 from rigd.devices.parameters import OPTIONAL, WrenchSensor
+from rigd.errors import UserError
 from rigd.safety import Limits
 
 
@@ -143,6 +145,8 @@ WIRING = {
 OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for names in WIRING.values() for name in names))
 TEXTS = ("name", "description")
 SOURCES = ("paper", "datasheet", "measured", "assumed")
+UNKNOWN = "unknown"
+"""Source of what has no value yet: in the parameters it is NaN (see `MAY_BE_UNKNOWN`)."""
 
 
 @cache
@@ -215,6 +219,10 @@ _LEAST_BREAKAWAY = 0.05
 """The least of it, as a fraction of the peak torque."""
 
 
+class UnknownValueError(UserError):
+    """A profile states values as unknown without which nothing can be computed or moved."""
+
+
 @dataclass(frozen=True, slots=True)
 class Profile:
     """One rig, as its profile describes it."""
@@ -264,8 +272,18 @@ class Profile:
         return self.design_motor or self.rig.motor
 
     def loop_model(self) -> LoopModel:
-        """Return what the closed loop's design and prediction need to know of this rig."""
+        """Return what the closed loop's design and prediction need to know of this rig.
+
+        Raises
+        ------
+        UnknownValueError
+            If a value of the profile is unknown: each is named, with the place to find it.
+        """
         rig = self.rig
+        if unknown := describe_unknown_values(rig):
+            raise UnknownValueError(
+                "\n".join(f"{self.path}: {line}" for line in unknown.splitlines())
+            )
         return LoopModel(
             rate_hz=rig.rate_hz,
             beam=rig.beam,

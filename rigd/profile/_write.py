@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.profile._load import ProfileError, profile_of
-from rigd.profile._schema import Profile, is_number, keys
+from rigd.profile._schema import UNKNOWN, Profile, is_number, keys
 
 SettingValue = bool | int | float | str | tuple[str, ...]
 
@@ -23,7 +23,7 @@ class Setting:
     """Dotted: ``cia402.node_id``."""
     value: SettingValue
     source: str = "assumed"
-    """One of the words that a profile knows; only numbers have one."""
+    """One of the words that a profile knows; only numbers have one. Unknown: without the value."""
     reason: str = ""
     """Becomes a comment above the value."""
     hexadecimal: bool = False
@@ -188,6 +188,8 @@ def _line(setting: Setting) -> str:
     shown = json.dumps(value, ensure_ascii=False)
     if not is_number(keys()[setting.key]):
         return f"{name} = {shown}"
+    if setting.source == UNKNOWN:
+        return f'{name} = {{ source = "{UNKNOWN}" }}'
     if setting.hexadecimal and isinstance(value, int):
         shown = f"0x{value:08X}"
     return f'{name} = {{ value = {shown}, source = "{setting.source}" }}'

@@ -11,6 +11,9 @@ from ._planning import largest_amplitude as largest_amplitude
 from ._planning import plan_document as plan_document
 from ._planning import plan_session as plan_session
 from ._planning import predict_session as predict_session
+from ._probing import ProbeFailedError as ProbeFailedError
+from ._probing import ProbeResult as ProbeResult
+from ._probing import probe_in_foreground as probe_in_foreground
 from ._process_group import ProcessGroup as ProcessGroup
 from ._quick_looks import QuickLook as QuickLook
 from ._quick_looks import QuickLooks as QuickLooks
@@ -29,3 +32,4 @@ from ._session import results_document as results_document
 from ._signal_blocks import SignalBlock as SignalBlock
 from ._status import ProcessStatus as ProcessStatus
 from ._status import RigStatus as RigStatus
+from ._tip_slope import with_tip_slope as with_tip_slope

@@ -9,6 +9,7 @@ from typing import Final, Self
 
 import typer
 
+from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
@@ -21,6 +22,7 @@ from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._session import SessionFailedError, SessionProgress, SessionResult
+from rigd.runner._tip_slope import with_tip_slope
 from rigd.runtime import RigLock, StopRequest
 
 _LOOK_PATIENCE_S: Final = 10.0
@@ -67,6 +69,7 @@ def run_in_foreground(
     fast: bool,
     live: bool,
     force: bool,
+    accept: Sequence[str] = (),
     quiet_stdout: bool,
     hardware: bool = False,
     look: bool = False,
@@ -74,6 +77,8 @@ def run_in_foreground(
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
+    identifies_motor: bool = False,
+    tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -89,7 +94,7 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Where the files go; made if it does not exist.
-    repeat, seed, notes, fast, live, force, hardware
+    repeat, seed, notes, fast, live, force, accept, hardware
         As on the command line. The sessions of a series follow each other on one connection: each
         waits until the beam has come to rest.
     quiet_stdout
@@ -105,6 +110,10 @@ def run_in_foreground(
         What a simulated beam meets, as on the command line.
     watch_fit
         Fit each record while it is recorded, and tell.
+    identifies_motor
+        See :class:`rigd.runner._series.Series`.
+    tip_slope_rad
+        Largest slope of the tip in an identification; None: the profile's.
 
     Raises
     ------
@@ -128,15 +137,18 @@ def run_in_foreground(
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
+            specimen = notes.get("specimen", "")
+            check_on_paper(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
+            profile = with_tip_slope(profile, tip_slope_rad)
+            mounted = with_specimen(profile, specimen)
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
-            mounted = with_specimen(profile, notes.get("specimen", ""))
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
                 rig.connect(moving)
@@ -148,7 +160,9 @@ def run_in_foreground(
                 repeat=repeat,
                 notes=notes,
                 force=force,
+                accept=accept,
                 watch_fit=watch_fit,
+                identifies_motor=identifies_motor,
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
@@ -195,6 +209,9 @@ class _Operator:
     def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - told when it is there
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
         self._line = ProgressLine()
+
+    def says(self, level: str, text: str) -> None:
+        self._tell(f"Warning: {text}" if level == "warning" else text)
 
     def shown(self, where: str) -> None:
         if where != self._where:

@@ -34,8 +34,8 @@ _LAST_PATIENCE_S: Final = 60.0
 _STOP_PATIENCE_S: Final = 5.0
 _POLL_S: Final = 0.05
 _KEPT: Final = (
-    "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "modes",
-    "parameters",
+    "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
+    "modes", "parameters",
 )  # fmt: skip
 """What of the last estimate goes into the file; the rest is what pieces are designed from."""
 

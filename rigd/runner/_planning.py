@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,20 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
-    SMALL_SLOPE_RAD,
     Beam,
     LoadedBeam,
     RealisationError,
     TipMotion,
     tip_motion,
 )
+from rigd.checks import Clearance, check_on_paper
 from rigd.control import (
     ClosedLoop,
     ControlDesignError,
     LoopResponse,
-    check_stability,
-    close_loop,
     design_damper,
+    stable_loop,
 )
 from rigd.engine import Ending
 from rigd.errors import UserError
@@ -39,6 +38,13 @@ from rigd.excitation import (
 from rigd.identified_beam import Use, read_identified_beam
 from rigd.profile import Profile
 from rigd.runner._move_plant import loop_model_with, mode_poles, move_plant_of, with_beam
+from rigd.runner._tip_slope import (
+    NOT_IDENTIFYING,
+    is_limited,
+    slope_remedy,
+    tip_document,
+    tip_in_words,
+)
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -48,8 +54,6 @@ _MOST_RAD = 2.0 * math.pi
 """Largest amplitude that an excitation takes."""
 _ROUNDS = 10
 """Steps of the search for the largest amplitude; three or four are needed."""
-_GOING = ("move", "touch")
-"""Excitations that go to an angle: they know where they start, and have no amplitude."""
 _NO_FORCE = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
     "(--force-limit) ends nothing, and points are less precise."
@@ -90,6 +94,8 @@ class Plan:
     """Why it must not be run: a line for each limit that it would leave; empty if it may be run."""
     ending: Ending = field(default_factory=Ending)
     """What follows the record, for the control process."""
+    clearance: Clearance = field(default_factory=Clearance)
+    """What the checks on paper found."""
 
 
 class LoopPreview:
@@ -115,7 +121,7 @@ class LoopPreview:
 
     @cached_property
     def _loop(self) -> ClosedLoop:
-        return close_loop(self._profile.loop_model())
+        return stable_loop(self._profile.loop_model())[0]
 
     def tracking(self, frequency_hz: Real) -> Complex:
         """Angle over reference at some frequencies, of the shape given."""
@@ -209,32 +215,41 @@ def excitation_for(
     start_rad
         Where the motor stands, from the rig's zero; only a move asks for it.
     """
+    if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
+        parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
     return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile, start_rad))
 
 
-def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
-    """Predict a session and refuse one that would leave the profile's limits.
+def plan_session(
+    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+) -> Plan:
+    """Predict a session and refuse one that the checks on paper or the profile's limits forbid.
 
     Parameters
     ----------
-    profile, excitation, force
+    profile, excitation, force, accept
         See `predict_session`.
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError
         Naming every limit the session would leave, and the largest amplitude that passes.
-    ControlDesignError, RealisationError
+    ControlDesignError, RealisationError, UnknownValueError
         As `predict_session`.
     """
-    plan = predict_session(profile, excitation, force=force)
+    plan = predict_session(profile, excitation, force=force, accept=accept)
+    plan.clearance.require()
     if plan.refused:
         raise RefusedError(plan.refused)
     return plan
 
 
-def predict_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
-    """Predict a session and compare it with the profile's limits.
+def predict_session(
+    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+) -> Plan:
+    """Check a session on paper, predict it, and compare it with the profile's limits.
 
     Parameters
     ----------
@@ -243,27 +258,38 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
     force
         Let torques be clipped, of the motor or of the sensor. No other limit can be forced: leaving
         it would end the session.
+    accept
+        Names of rows of `rigd check` that may fail.
 
     Raises
     ------
+    UnknownRowError
+        If `accept` names none.
+    UnknownValueError
+        If a value of the profile is unknown.
     ControlDesignError
         If the loop is unstable.
     RealisationError
         If the beam's damping cannot be realised.
     """
-    loop = close_loop(loop_model_with(profile, excitation.model))
-    unstable = check_stability(loop)
+    clearance = check_on_paper(profile, accept)
+    loop, unstable = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(loop, excitation)
     firm, forcible = (
         [finding for limited in channels if (finding := limited.violation())]
         for channels in _limited(profile, prediction)
     )
-    refusals: list[str] = []
-    if firm or (forcible and not force):
+    refusals = list(clearance.refusals)
+    slope = _slope(profile, prediction) if is_limited(excitation) else None
+    too_steep = slope is not None and slope.violation()
+    if firm or too_steep or (forcible and not force):
         lower = _remedy(profile, excitation, force=force)
-        refusals = [f"{finding}; {lower}." for finding in firm]
+        refusals += [f"{finding}; {lower}." for finding in firm]
+        if slope is not None and too_steep:
+            remedy = slope_remedy(excitation, slope.value, slope.limit)
+            refusals.append(f"{too_steep}; {lower}{remedy}.")
         refusals += [f"{finding}; {lower}, or allow clipping with --force." for finding in forcible]
-    warnings = [unstable] if unstable else []
+    warnings = [*clearance.warnings, *([unstable] if unstable else [])]
     if not refusals:
         warnings += [f"{finding}: it will be clipped and flagged." for finding in forcible]
     if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
@@ -271,15 +297,16 @@ def predict_session(profile: Profile, excitation: Excitation, *, force: bool = F
     return Plan(
         prediction,
         warnings=tuple(warnings),
-        tip_in_words=_tip_in_words(prediction, profile.rig.beam, excitation.kind),
+        tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
         refused="\n".join(refusals),
         ending=_ending(loop, stays=excitation.stays),
+        clearance=clearance,
     )
 
 
 def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
     """Say what of an excitation is to be changed where it would leave the limits."""
-    if excitation.kind in _GOING:
+    if excitation.kind in NOT_IDENTIFYING:
         return "go less far or slower"
     largest_rad = largest_amplitude(profile, excitation, force=force)
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
@@ -320,12 +347,17 @@ def largest_amplitude(
     """
     if excitation.kind in ("modes", "until") or not _has_amplitude(excitation.kind):
         return None
-    loop = close_loop(profile.loop_model())
+    loop, _ = stable_loop(profile.loop_model())
     given_rad = abs(float(excitation.parameters["amplitude_rad"]))
+    # Chirps count as all others here: what is offered keeps the range of the linear model.
+    steepest = _slope(profile, predict(loop, excitation))
 
     def share_at(amplitude_rad: float) -> float:
-        reference_rad = excitation.reference_rad * (amplitude_rad / given_rad)
+        scale = amplitude_rad / given_rad
+        reference_rad = excitation.reference_rad * scale
         firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
+        if steepest is not None:
+            firm += (replace(steepest, value=steepest.value * scale),)
         return _share(firm if force else firm + forcible)
 
     # All peaks are proportional to the amplitude, but for the friction compensation in the torque.
@@ -363,15 +395,17 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
         "ends_itself": excitation.search is not None,
         **asdict(plan.prediction),
+        "tip": tip_document(plan.prediction.tip, profile.rig.beam),
         "limits": {
             "angle_rad": profile.limits.angle_rad,
             "velocity_rad_s": profile.limits.velocity_rad_s,
             "torque_nm": profile.rig.motor.peak_torque_nm,
             "tracking_error_rad": profile.limits.tracking_error_rad,
             "coupling_torque_nm": _sensor_limit_nm(profile),
-            "tip_slope_rad": SMALL_SLOPE_RAD,
+            "tip_slope_rad": profile.limits.tip_slope_rad,
         },
         "refused": plan.refused or None,
+        "failed_checks": [asdict(each) for each in plan.clearance.failed],
         "tip_in_words": plan.tip_in_words,
         "beam": asdict(profile.rig.beam),
         "damping": asdict(profile.rig.damping),
@@ -461,36 +495,39 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
         If the loop is unstable and the response grows beyond all numbers.
     """
     response = loop.simulate(excitation.reference_rad)
+    peaks = _peaks(excitation.reference_rad, response)
+    angle_rad = response.angle_rad.copy()
+    del response  # an hour of it takes 150 MB, and the tip as much again
     model = loop.model
-    tip = None
     if model.beam is not None:
         tip = tip_motion(
             model.beam,
             model.damping,
-            response.angle_rad,
+            angle_rad,
             model.rate_hz,
             tip_mass_kg=model.tip_mass_kg,
             root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
         )
-    peaks = _peaks(excitation.reference_rad, response, tip)
-    if excitation.kind not in _GOING:
+        peaks = replace(peaks, tip=tip)
+    if excitation.kind not in NOT_IDENTIFYING:
         return peaks
     start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
-    return replace(peaks, peak_angle_rad=_peak(start_rad + response.angle_rad))
+    return replace(peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
-def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = None) -> Prediction:
+def _peaks(reference_rad: Real, response: LoopResponse) -> Prediction:
     return Prediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
         peak_torque_nm=_peak(response.torque_nm),
         peak_tracking_error_rad=_peak(reference_rad - response.angle_rad),
         peak_coupling_torque_nm=_peak(response.coupling_torque_nm),
-        tip=tip,
     )
 
 
-def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str]:
+def predicted_metadata(
+    profile: Profile, predicted: Prediction, excitation: Excitation
+) -> dict[str, str]:
     """Return the predicted peaks and their limits as a session's file has them.
 
     Parameters
@@ -499,6 +536,8 @@ def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str
         Profile of the rig, with its limits.
     predicted
         What the session is predicted to do.
+    excitation
+        Excitation of the session; what it plans while it runs keeps its own limit of the slope.
 
     Returns
     -------
@@ -507,30 +546,13 @@ def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str
     """
     firm, forcible = _limited(profile, predicted)
     metadata = {}
-    for peak in (*firm, *forcible):
+    slope = _slope(profile, predicted)
+    if slope is not None and excitation.search is not None:
+        slope = replace(slope, value=max(slope.value, excitation.search.tip_slope_rad))
+    for peak in (*firm, *forcible, *(() if slope is None else (slope,))):
         metadata[f"predicted_peak_{_KEYS[peak.name]}"] = repr(peak.value)
         metadata[f"limit_{_KEYS[peak.name]}"] = repr(peak.limit)
     return metadata
-
-
-def _tip_in_words(predicted: Prediction, beam: Beam, kind: str) -> str:
-    tip = predicted.tip
-    if tip is None:
-        return ""
-    share = tip.deflection_m / beam.length_m
-    motion = (
-        f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * share:.2g} % of the length), "
-        f"tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
-    )
-    if not tip.slope_rad > SMALL_SLOPE_RAD:
-        return motion
-    lower = math.floor(100 * SMALL_SLOPE_RAD / tip.slope_rad) / 100
-    scales = lower > 0 and kind not in _GOING
-    within = f"; {lower:g} times the amplitude stays within" if scales else ""
-    return (
-        f"{motion} At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error "
-        f"up to {100 * tip.slope_rad**2 / 3:.2g} %), and air drag may limit the motion{within}."
-    )
 
 
 _KEYS = {
@@ -539,6 +561,7 @@ _KEYS = {
     "tracking error": "tracking_error_rad",
     "coupling torque": "coupling_torque_nm",
     "torque": "torque_nm",
+    "tip slope": "tip_slope_rad",
 }
 """Names of the limited peaks as keys of metadata."""
 
@@ -597,6 +620,14 @@ def _limited(
         ),
     )
     return firm, forcible
+
+
+def _slope(profile: Profile, predicted: Prediction) -> _Limited | None:
+    """Return the slope of the tip with its limit for an identification; None without a beam."""
+    if predicted.tip is None:
+        return None
+    key, limit_rad = "limits.tip_slope_rad", profile.limits.tip_slope_rad
+    return _Limited("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
 
 
 def _share(channels: tuple[_Limited, ...]) -> float:

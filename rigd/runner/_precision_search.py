@@ -29,6 +29,7 @@ from rigd.excitation import (
 )
 from rigd.profile import Profile
 from rigd.runner._planning import LoopPreview
+from rigd.session import Validity
 from rigd.units import with_half_width, with_share
 
 Real = NDArray[np.float64]
@@ -452,17 +453,19 @@ class Search:
     ) -> FitTold:
         """Return an estimate with a row of the table of what is asked for."""
         state = {"left_s": self._course.left_s, "targets": targets_json(found)}
-        text = [] if quietly else self._rows(found, time_s)
+        validity = Validity.of_document(document.get("validity"))
+        text = [] if quietly else self._rows(found, time_s, validity)
         return FitTold({**document, "search": state, "text": text})
 
-    def _rows(self, found: Sequence[Stated], time_s: float) -> list[str]:
+    def _rows(self, found: Sequence[Stated], time_s: float, validity: Validity) -> list[str]:
         """Return the next row of the table, with its heads where these are new."""
         rows = []
         columns = [each.name for each in found]
         if columns != self._columns:
             self._columns = columns
             heads = "".join(f"{name:<{_WIDTH}}" for name in columns)
-            rows.append(f"  time  {heads}left   (± one standard deviation)")
+            about = f"± one standard deviation; tip slope {validity.short}"
+            rows.append(f"  time  {heads}left   ({about})")
         left_s = self._course.left_s
         cells = "".join(f"{_cell(each):<{_WIDTH}}" for each in found)
         return [*rows, f"{time_s:5.1f} s {cells}{'' if left_s is None else f'{left_s:.0f} s'}"]

@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from rigd import __version__
+from rigd.checks import FailedCheck
 from rigd.devices import (
     WhatMoves,
     check_selection,
@@ -70,6 +71,8 @@ class Order:
     """Fit the record while it is recorded."""
     seed: int | None = None
     """Seed of a simulated rig's noise; None: a fresh one."""
+    accepted: tuple[FailedCheck, ...] = ()
+    """Rows of `rigd check` that failed and that the operator accepted."""
 
 
 def load_rig(
@@ -383,6 +386,8 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         **dict(order.predicted),
         **dict(order.notes),
     }
+    if order.accepted:
+        metadata["accepted_checks"] = ", ".join(each.name for each in order.accepted)
     serial_number = connected.calibration.get("serial_number")
     if isinstance(serial_number, str):
         metadata["sensor_serial_number"] = serial_number

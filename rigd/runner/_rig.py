@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, WhatMoves
+from rigd.devices import DeviceError, WhatMoves, describe_unknown_values
 from rigd.engine import (
     CONTROL,
     LIVE,
@@ -18,6 +18,7 @@ from rigd.engine import (
     Ended,
     Measured,
     Precedence,
+    Probe,
     Pulse,
     Refused,
     SharedState,
@@ -38,6 +39,11 @@ from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
+_SLOW_PATIENCE_S = 30.0
+"""Time for a heartbeat under the virtual clock, whose ticks may wait for replies."""
+_ENABLE_PATIENCE_S = 5.0
+"""Time for enabling a drive, during which there is no heartbeat."""
+_PROBE_PATIENCE_S = 60.0
 _ANSWER_PATIENCE_S = 10.0
 """Time to wait for an answer, beyond the time that is measured."""
 
@@ -114,6 +120,11 @@ class Rig:
         """Identity and calibration of the connected sensor; None while not connected."""
         return None if self._told is None or not self.connected else self._told.calibration
 
+    @property
+    def drive_statement(self) -> Mapping[str, str]:
+        """What the connected drive states of itself; empty while not connected."""
+        return {} if self._told is None or not self.connected else self._told.drive
+
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
 
@@ -127,8 +138,11 @@ class Rig:
         Raises
         ------
         RigError
-            If that fails; everything is closed again then.
+            If that fails; everything is closed again then. Nothing is connected while a value of
+            the profile is unknown.
         """
+        if unknown := describe_unknown_values(self._profile.rig):
+            raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
         if self.connected:
             self.disconnect()
         try:
@@ -259,6 +273,75 @@ class Rig:
         self._zero_set, self.zero_lost = True, False
         return answer
 
+    def probe(self, profile: Profile, stop: StopRequest) -> dict[str, Any]:
+        """Make the probing move of a profile.
+
+        Parameters
+        ----------
+        profile
+            The rig's; its beam may be another.
+        stop
+            The operator's, which ends it.
+
+        Returns
+        -------
+        dict
+            ``end``: name of a `rigd.safety.ProbeEnd`, and the fields of a
+            `rigd.safety.ProbeEstimate`.
+
+        Raises
+        ------
+        RigError
+            If it is stopped, an interlock ends it, or the rig is lost.
+        """
+        group = self._require()
+        board = group.channels.board
+        if self._precedence is not None:
+            self._precedence.cover()
+        _wipe(board)
+
+        def request_stop() -> None:
+            board[Word.STOP] = Stop.OPERATOR
+
+        stop.on_request = request_stop
+        if stop.requested:
+            request_stop()
+        try:
+            group.control.send(Probe(profile))
+            answer = self._await_probe(group, profile)
+        except (ChildError, RigError) as error:
+            self.disconnect()
+            raise RigError(str(error)) from None
+        finally:
+            stop.on_request = _nothing
+            _wipe(board)
+        if isinstance(answer, Refused):
+            raise RigError(answer.reason)
+        assert isinstance(answer, Measured)
+        return answer.values
+
+    def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
+        """Wait for the result of a probing move, and watch over the control process meanwhile."""
+        board, pulse = group.channels.board, Pulse()
+        assert CONTROL.hung_after_s is not None
+        hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
+        until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_PATIENCE_S
+        while True:
+            answer = group.control.poll(_POLL_S)
+            board.beat(Word.SUPERVISOR_BEAT)
+            if isinstance(answer, Ended):
+                raise RigError(answer.reason or "It was stopped.")
+            if answer is not None:
+                return answer
+            now_s = time.monotonic()
+            still_s = pulse.look(board[Word.CONTROL_BEAT], now_s)
+            if still_s > hung_after_s or now_s > until_s:
+                group.control.kill()
+                raise RigError(
+                    "The control process did not end the probing move and was killed: without its "
+                    "heartbeat the drive switches off by itself. Check CPU load."
+                )
+
     def watch(self) -> None:
         """Check whether the control process is well; call it some times a second between sessions.
 
@@ -383,6 +466,10 @@ class Rig:
         with contextlib.suppress(ChildError):
             self._group.control.poll(_ANSWER_PATIENCE_S)
         self.disconnect()
+
+
+def _nothing() -> None:
+    """Leave a stop request to whoever polls it."""
 
 
 def _wipe(board: SharedState) -> None:

@@ -6,9 +6,9 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from rigd.devices import session_seed
 from rigd.engine import Event
@@ -22,7 +22,7 @@ from rigd.runner._planning import (
 )
 from rigd.runner._quick_looks import QuickLooks
 from rigd.runner._request import Order, check_required, choose_path, make_room
-from rigd.runner._rig import Rig
+from rigd.runner._rig import Rig, RigError
 from rigd.runner._session import SessionProgress, SessionResult, always
 from rigd.runner._touch_search import touch_search
 from rigd.runtime import StopRequest
@@ -38,6 +38,9 @@ class SeriesWatcher(Protocol):
 
     def begins(self, number: int, path: Path) -> None:
         """Take note of the next session, from 1 on, and its file; an error ends the series."""
+
+    def says(self, level: Literal["info", "warning"], text: str) -> None:
+        """Take note of what comes before the first session."""
 
     def shown(self, where: str) -> None:
         """Take note of where its live view is, or why there is none."""
@@ -65,8 +68,13 @@ class Series:
         specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
+    accept
+        Names of rows of `rigd check` that may fail; those that do are recorded in the files.
     watch_fit
         Fit each record while it is recorded.
+    identifies_motor
+        The sessions are to measure the motor: a probing move then verifies only what the bounds of
+        travel and speed rest on.
 
     Attributes
     ----------
@@ -77,6 +85,8 @@ class Series:
 
     Raises
     ------
+    CheckFailedError, UnknownRowError
+        If a check on paper fails that is not accepted, or `accept` names no row.
     RefusedError, ControlDesignError, RealisationError
         If the sessions would leave the limits, cannot be predicted, or lack metadata that the
         profile requires.
@@ -93,9 +103,12 @@ class Series:
         repeat: int = 1,
         notes: Mapping[str, str] | None = None,
         force: bool = False,
+        accept: Sequence[str] = (),
         watch_fit: bool = False,
+        identifies_motor: bool = False,
     ) -> None:
         self._watch_fit = watch_fit
+        self._identifies_motor = identifies_motor
         self._profile = profile
         self._excitation = excitation
         self._folder = folder
@@ -107,7 +120,7 @@ class Series:
                 f"--repeat {repeat}: a {excitation.kind} ends elsewhere than it starts and is run "
                 "once; omit the option."
             )
-        self.plan = plan_session(profile, excitation, force=force)
+        self.plan = plan_session(profile, excitation, force=force, accept=accept)
         self._touch = touch_search(profile, excitation)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -160,7 +173,15 @@ class Series:
             If there is no room for a further session.
         RigError, SessionFailedError
             If a session cannot be run, or failed; it is not among the results.
+        ProbeFailedError
+            If a probing move before the first session shows that the rig contradicts its profile.
         """
+        try:
+            probed = {} if stop.requested else self._probe(rig, stop, watcher)
+        except RigError:
+            if stop.requested and rig.connected:
+                return  # the move was stopped, and nothing else happened
+            raise
         for number in range(1, self._repeat + 1):
             if looks is not None and number > 1:
                 _await_look(looks, rig, stop)
@@ -176,11 +197,17 @@ class Series:
                 self._excitation,
                 path,
                 tuple(notes.items()),
-                tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+                tuple(
+                    (
+                        predicted_metadata(self._profile, self.plan.prediction, self._excitation)
+                        | probed
+                    ).items()
+                ),
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
                 self._seed(number),
+                self.plan.clearance.accepted,
             )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:
@@ -201,6 +228,17 @@ class Series:
         if simulation is None or simulation.seed is None:
             return None
         return session_seed(simulation.seed, number)
+
+    def _probe(self, rig: Rig, stop: StopRequest, watcher: SeriesWatcher) -> dict[str, str]:
+        """Make a probing move where motor and encoder are not known; return its metadata."""
+        if self._profile.rig.devices.drive == "sim":
+            return {}
+        from rigd.runner import _probing  # late: a simulation in this process needs none
+
+        result = _probing.verify(
+            self._profile, rig, stop, watcher.says, motor=not self._identifies_motor
+        )
+        return {} if result is None else result.as_metadata()
 
     def _make_room(self) -> None:
         make_room(self._folder, self._excitation, self._profile.limits)

@@ -322,6 +322,7 @@ class Session:
             order.ending,
             touch,
             order.seed,
+            tuple(f"{each.name}: {each.text}" for each in order.accepted),
         )
         group.control.send(job)
         answer = self._listen_to_control()

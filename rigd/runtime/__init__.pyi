@@ -23,6 +23,7 @@ from ._locks import RigLock as RigLock
 from ._locks import held_rig as held_rig
 from ._locks import holds_rig as holds_rig
 from ._plain_files import open_plain_file as open_plain_file
+from ._plain_files import read_plain_file as read_plain_file
 from ._processes import RunningProcess as RunningProcess
 from ._processes import listening_sockets as listening_sockets
 from ._processes import name_this_process as name_this_process

@@ -1,10 +1,15 @@
-"""Text files that a user names, of whatever kind they may turn out to be."""
+"""Files that a user names, of whatever kind they may turn out to be."""
 
 import errno
 import os
 import stat
 from pathlib import Path
-from typing import TextIO
+from typing import Final, TextIO
+
+_FLAGS: Final = os.O_RDONLY | sum(
+    getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NONBLOCK", "O_BINARY")
+)
+"""Windows has not all of them."""
 
 
 def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
@@ -24,9 +29,35 @@ def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) 
     OSError
         If it cannot be opened, or is not of that kind.
     """
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    fd = _open(path, most_bytes)
+    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
+
+
+def read_plain_file(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a file of limited size; a pipe without a writer is not waited for.
+
+    Parameters
+    ----------
+    path
+        Name of the file.
+    most_bytes
+        The limit.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is not of that kind.
+    """
+    with open(_open(path, most_bytes), "rb") as file:
+        return file.read(most_bytes)
+
+
+def _open(path: Path, most_bytes: int) -> int:
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "its name contains a NUL character")
+    fd = os.open(path, _FLAGS)
     status = os.fstat(fd)
     if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
         os.close(fd)
         raise OSError(errno.EINVAL, f"not a file of at most {most_bytes / 1e6:g} MB")
-    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
+    return fd

@@ -12,5 +12,15 @@ from ._limits import Limits as Limits
 from ._limits import Violation as Violation
 from ._monitor import LOOK_EVERY as LOOK_EVERY
 from ._monitor import LimitWatch as LimitWatch
+from ._probe_estimate import ProbeEstimate as ProbeEstimate
+from ._probe_estimate import contradiction as contradiction
+from ._probe_estimate import doubts as doubts
+from ._probe_estimate import estimate_probe as estimate_probe
+from ._probing_move import MEASURED as MEASURED
+from ._probing_move import ProbedRig as ProbedRig
+from ._probing_move import ProbeEnd as ProbeEnd
+from ._probing_move import ProbePlan as ProbePlan
+from ._probing_move import ProbingMove as ProbingMove
+from ._probing_move import plan_probe as plan_probe
 from ._scale_watch import ScaleWatch as ScaleWatch
 from ._sensor_watch import SensorWatch as SensorWatch

@@ -93,7 +93,13 @@ class BeamPrediction:
         self._angle_rad = angle_rad
 
     def step(self, angle_rad: float, torque_nm: float) -> float:
-        """Return the measured coupling torque less the predicted one, in N·m."""
+        """Return the measured coupling torque less the predicted one, in N·m.
+
+        Parameters
+        ----------
+        angle_rad, torque_nm
+            Angle and coupling torque as measured.
+        """
         size = self._size
         input_, output = self._vectors
         input_[size] = angle_rad - self._rest_rad

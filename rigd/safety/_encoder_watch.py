@@ -81,7 +81,7 @@ class EncoderWatch:
     delay_ticks
         Ticks from a command to its torque.
     scales
-        Compares the scales of the readings; None: they are not known yet.
+        Compares the scales of the readings; None: they are not compared.
 
     Attributes
     ----------

@@ -11,6 +11,8 @@ from typing import Annotated, Final
 
 from annotated_types import Ge, Gt, Le, Lt
 
+from rigd.beam import SMALL_SLOPE_RAD
+
 Positive = Annotated[float, Gt(0)]
 BelowAll = Annotated[float, Gt(0), Lt(100)]
 """Per cent; a share is never more than all."""
@@ -60,9 +62,15 @@ class Limits:
     standstill_torque_nm: Annotated[float, Ge(0)] = field(default=0.0, metadata={"optional": True})
     """Net torque on the shaft, motor less coupling torque, that friction never withstands: an
     encoder that stands still has failed. 0: five times ``motor.coulomb_nm``."""
+    torque_ratio: Annotated[float, Gt(1)] = field(default=2.0, metadata={"optional": True})
+    """Ratio of the net torque on the shaft to its inertia times its measured acceleration, or its
+    inverse: 1 if all scales of encoder and motor are right."""
     stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
     """Share of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as for
     `missed_percent`. ``analyze`` takes no record with more than 1 %."""
+    tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
+    """Slope of the antenna's tip that an identification may be predicted to reach; checked before
+    the session, not in it. Beyond the default the linear model is not exact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,17 +111,18 @@ class Violation:
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
         remedy = f" {self.remedy}" if self.remedy else ""
-        told = f"{self.channel[0].upper()}{self.channel[1:]} {self.value:.4g} {self.unit}"
+        channel = f"{self.channel[0].upper()}{self.channel[1:]}"
+        value, limit = (f"{number:.4g} {self.unit}".rstrip() for number in (self.value, self.limit))
         if self.warning is not None:
             side = "below" if self.below else "above"
             where = f", {self.key}" if self.key else ""
             return (
-                f"{told} {side} warning level {self.warning:.4g} {self.unit} "
+                f"{channel} {value} {side} warning level {self.warning:.4g} {self.unit} "
                 f"(limit {self.limit:.4g}{where}).{remedy}"
             )
         how = "below" if self.below else "exceeds"
         where = f" ({self.key})" if self.key else ""
-        return f"{told} {how} limit {self.limit:.4g} {self.unit}{where}.{remedy}"
+        return f"{channel} {value} {how} limit {limit}{where}.{remedy}"
 
 
 # Table of interlocks
@@ -265,8 +274,8 @@ INTERLOCKS: Final = (
     Interlock(
         "scales",
         "ratio of the net torque on the shaft to its inertia times its measured acceleration",
-        "(1 if all scales are right)",
         "",
+        "limits.torque_ratio",
         None,
         Checked.TICK,
         Action.FAULT,

@@ -20,9 +20,6 @@ WINDOW_TICKS = 8
 """Ticks from one mean speed to the next."""
 SPEED_TICKS = 4
 """Ticks over which a mean speed is taken."""
-LIMIT = 2.0
-"""Ratio, and inverse ratio, that is a fault. Motor data wrong by a quarter stay within."""
-
 _TORQUE_ERROR = 0.25
 _MEMORY = 0.995
 """Weight of a window over that of the next."""
@@ -45,12 +42,15 @@ class ScaleWatch:
     ----------
     inertia_kg_m2
         Inertia of the motor.
+    limit
+        Ratio, or inverse ratio, that is a fault; infinite: none is.
     """
 
-    __slots__ = ("_inertia_kg_m2", "_normal", "_windows")
+    __slots__ = ("_inertia_kg_m2", "_limit", "_normal", "_windows")
 
-    def __init__(self, inertia_kg_m2: float) -> None:
+    def __init__(self, inertia_kg_m2: float, limit: float) -> None:
         self._inertia_kg_m2 = inertia_kg_m2
+        self._limit = limit
         self.reset()
 
     def reset(self) -> None:
@@ -103,8 +103,11 @@ class ScaleWatch:
         ratio, deviation = self.estimate()
         row = BY_NAME["scales"]
         low, high = ratio - _SURE * deviation, ratio + _SURE * deviation
-        if low > LIMIT:
-            return Violation(row.channel, ratio, LIMIT, row.unit, row.remedy)
-        if high < 1.0 / LIMIT:
-            return Violation(row.channel, ratio, 1.0 / LIMIT, row.unit, row.remedy, below=True)
+        limit = self._limit
+        if low > limit:
+            return Violation(row.channel, ratio, limit, row.unit, row.remedy, row.limit)
+        if high < 1.0 / limit:
+            return Violation(
+                row.channel, ratio, 1.0 / limit, row.unit, row.remedy, row.limit, below=True
+            )
         return None

@@ -7,7 +7,7 @@ sensor) or of one (a broken gauge, or one clipped at a plausible value).
 """
 
 from collections.abc import Sequence
-from math import ceil, log
+from math import ceil, log, sqrt
 from operator import eq
 
 from rigd.safety._limits import BY_NAME, Violation
@@ -21,11 +21,14 @@ _CHANCE = 1e-12
 """Probability of a run of repeated readings that is taken for impossible."""
 _QUIET = 0.98
 """Fraction of repeated readings at the tare above which repetitions mean nothing."""
-_RARE = 0.2
-"""Fraction of repeated readings at the tare up to which single repetitions are counted."""
-_OFTEN = 0.3
-"""Fraction of repeated readings over `_COUNTED` ticks above which the sensor repeats them."""
-_COUNTED = 64
+_COUNTED = 256
+"""Ticks over which repeated readings are counted."""
+_LEAST_SHARE = 0.1
+_SIGNIFICANT = 8.0
+_LARGEST_SHARE = 0.45
+"""Fraction of repeated readings above which the sensor repeats them: so much, and so many standard
+deviations, more than at the tare. Beyond the largest, readings that repeat the one before every
+second time are not distinguishable."""
 _LEARNED = 100
 """Readings at the tare from which on the fractions are known."""
 
@@ -51,11 +54,11 @@ class SensorWatch:
         "_limits",
         "_noisy",
         "_notices",
-        "_rare",
         "_rate_hz",
         "_repeated",
         "_running",
         "_runs",
+        "_shares",
         "_warned",
     )
 
@@ -76,7 +79,7 @@ class SensorWatch:
         self._runs = [0] * n
         self._running = False
         self._limits: list[int] | None = None
-        self._rare = [False] * n
+        self._shares: list[float] = []
         self._warned: set[str] = set()
 
     def judge(self) -> Violation | None:
@@ -94,8 +97,11 @@ class SensorWatch:
             else:
                 chance = max(share, 1.0 / n)
                 self._limits.append(max(least, ceil(log(_CHANCE) / log(chance))))
-        self._rare = [
-            share <= _RARE and noisy for share, noisy in zip(shares, self._noisy, strict=True)
+        self._shares = [
+            share + max(_LEAST_SHARE, _SIGNIFICANT * sqrt(share * (1.0 - share) / _COUNTED))
+            if noisy
+            else 1.0
+            for share, noisy in zip(shares, self._noisy, strict=True)
         ]
         self._repeated = [0] * len(shares)
         self._counted = 0
@@ -138,16 +144,12 @@ class SensorWatch:
         self._counted += 1
         if self._counted >= _COUNTED:
             repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
-            # All together first, last in each list. What is frozen altogether is named as such.
-            for number in reversed(range(len(runs))):
-                count = repeated[number]
-                if not self._rare[number] or runs[number] > limits[number]:
-                    continue
-                if count > _OFTEN * _COUNTED:
-                    channel = self._channels[number]
-                    return _violation(
-                        "repeated wrench", channel, 100.0 * count / _COUNTED, 100.0 * _OFTEN
-                    )
+            for number, count in enumerate(repeated):
+                share, limit = count / _COUNTED, self._shares[number]
+                if limit < share and limit < _LARGEST_SHARE and runs[number] <= limits[number]:
+                    together = 2 * repeated[-1] > count
+                    channel = "" if together else self._channels[number]
+                    return _violation("repeated wrench", channel, 100.0 * share, 100.0 * limit)
         if max(runs) <= min(limits):
             return None
         for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):

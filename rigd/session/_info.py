@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from rigd.printable import counts_text, grouped, printable
+from rigd.printable import counts_text, grouped, listed, printable
 from rigd.session._format import SessionError, Status
 from rigd.session._online_fit import mode_line
 from rigd.session._quick_look import fit_of
@@ -75,6 +75,8 @@ class SessionInfo:
     """Name → bytes."""
     left_out: list[str]
     """What of the file is not here because it is too much to be shown, in words."""
+    absent: str = ""
+    """What was recorded and is not in the file, in words; empty: nothing, or not known."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as a document of JSON types."""
@@ -102,6 +104,7 @@ class SessionInfo:
             ],
             "attachments": self.attachments,
             "left_out": self.left_out,
+            "absent": self.absent,
         }
 
     def lines(self) -> list[str]:
@@ -109,7 +112,8 @@ class SessionInfo:
         rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", _clock(datetime.fromisoformat(self.start_utc))),
-            *_outcome(self.outcome or {}),
+            *_outcome(self.outcome or {}, is_whole=not self.absent),
+            *([("absent", self.absent)] if self.absent else []),
             *(("recovered", f"{k}: {v}") for k, v in _recovery(self.outcome or {}).items()),
             (
                 "samples",
@@ -165,7 +169,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     # Ticks that are missing at the end leave no gap; only the outcome knows of them.
     scheduled = (session.outcome or {}).get("scheduled", "")
     if scheduled.isascii() and scheduled.isdigit():
-        if len(scheduled) <= _LONGEST_COUNT:
+        if _is_count(scheduled):
             span = max(span, int(scheduled))
         else:
             left_out.append(f"scheduled of the outcome, a number of {len(scheduled)} digits")
@@ -191,7 +195,37 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
             {name: len(data) for name, data in session.attachments.items()}
         ),
         left_out=left_out,
+        absent=_absent(session),
     )
+
+
+def _absent(session: Session) -> str:
+    """Say which samples the outcome or the segments state and the file has not: it was trimmed."""
+    ticks = session.samples["tick"]
+    stated = (session.outcome or {}).get("recorded", "")
+    recorded = int(stated) if _is_count(stated) else 0
+    there = f"those of ticks {ticks[0]} to {ticks[-1]} are" if len(ticks) else "none is"
+    if recorded > len(ticks):
+        return (
+            f"{grouped(recorded - len(ticks))} of the {grouped(recorded)} samples that were "
+            f"recorded are not in this file ({there}): it was trimmed. Take the original."
+        )
+    first, end = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
+    outside = [
+        name
+        for name, (begins, ends) in session.segments.items()
+        if ends > begins and (begins < first or ends > end)
+    ]
+    if outside and (session.outcome or {}).get("outcome") == "complete":
+        return (
+            f"Samples of {listed(outside)} are not in this file ({there}): it was trimmed. Take "
+            "the original."
+        )
+    return ""
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= _LONGEST_COUNT
 
 
 def _cut(text: str, most: int) -> str:
@@ -286,10 +320,11 @@ def _utc(utc_ns: int) -> datetime:
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
 
 
-def _outcome(outcome: dict[str, str]) -> Iterator[tuple[str, str]]:
+def _outcome(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
     told = {"outcome", "reason", "touches", "fit"}
     told |= {_RECOVERED + key for key in _recovery(outcome)}
-    text = outcome.get("outcome", "unknown").capitalize()
+    text = outcome.get("outcome", "unknown")
+    text = text.capitalize() if is_whole else f"Recorded as {text}"
     with suppress(KeyError, ValueError):  # of another program, or of a recovery
         text += f": {counts_text(outcome)}"
         told |= _COUNTS

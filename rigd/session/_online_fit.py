@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from rigd.printable import listed
 from rigd.session._format import Buffer, SessionError, decode_samples
+from rigd.session._validity import Validity
 from rigd.units import decimals, with_half_width
 
 _VERSION: Final = 1
@@ -215,7 +216,9 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     found = [f"  {sentence}" for sentence in answer["findings"]]
     if answer["problem"]:
         return [f"After {answer['duration_s']:.1f} s: {answer['problem']}", *found]
-    lines = [f"After {answer['duration_s']:.1f} s (± 95 %, statistical only):"]
+    validity = Validity.of_document(answer.get("validity")).short
+    head = f"± 95 %, statistical only; tip slope {validity}"
+    lines = [f"After {answer['duration_s']:.1f} s ({head}):"]
     earlier = {mode["mode"]: mode for mode in (before or {}).get("modes", ()) if mode["shown"]}
     for mode in answer["modes"]:
         if mode["shown"]:

@@ -6,12 +6,14 @@ session file has of its record.
 """
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
+from rigd.session._validity import Validity
 from rigd.units import finite_number
 
 Document = dict[str, Any]
@@ -22,6 +24,8 @@ LOOK_VERSION: Final = 1
 """Version of its layout."""
 
 _MOST_BYTES: Final = 1 << 20
+_WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags with which a pipe reads as empty; Windows has neither."""
 _MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_READ: Final = 200
@@ -71,6 +75,7 @@ def read_look(path: Path) -> Document | None:
             **{name: _text(found.get(name) or "") for name in _TEXTS},
             **{name: int(found.get(name) or 0) for name in _TIMES},
             "modes": modes_of(found.get("modes")),
+            "validity": Validity.of_document(found.get("validity")).as_json(),
             "response": _response(found.get("response")),
             "model": _curves(found.get("model"), (*_CURVES, *_BAND)),
             **{name: [_text(line) for line in found.get(name) or []] for name in _LINES},
@@ -138,7 +143,8 @@ def _start_utc_ns(path: Path) -> int:
 
 
 def _content(path: Path) -> bytes:
-    with path.open("rb") as file:
+    descriptor = os.open(path, os.O_RDONLY | _WITHOUT_WAITING)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - of a descriptor
         return file.read(_MOST_BYTES)
 
 
@@ -186,7 +192,8 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     Returns
     -------
     dict or None
-        ``duration_s`` of the record that was fitted, ``problem``, ``modes`` as of `modes_of`,
+        ``duration_s`` of the record that was fitted, ``problem``, ``validity`` as of
+        `Validity.as_json`, ``modes`` as of `modes_of`,
         ``parameters`` by name, ``findings``, and ``search`` of a session that went on until a
         precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
         ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None if there is none that can
@@ -203,6 +210,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         return {
             "duration_s": max(duration_s or 0.0, 0.0),
             "problem": _text(found.get("problem") or ""),
+            "validity": Validity.of_document(found.get("validity")).as_json(),
             "modes": modes_of(found.get("modes")),
             "parameters": {name: value for name, value in parameters.items() if value is not None},
             "findings": [_text(line) for line in found.get("findings") or []],

@@ -7,12 +7,13 @@ and is then renamed to its own name, never over another file.
 
 import contextlib
 import errno
+import io
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -89,6 +90,18 @@ _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
 
 
+class _CountedFile(io.FileIO):
+    """A file that counts the bytes that were written to it."""
+
+    written = 0
+
+    def write(self, data: Any, /) -> int:  # noqa: ANN401 - whatever bytes are in
+        """Write, and count."""
+        count = super().write(data)
+        self.written += count
+        return count
+
+
 class SessionWriter:
     """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
 
@@ -124,14 +137,17 @@ class SessionWriter:
         self._failed = False
         with self._explained():
             try:
-                descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+                # Appended to, so that bytes which another program takes away are missed at the end.
+                flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_APPEND
+                descriptor = os.open(self.part, flags, 0o666)
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.part} exists: another session is being recorded to it or was "
                     "interrupted. Choose another name or move that file away; nothing is "
                     "overwritten."
                 ) from None
-            self._stream = os.fdopen(descriptor, "wb")
+            self._raw = _CountedFile(descriptor, "wb")
+            self._stream = io.BufferedWriter(self._raw)
             mark_as_written(descriptor)
             # Only now, so that a writer that finishes in between is seen.
             if os.path.lexists(path):
@@ -331,11 +347,19 @@ class SessionWriter:
             self.part.unlink(missing_ok=True)
 
     def _check_place(self) -> None:
-        """Notice that the file has gone from under its name; writing to it would still succeed."""
+        """Check that the file is under its name and as long as what was written to it.
+
+        Writing to one that was removed or shortened would still succeed.
+        """
         if not self._is_in_place():
             raise SessionError(
                 f"{self.part} was removed or moved while it was recorded. Do not change the folder "
                 "of a running session."
+            )
+        if os.fstat(self._stream.fileno()).st_size != self._raw.written:
+            raise SessionError(
+                f"{self.part} was shortened or written to by another program while it was "
+                "recorded. Do not change the files of a running session."
             )
 
     def _is_in_place(self) -> bool:
@@ -552,7 +576,12 @@ def rename_new(source: Path, target: Path) -> None:
         # A file system without hard links (FAT, some network shares): reserve the name, which
         # fails if the name is taken, and replace the empty file that then is our own.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-        source.replace(target)
+        try:
+            source.replace(target)
+        except OSError:
+            with contextlib.suppress(OSError):
+                target.unlink()  # else it would keep the name from a recovery
+            raise
     else:
         source.unlink()
 
@@ -572,7 +601,7 @@ def is_being_written(path: Path) -> bool:
     if fcntl is None:
         return False
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would be waited for
     except OSError:
         return False
     try:

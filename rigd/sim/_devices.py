@@ -44,7 +44,7 @@ class Stuck:
     Parameters
     ----------
     every
-        Of so many readings in a row one is new; 0: none is.
+        Number of readings of which the first is new; 0: none is.
     """
 
     __slots__ = ("_count", "_every", "_value")

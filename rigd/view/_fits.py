@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session import unseen_modes
+from rigd.session import Validity, unseen_modes
 from rigd.units import suffix_of, unit_of, with_half_width, with_share
 from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
 from rigd.view._session_info import plain
@@ -168,6 +168,8 @@ def fit_table(fit: Fit | None) -> str:
     unseen = unseen_modes(fit.get("modes", ()))
     if unseen:
         parts.append(f"Not visible so far: {unseen}.")
+    if modes:
+        parts.append(Validity.of_document(fit.get("validity")).sentence)
     rows = [_parameter_row(*each) for each in fit.get("parameters", {}).items()]
     if rows:
         parts.append(_markdown("parameter", "value", rows=[row for row in rows if row]))

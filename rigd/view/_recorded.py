@@ -1,6 +1,5 @@
 """Recorded sessions as Rerun shows them."""
 
-import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
+from rigd.documents import DocumentError, parse_toml
 from rigd.session import Session, SessionError, Status, fit_of, touch_line, touches_of
 from rigd.text_table import decode_text
 from rigd.units import unit_of
@@ -113,12 +113,12 @@ _LIMITS: Final = {
 def _stated_limits(profile: bytes) -> dict[str, float]:
     """Return the limits that a profile states and that can be used; it may be of any version."""
     try:
-        table = tomllib.loads(decode_text(profile))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        table = parse_toml(decode_text(profile))
+    except (UnicodeDecodeError, DocumentError):
         return {}
     limits = {}
     for name, (section, key) in _LIMITS.items():
-        with suppress(KeyError, TypeError, ValueError):
+        with suppress(KeyError, TypeError, ValueError, OverflowError):
             if (limit := float(table[section][key]["value"])) > 0.0:
                 limits[name] = limit
     return limits
@@ -140,11 +140,11 @@ def nominal_damping(profile: bytes) -> Damping | None:
     Only these numbers are looked for: the profile of an older or of a newer program serves as well.
     """
     try:
-        table = tomllib.loads(decode_text(profile))["beam"]["damping"]
+        table = parse_toml(decode_text(profile))["beam"]["damping"]
         zeta, alpha, gamma, lambda_ = (
             float(table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
         )
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
     # Comparisons are false of what is not a number.
     usable = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf

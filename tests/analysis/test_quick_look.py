@@ -47,6 +47,15 @@ def test_the_modes_are_those_of_the_whole_judgement(chirps, selection):
     assert look["flags"] == [finding.sentence for finding in selection.verdict.findings]
 
 
+def test_the_modes_have_their_validity(chirps, short_chirps):
+    """The files state no slope: it is that of the whole judgement, by the fitted beam."""
+    _, (look, _) = chirps
+    validity = whole_record(load_record(short_chirps[0])).validity
+    assert look["validity"] == validity.as_json()
+    assert look["validity"]["predicted_peak_tip_slope_rad"] > 0.05
+    assert f"  {validity.sentence}" in look["text"]
+
+
 def test_the_response_keeps_the_height_of_the_resonances(chirps):
     _, (look, _) = chirps
     response = look["response"]
@@ -214,7 +223,8 @@ def test_the_text_is_for_a_terminal(chirps):
     assert head == f"Quick look at {paths[1].stem}; ± 95 %, statistical only:"
     assert modes[0].startswith("  mode 1: 2.5")
     assert modes[2].endswith(" %")
-    assert modes[3].startswith("  mean coherence 0.")
+    assert modes[3].startswith("  Tip slopes up to 0.")
+    assert modes[4].startswith("  mean coherence 0.")
     assert look["text"][-1] == f"  {look['against_last']['sentence']}"
 
 

@@ -152,6 +152,14 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert "torn.mcap" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     text = (tmp_path / "tables.txt").read_text()
+    # No number without its validity: that of the worst session.
+    slope_rad = max(each.validity.predicted_peak_tip_slope_rad for each in found.sessions)
+    assert found.validity.predicted_peak_tip_slope_rad == slope_rad > 0.14
+    assert found.validity.sentence in text
+    assert found.validity.sentence in page
+    assert content["validity"] == content["headlines"][-1]["validity"] == found.validity.as_json()
+    for of_file in (*content["headlines"][:-1], *content["files"]):
+        assert of_file["validity"]["predicted_peak_tip_slope_rad"] > 0.14
     for words in ("Table 3", "Table 4", "Table 5", "Pooled", "Leave-one-out", "torn"):
         assert words in text
     for name in ("table5", "nominal_indices", "welch_bias", "pooled", "validation", "session_list"):

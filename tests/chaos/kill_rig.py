@@ -282,7 +282,7 @@ class Scene:
         if mode != "direct":
             self.start_simulator()
         options = ["--rest", REST_S, "--duration", self._sweep_s, "--ring-down", RING_DOWN_S]
-        options += ["--stop-hz", 10, "--json"]
+        options += ["--stop-hz", 10, "--json", *self._accepted]
         if mode == "daemon":
             self.supervisor = self._serve()
             wait_for(lambda: self.state == "ready", _STARTED_S, "daemon that is ready")
@@ -291,6 +291,14 @@ class Scene:
             self.session = self.supervisor = self._start(
                 "run", "chirp", "--no-look", *self._where, *options
             )
+
+    @property
+    def _accepted(self) -> list[str]:
+        """The limits of CHANGES let the shaft of a wired rig turn beyond its stop."""
+        if self.mode == "direct":
+            return []
+        ways = "loop_fails", "no_angle", "encoder_fails", "missed_ticks"
+        return [word for way in ways for word in ("--accept", f"travel_{way}")]
 
     @property
     def _where(self) -> list[object]:
@@ -448,6 +456,7 @@ class Scene:
     def _short_session(self) -> tuple[int, str]:
         """Return its exit code and what was said."""
         hold = ["hold", "--duration", 0.5, "--rest", 0.1, "--ring-down", 0.1, "--json"]
+        hold += self._accepted
         if self.mode == "daemon":
             done = self._command("start", *hold)
         else:

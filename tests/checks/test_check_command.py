@@ -48,7 +48,7 @@ def test_json_is_one_document(rigd, stand_ins):
     assert set(document) == {"verdict", "rows"}
     assert document["verdict"] == "warnings"
     assert all(
-        set(row) == {"group", "what", "found", "wanted", "verdict", "detail"}
+        set(row) == {"group", "what", "found", "wanted", "verdict", "detail", "name"}
         for row in document["rows"]
     )
     assert {row["verdict"] for row in document["rows"]} <= {"ok", "warning", "failed", "skipped"}

@@ -75,7 +75,7 @@ def test_json_is_the_document_of_every_check(rigd):
     document = json.loads(done.stdout)
     assert set(document) == {"verdict", "rows"}
     for row in document["rows"]:
-        assert set(row) == {"group", "what", "found", "wanted", "verdict", "detail"}
+        assert set(row) == {"group", "what", "found", "wanted", "verdict", "detail", "name"}
         assert row["group"] == "EDS"
         assert row["verdict"] in ("ok", "warning", "failed", "skipped")
 

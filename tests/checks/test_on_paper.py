@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks._on_paper import profile_rows, record_row, wiring_rows
+from rigd.checks._on_paper import profile_rows, record_rows, wiring_rows
 from rigd.checks._rows import Row, Verdict, overall
 from rigd.devices.canbus._budget import bus_load
 from rigd.excitation import ExcitationError, chirp
@@ -44,11 +44,11 @@ def test_a_profile_without_assumptions_has_no_warning(can_profile):
 
 
 def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
-    row = record_row(can_profile)
+    (row,) = record_rows(can_profile)
     assert (row.found, row.verdict, row.detail) == ("2400 s at 1000 Hz", Verdict.OK, "")
     assert row.wanted == "136 s (run chirp)"
     fast = replace(can_profile, rig=replace(can_profile.rig, rate_hz=20_000.0))
-    row = record_row(fast)
+    (row,) = record_rows(fast)
     assert (row.found, row.verdict) == ("120 s at 20000 Hz", Verdict.WARNING)
     assert "2400000 samples can be analysed" in row.detail
     with pytest.raises(ExcitationError, match="120 s is the most"):

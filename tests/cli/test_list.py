@@ -27,7 +27,12 @@ def sessions(record_briefly, write_look, write_report):
     first = record_briefly("first", specimen="antenna 3", operator="Ada")
     write_look(first, mode(2.600, 0.002, 0.00910, 0.00008), mode(16.3))
     second = record_briefly("second", specimen="antenna 3", day=1.5, outcome="stopped")
-    write_report(second, mode(2.570, 0.002, 0.00905, 0.00008), mode(16.3))
+    write_report(
+        second,
+        mode(2.570, 0.002, 0.00905, 0.00008),
+        mode(16.3),
+        validity={"predicted_peak_tip_slope_rad": 0.6, "linear_model_error": 0.12},
+    )
     record_briefly("third", specimen="antenna 4", day=2)
     second.with_name("text.mcap").write_text("no session")
 
@@ -40,8 +45,10 @@ def test_the_newest_come_first_with_their_modes_and_problems(listed):
     ]  # fmt: skip
     assert [cell.strip() for cell in told[2].split("  ") if cell.strip()][1:] == [
         "second.mcap", "antenna 3", "chirp", "stopped", "2.57 Hz 0.905 %, 16.3 Hz 0.5 %",
-        "report",
+        "0.6 rad, error ≤ 12 %", "report",
     ]  # fmt: skip
+    assert "unknown" in told[3]  # of the look at the first session, which states no slope
+    assert "unknown" not in told[1] + told[2]
     assert "text.mcap" in told[4]
     assert told[5].startswith("text.mcap: ")
     assert "is not an MCAP file" in told[5]
@@ -56,6 +63,8 @@ def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
     assert "-0.55 % " in second
     assert second.count("*") == 1
     assert first.index("●") > second.index("●")
+    assert "unknown" in first
+    assert "0.6 rad, error ≤ 12 %" in second
     assert told[4].startswith("mode 2")
     assert "*" not in "".join(told[4:7])
 

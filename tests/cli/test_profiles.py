@@ -1,7 +1,9 @@
 """``rigd profiles``: a new profile from a drive's EDS, that loads and says what is to be done."""
 
+import json
 import re
 import shutil
+from math import isnan
 
 import pytest
 from cases import further
@@ -9,8 +11,11 @@ from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text, without
 from typer.testing import CliRunner
 
 from rigd.cli.app import app
+from rigd.devices import MAY_BE_UNKNOWN
 from rigd.profile import load_profile
 from rigd.profile._from_eds import QUESTIONS
+
+ASKED = {question.key for question in QUESTIONS}
 
 
 @pytest.fixture
@@ -57,11 +62,17 @@ def test_it_gets_past_loading_in_a_check(new, rigd_here, monkeypatch, name):
     monkeypatch.setattr("rigd.checks._check.inspect_devices", lambda _: [])
     new(eds_path(name))
     done = rigd_here("check", "--profile", "my_rig.toml", "--json")
+    assert done.returncode == 1, done.stdout
+    assert done.stderr == ""
+    rows = [row for row in json.loads(done.stdout)["rows"] if row["verdict"] == "failed"]
+    assert [row["what"] for row in rows if row["name"] == "unknown_values"] == [
+        key for key in MAY_BE_UNKNOWN if key in ASKED
+    ]
     # What a drive lacks is not accepted by itself.
     lacks = {"e35": "watchdog", "epos4_0110": "torque_limit", "epos4_0170": "torque_limit"}
-    assert done.returncode == (1 if name in lacks else 0), done.stdout
-    assert lacks.get(name, "") in done.stdout
-    assert done.stderr == ""
+    others = [row for row in rows if row["name"] != "unknown_values"]
+    assert {row["name"] for row in others} == ({"eds"} if name in lacks else set())
+    assert lacks.get(name, "") in " ".join(row["detail"] for row in others)
 
 
 def test_what_no_file_tells_is_marked_and_listed(new, tmp_path):
@@ -69,9 +80,12 @@ def test_what_no_file_tells_is_marked_and_listed(new, tmp_path):
     text = (tmp_path / "my_rig.toml").read_text()
     profile = load_profile(tmp_path / "my_rig.toml")
     for question in QUESTIONS:
-        assert f"  {question.key} = " in done.stderr
-        assert profile.sources.get(question.key, "assumed") == "assumed"
+        unknown = question.key in MAY_BE_UNKNOWN
+        assert f"  {question.key} = {'unknown' if unknown else ''}" in done.stderr
+        source = "unknown" if unknown else "assumed"
+        assert profile.sources.get(question.key, "assumed") == source
         name = question.key.rpartition(".")[2]
+        assert not unknown or f'\n{name} = {{ source = "unknown" }}\n' in text
         assert re.search(rf"^# TO FILL IN: [^\n]*\n(# [^\n]*\n)*{name} = ", text, re.MULTILINE)
     shown = (
         r'^# TO FILL IN: the drive lacks[^\n]*\n(# [^\n]*\n)+# accept_without = \["torque_limit"\]$'
@@ -179,16 +193,16 @@ def test_a_terminal_is_asked(asked, tmp_path):
     profile = load_profile(tmp_path / "my_rig.toml")
     assert profile.rig.can.channel == "can1"
     assert profile.rig.cia402.node_id == 5
-    assert profile.rig.cia402.gear_ratio == 100.0
+    assert isnan(profile.rig.cia402.gear_ratio)
     assert profile.rig.cia402.rated_torque_unit_nm == 1e-6
     assert profile.rig.motor.rated_torque_nm == 0.6
     assert profile.rig.motor.peak_torque_nm == 1.2
     assert profile.rig.motor.continuous_torque_nm == 0.5
     assert profile.sources["motor.peak_torque_nm"] == "datasheet"
-    assert profile.sources["cia402.gear_ratio"] == "assumed"
+    assert profile.sources["cia402.gear_ratio"] == "unknown"
     assert "less than or equal to 127" in done.stderr
     assert "To fill in" in done.stderr
-    assert "  cia402.gear_ratio = 100.0" in done.stderr
+    assert "  cia402.gear_ratio = unknown" in done.stderr
     assert "  cia402.node_id" not in done.stderr
 
 

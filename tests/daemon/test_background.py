@@ -1,7 +1,6 @@
 """Predictions and checks of the daemon, made in a process of their own, whatever else is done."""
 
 import asyncio
-import json
 import pickle
 import resource
 import subprocess
@@ -40,6 +39,17 @@ def test_a_prediction_is_that_of_a_start_and_needs_no_rig(operate, profile):
     assert refused["largest_amplitude_rad"] == largest_rad
     assert "exceeds" in refused["plan"]["refused"]
     assert operated.ask("predict", excitation="hold")["largest_amplitude_rad"] is None
+
+
+def test_the_limit_of_the_slope_is_given_with_a_request(operate):
+    """As a member of it, or as clients of before an update have it: among the parameters."""
+    operated = operate()
+    plan = operated.ask("predict", **loud(0.05), tip_slope_rad=2.0)["plan"]
+    assert "tip slope" not in (plan["refused"] or "")
+    assert plan["limits"]["tip_slope_rad"] == 2.0
+    older = {"targets": "damping 1%", "tip_slope_rad": 0.2}
+    plan = operated.ask("predict", excitation="until", parameters=older)["plan"]
+    assert plan["parameters"]["tip_slope_rad"] == plan["limits"]["tip_slope_rad"] == 0.2
 
 
 def test_what_no_prediction_can_be_made_of_is_refused(operate):
@@ -102,9 +112,10 @@ def test_a_prediction_without_the_memory_is_refused(profile):
         capture_output=True,
         check=True,
     )
-    answer = json.loads(told.stdout)
-    assert "not enough free memory" in answer["error"]
-    assert answer["wrong_use"]
+    answer = pickle.loads(told.stdout)
+    assert isinstance(answer, CommandError)
+    assert "not enough free memory" in str(answer)
+    assert answer.wrong_use
 
 
 def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):

@@ -78,6 +78,7 @@ def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
     assert (metadata["specimen"], metadata["beam_length_m"]) == ("antenna 4", "0.95")
     assert (metadata["meta_temperature_c"], metadata["meta_batch"]) == ("21.4", "7")
     assert session.number("predicted_peak_torque_nm") == plan["peak_torque_nm"]
+    assert session.number("predicted_peak_tip_slope_rad") == plan["tip"]["slope_rad"]
     assert session.number("limit_torque_nm") == plan["limits"]["torque_nm"]
     assert session.attachments["specimen.toml"].decode() == SPECIMEN
     assert subject_of_session(session).damping.zeta == 8e-5

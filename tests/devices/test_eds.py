@@ -91,6 +91,14 @@ AS_OTHERS_WRITE = {
     + "\n[ManufacturerObjects]\n1=0x2000\n1=0x2001\n",
     "neither section nor key": lambda text: text + "\nnonsense\n=\n]x[\n[\n",
     "comments that lack lines": lambda text: text + "\n[Comments]\nLines=99\nLine1=x\n",
+    "flags as words": lambda text: text.replace("PDOMapping=1", "PDOMapping=TRUE")
+    .replace("PDOMapping=0", "PDOMapping=FALSE").replace("BaudRate_1000=1", "BaudRate_1000=TRUE"),
+    "values in quotes": lambda text: "\n".join(
+        "{}={}{}{}".format(*(key, mark, value, mark)) if value else line
+        for line in text.split("\n")
+        for key, _, value in [line.partition("=")]
+        for mark in ["\"" if len(line) % 2 else "'"]
+    ),
     "dummies without values": lambda text: text + "\n[DummyUsage]\nDummy0001=\n",
     "empty values": lambda text: text.replace(
         "PDOMapping=0", "PDOMapping=\nLowLimit=\nHighLimit=\nParameterValue=\nObjFlags="

@@ -35,7 +35,7 @@ def run(tmp_path, runtime_folder):
 @pytest.mark.further  # its commands are parsed in test_documents.py
 def test_from_its_eds_to_the_first_session(run, tmp_path):
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
-    assert len(SHELLS) == 3
+    assert len(SHELLS) == 4
     done = run("\n".join(SHELLS))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stderr

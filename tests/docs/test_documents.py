@@ -1,5 +1,7 @@
 """Documents name files and commands that exist, and their links lead somewhere."""
 
+import inspect
+import json
 import re
 import shlex
 from pathlib import Path
@@ -8,7 +10,10 @@ import pytest
 import typer
 
 from analysis.cli.app import app as analyze_app
+from rigd.cli import run
 from rigd.cli.app import app as rigd_app
+from rigd.profile import load_profile
+from rigd.runner import excitation_for, predict_session
 
 PROJECT = Path(__file__).parents[2]
 DOCUMENTS = sorted(
@@ -100,3 +105,57 @@ def test_commands_and_options_are_those_of_the_programs(path):
                 parse(PROGRAMS[program], words, program)
             except Exception as error:
                 raise AssertionError(f"{line}: {error}") from error
+
+
+def sessions_of(path):
+    """Excitation, its parameters and options of each ``rigd run`` and ``start`` of a document."""
+    for line in shell_lines(path):
+        for program, words in commands(line):
+            if program == "rigd" and words[:1] in (["run"], ["start"]) and len(words) > 1:
+                kind, *options = words[1:]
+                group = PROGRAMS["rigd"].commands[words[0]]
+                given = group.commands[kind].make_context(kind, options).params
+                function = getattr(run, kind)
+                own = {name: given[name] for name in inspect.signature(function).parameters}
+                parameters = {k: v for k, v in function(**own).items() if v is not None}
+                yield line, kind, parameters, given
+
+
+EVERY_SESSION = [each for path in DOCUMENTS for each in sessions_of(path)]
+FILES = {
+    "file": "time_s,angle_rad\n0,0\n2,0.02\n4,0\n",
+    "modes": json.dumps({"modes": [
+        {"file": "a", "estimator": "record", "frequency_hz": hz, "damping_ratio": ratio}
+        for hz, ratio in ((2.57, 0.0091), (16.01, 0.00415), (44.81, 0.00995))
+    ]}),
+}  # fmt: skip
+"""What stands in the files that an excitation reads: of README, and of a first analysis."""
+
+
+def test_every_kind_of_identification_is_shown():
+    kinds = {kind for _, kind, *_ in EVERY_SESSION}
+    assert {"chirp", "step", "multisine", "hold", "file", "modes", "until"} <= kinds
+    assert len(EVERY_SESSION) > 20
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        pytest.param(kind, parameters, id=re.sub(r"[^\w .-]", "", line)[:60])
+        for line, kind, parameters, given in EVERY_SESSION
+        if kind not in ("move", "touch") and given["tip_slope_rad"] is None
+    ],
+)
+def test_identifications_keep_the_limit_of_the_tip_s_slope(kind, parameters, tmp_path):
+    """As every default does; the reference paper's chirp alone is beyond it, and says so."""
+    if kind in FILES:
+        parameters = parameters | {"path": tmp_path / "file"}
+        parameters["path"].write_text(FILES[kind])
+    profile = load_profile("sim")
+    plan = predict_session(profile, excitation_for(profile, kind, parameters))
+    assert not plan.refused
+    if kind == "chirp":
+        assert plan.prediction.tip.slope_rad < 0.61
+        assert "is not refused for it" in plan.tip_in_words
+    else:
+        assert plan.prediction.tip.slope_rad <= profile.limits.tip_slope_rad

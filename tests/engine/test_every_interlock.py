@@ -187,7 +187,7 @@ CASES = {
     ),
     "scales": Case(
         strengthen,
-        r"Ratio of the net torque .* 0\.\d+ \(1 if all scales are right\) below limit 0\.5 ",
+        r"Ratio of the net torque .* acceleration 0\.\d+ below limit 0\.5 ",
     ),
     "frozen sensor": Case(
         lambda s: sensor(s, stuck=Stuck()),

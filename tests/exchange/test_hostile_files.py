@@ -1,15 +1,17 @@
 """Files that claim what they do not hold, or hold what nobody can: refused, in bounded memory."""
 
+import os
 import resource
 import struct
 import subprocess
 import sys
 import zlib
 
+import numpy as np
 import pytest
 from cases import further
 
-from analysis.exchange._source import bounded_memory
+from analysis.exchange._source import ExchangeError, bounded_memory, read_source
 
 READ = """
 import sys
@@ -88,6 +90,38 @@ def test_four_gigabytes_that_are_not_there(tmp_path, dims):
     path.write_bytes(MAT_HEADER + struct.pack("<2I", 14, len(body)) + body)
     _, megabytes = refused(path, "a")
     assert megabytes < 200
+
+
+def test_matlab_7_3_reads_nothing_but_what_is_in_it(tmp_path):
+    """A link or a data set may lead to any file that the importer can read, or to a pipe."""
+    h5py = pytest.importorskip("h5py", reason="MATLAB 7.3 is read if h5py is there")
+    secret, other, path = (tmp_path / name for name in ("secret", "other.h5", "a.mat"))
+    secret.write_bytes(np.arange(50.0).tobytes())
+    os.mkfifo(tmp_path / "pipe")
+    with h5py.File(other, "w") as file:
+        file["x"] = np.arange(50.0)[None, :]
+    with h5py.File(path, "w") as file:
+        file["plain"] = np.arange(50.0)[None, :]
+        file["soft"] = h5py.SoftLink("/plain")
+        file["outside"] = h5py.ExternalLink(str(other), "/x")
+        file["waits"] = h5py.ExternalLink(str(tmp_path / "pipe"), "/x")
+        raw = [(str(secret), 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("raw", (1, 50), "f8", external=raw)
+        layout = h5py.VirtualLayout((1, 50), "f8")
+        layout[:] = h5py.VirtualSource(str(other), "x", (1, 50))
+        file.create_virtual_dataset("virtual", layout)
+        group = file.create_group("log")
+        group["angle"] = file["plain"]
+        group["torque"] = h5py.SoftLink("/plain")
+        group["back"] = group
+    for name in ("plain", "log.angle", "log.back.angle"):
+        assert read_source(path, [name])[1][name].values.tolist() == list(range(50))
+    for name in ("soft", "outside", "waits", "raw", "virtual", "log.torque"):
+        with pytest.raises(ExchangeError, match="stored elsewhere"):
+            read_source(path, [name])
+    for name in ("/plain", "log/angle", "log..", "plain.x"):
+        with pytest.raises(ExchangeError, match="has no channel"):
+            read_source(path, [name])
 
 
 def test_a_universal_file_of_nothing_but_marks(tmp_path):

@@ -303,9 +303,9 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
             ("uncertainty.length_percent is 51 %", "50"),
         ),
         ("[sensor]\ntool_inertia_kg_m2 = -1.0", ("sensor.tool_inertia_kg_m2", "negative")),
-        ("[beam", ("not a TOML file",)),
-        ("a = " + "[" * 100_000, ("not a TOML file",)),
-        ("#" * 1_000_001, ("too large",)),
+        ("[beam", ("not valid TOML",)),
+        ("a = " + "[\n" * 100_000, ("nested too deeply",)),
+        ("#" * 250_001, ("at most 0.25 MB",)),
     ],
 )
 def test_what_is_no_specimen_is_refused(tmp_path, text, words):

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from rigd import excitation
-from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
+from rigd.beam import PARAMETERS, SMALL_SLOPE_RAD, Beam, transfer_and_gradient
 from rigd.excitation import ExcitationError
 from rigd.excitation._named import KINDS, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
+from rigd.runner import with_tip_slope
 from rigd.runner._planning import LoopPreview, excitation_for, plan_session
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -104,13 +105,26 @@ def test_the_planning_lets_the_amplitudes_through(document, profile, amplitude_r
 def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(document, profile):
     # Behind the motor loop the angle is small at the third mode, and the error the whole amplitude.
     limits = replace(profile.limits, tracking_error_rad=0.02)
-    tight = replace(profile, limits=limits)
+    profile, tight = (with_tip_slope(replace(profile, limits=each), 10.0) for each in
+                      (profile.limits, limits))  # fmt: skip
     options = {"path": document(), "duration_s": 60.0}
     free, held = (bands_of(excitation_for(p, "modes", options)) for p in (profile, tight))
     assert [row[2] for row in free] == pytest.approx([0.025] * 3, rel=0.05)
     assert held[2][2] < 0.018
     assert held[0][2] == pytest.approx(free[0][2], rel=0.03)
     plan_session(tight, excitation_for(tight, "modes", options))
+
+
+@pytest.mark.parametrize("limit_rad", [None, 0.05, 0.4])
+def test_the_amplitudes_keep_the_limit_of_the_tip_s_slope(document, profile, limit_rad):
+    """Each of the three sweeps comes as near to it as it may."""
+    rig = with_tip_slope(profile, limit_rad)
+    options = {"path": document(), "duration_s": 60.0}
+    made = excitation_for(rig, "modes", options)
+    plan = plan_session(rig, made)
+    limit_rad = limit_rad or SMALL_SLOPE_RAD
+    assert made.parameters["tip_slope_rad"] == limit_rad
+    assert 0.8 * limit_rad < plan.prediction.tip.slope_rad <= 0.91 * limit_rad
 
 
 def test_the_split_is_the_best_there_is(rig):

@@ -97,7 +97,7 @@ def test_a_bad_value_is_named_with_its_remedy(document, modes, words):
         (b"{", ("not a JSON document",)),
         (b"[]", ("no JSON object", "modes")),
         (b'{"fits": []}', ("modes is missing",)),
-        (b"\xff\xfe\x00", ("not a JSON document",)),
+        (b"\xff\xfe\x00", ("UTF-8",)),
         (b"[" * 100_000, ("nested",)),
         (b'{"modes": [{"frequency_hz": ' + b"9" * 5000 + b"}]}", ("JSON",)),
     ],

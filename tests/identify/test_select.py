@@ -14,6 +14,7 @@ from analysis.identify._refit import resonances_kept
 from analysis.identify._verdict import ANOTHER_DAMPING, EVEN
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam
+from rigd.session import Validity
 
 OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)
 """rho/EI off by 1 %, EI by 2 %."""
@@ -100,10 +101,12 @@ def test_an_order_close_to_1_spoils_no_number(nearly_one):
 def test_the_headline_is_json(nearly_one):
     verdict = nearly_one.verdict
     content = headline_json(
-        "x.mcap", nearly_one.headline, (verdict.alpha, verdict.lambda_), verdict.findings
-    )
+        "x.mcap", nearly_one.headline, (verdict.alpha, verdict.lambda_), verdict.findings,
+        Validity(0.6, 0.12),
+    )  # fmt: skip
     back = json.loads(json.dumps(content, allow_nan=False))
     assert back["file"] == "x.mcap"
+    assert back["validity"]["predicted_peak_tip_slope_rad"] == 0.6
     assert {"zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "delay_s",
             "bending_stiffness_n_m2", "tool_inertia_kg_m2"} == set(back["parameters"])  # fmt: skip
     for each in back["parameters"].values():

@@ -8,7 +8,7 @@ import pytest
 from library_folders import START_UTC_NS, mode
 
 from rigd.library import LibraryError, list_sessions
-from rigd.session import SessionWriter
+from rigd.session import SessionWriter, Validity
 
 
 def test_what_file_look_and_report_say_stands_in_the_row(
@@ -30,6 +30,25 @@ def test_what_file_look_and_report_say_stands_in_the_row(
     assert row.report == last / "report.html"
     assert [each["frequency_hz"]["value"] for each in row.modes] == [2.61, 16.3]
     assert row.modes[0]["damping_ratio"]["interval_95"] == pytest.approx([0.0045, 0.0055])
+
+
+def test_modes_come_with_the_validity_of_their_source(
+    record_briefly, write_look, write_report, tmp_path
+):
+    of_look, of_report = Validity(0.6, 0.12).as_json(), Validity(0.1, 0.003).as_json()
+    for name, look, report, expected in (
+        ("a", of_look, None, of_look),
+        ("b", of_look, of_report, of_report),
+        ("c", {}, None, Validity().as_json()),  # of before an update: not known
+    ):
+        path = record_briefly(name)
+        write_look(path, mode(2.5), validity=look)
+        if report is not None:
+            write_report(path, mode(2.6), validity=report)
+        for _ in "read", "from the index":
+            assert {row.id: row.validity for row in list_sessions(tmp_path)}[name] == expected
+    record_briefly("without_modes")
+    assert {row.id: row.validity for row in list_sessions(tmp_path)}["without_modes"] is None
 
 
 def test_a_rate_that_no_rig_has_gives_no_length(record_briefly, tmp_path):

@@ -40,9 +40,9 @@ def mode(frequency_hz, half_hz=0.01, damping_ratio=0.005, half=0.0005):
 def write_look():
     """Write the quick look of a session, with its modes."""
 
-    def write(path, *modes):
+    def write(path, *modes, **others):
         target = path.with_name(f"{path.stem}.look.json")
-        target.write_text(json.dumps({"version": 1, "modes": modes}))
+        target.write_text(json.dumps({"version": 1, "modes": modes} | others))
         return target
 
     return write
@@ -52,11 +52,13 @@ def write_look():
 def write_report():
     """Write the report of a session, with its modes."""
 
-    def write(path, *modes, number=1):
+    def write(path, *modes, number=1, **others):
         folder = path.with_name(f"{path.stem}.report{'' if number == 1 else f'-{number}'}")
         folder.mkdir()
         (folder / "report.html").write_text("<html>")
-        (folder / "analysis.json").write_text(json.dumps({"headlines": [{"modes": modes}]}))
+        (folder / "analysis.json").write_text(
+            json.dumps({"headlines": [{"modes": modes} | others]})
+        )
         return folder
 
     return write

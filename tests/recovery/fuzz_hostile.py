@@ -373,7 +373,7 @@ class Outcome:
     def wrong(self):
         """Return what is wrong with it, "" if nothing is."""
         found = ["control characters"] if _CONTROL.search(self.words) else []
-        if self.code not in (0, 1):
+        if self.code not in (0, 1, 2):
             found.append(f"ended with {self.code}")
         if "Traceback" in self.words:
             found.append("traceback")
@@ -386,8 +386,11 @@ class Outcome:
         return f"{self.case}: {self.command}: {', '.join(found)}\n{self.words}" if found else ""
 
 
-def run_forked(action, output):
-    """Run something in a child; return its exit code, and what it took as wait4 tells it."""
+def run_forked(action, output, interrupt_s=None):
+    """Run something in a child; return its exit code, and what it took as wait4 tells it.
+
+    It gets a SIGINT after so many seconds.
+    """
     sys.stdout.flush()
     child = os.fork()
     if child == 0:
@@ -405,11 +408,15 @@ def run_forked(action, output):
                 sys.stdout.flush()
                 sys.stderr.flush()
             os._exit(code or 0)
-    deadline = time.monotonic() + _PATIENCE_S
+    began = time.monotonic()
+    deadline = began + _PATIENCE_S
     while True:
         pid, status, usage = os.wait4(child, os.WNOHANG)
         if pid:
             return os.waitstatus_to_exitcode(status), usage
+        if interrupt_s is not None and time.monotonic() > began + interrupt_s:
+            os.kill(child, signal.SIGINT)
+            interrupt_s = None
         if time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)
         time.sleep(0.005)

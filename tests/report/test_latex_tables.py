@@ -6,7 +6,7 @@ import pytest
 from matplotlib.mathtext import MathTextParser
 
 from analysis.report._record_report import report_tables
-from analysis.report._table import Cell, Column, Table, latex_table, latex_text
+from analysis.report._table import Cell, Column, Table, latex_table, latex_text, with_validity
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,9 @@ def test_a_column_without_an_entry_is_left_out():
 def test_modes_and_parameters_are_written(report, record_result):
     modes, (_sizes, parameters, *_others), _ = report_tables(record_result)
     for table in (modes, parameters):
-        assert (report / "tables" / f"{table.name}.tex").read_text("utf-8") == latex_table(table)
+        assert (report / "tables" / f"{table.name}.tex").read_text("utf-8") == latex_table(
+            with_validity(table, record_result.validity)
+        )
     assert {path.name for path in (report / "tables").glob("*.tex")} == {
         "model.tex", "modes.tex", "parameters.tex",
     }  # fmt: skip

@@ -8,6 +8,7 @@ from cases import further
 
 from rigd.control import ControlDesignError, PidController, close_loop, design_pid
 from rigd.excitation import chirp, from_csv, hold, multisine, step
+from rigd.runner import with_tip_slope
 from rigd.runner._console import plan_lines
 from rigd.runner._planning import (
     RefusedError,
@@ -56,6 +57,7 @@ def test_slopes_count_and_not_the_deflection_alone(profile):
 
 
 def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):
+    profile = with_tip_slope(profile, 10.0)
     excitation = chirp(rate_hz=1000.0, amplitude_rad=0.25)
     with pytest.raises(RefusedError, match=r"peak torque of 3\.8.* exceeds 0\.9 N·m .*--force"):
         plan_session(profile, excitation)
@@ -87,6 +89,7 @@ def test_predicted_saturation_is_what_the_controller_does(profile):
     ],
 )
 def test_the_largest_amplitude_passes_and_a_little_more_does_not(profile, make, force):
+    profile = with_tip_slope(profile, 10.0)
     largest_rad = largest_amplitude(profile, make(4.0), force=force)
     assert largest_amplitude(profile, make(1e-3), force=force) == pytest.approx(
         largest_rad, rel=0.01

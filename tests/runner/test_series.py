@@ -82,6 +82,7 @@ def test_a_lone_session_is_not_numbered(make_series):
     assert order.notes == ()
     assert dict(order.predicted)["limit_angle_rad"] == "1.57"
     assert float(dict(order.predicted)["predicted_peak_velocity_rad_s"]) >= 0.0
+    assert float(dict(order.predicted)["predicted_peak_tip_slope_rad"]) >= 0.0
     assert order.path.stem.endswith("-hold")
 
 

@@ -144,10 +144,11 @@ def test_lines_tell_modes_changes_doubts_and_findings():
         mode(2, 16.0, 0.005, flag="part of the record is unexplained"),
         mode(3, 45.0, 0.01, shown=False),
         findings=["A hum."],
+        validity={"predicted_peak_tip_slope_rad": 0.6, "linear_model_error": 0.12},
     )
     json.dumps(now)
     assert estimate_lines(now, before) == [
-        "After 7.0 s (± 95 %, statistical only):",
+        "After 7.0 s (± 95 %, statistical only; tip slope 0.6 rad, error ≤ 12 %):",
         "  mode 1: 2.5020 ± 0.0012 Hz, damping 1.020 ± 0.012 %; change +0.00200 Hz, +2 %",
         "  mode 2: 16.0000 ± 0.0012 Hz, damping 0.500 ± 0.012 % "
         "(doubtful: part of the record is unexplained)",
@@ -155,6 +156,7 @@ def test_lines_tell_modes_changes_doubts_and_findings():
         "  A hum.",
     ]
     assert "change" not in "".join(estimate_lines(now))
+    assert "tip slope unknown" in estimate_lines(before)[0]
     assert mode_line(now["modes"][0]) in estimate_lines(now)[1]
 
 

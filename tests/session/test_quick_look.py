@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from library_folders import mode, quantity
 from online_fits import online_fit
 
-from rigd.session import fit_of, last_look, look_path, modes_of, read_look
+from rigd.session import Validity, fit_of, last_look, look_path, modes_of, read_look
 from rigd.view._fits import fit_table
 
 RESPONSE = {
@@ -33,9 +33,21 @@ def test_what_is_written_is_read(tmp_path):
         "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
         "modes": [{"mode": 2, "shown": False, **mode(2.5)}],
         "coherence": {"mean": None, "low_bands": []}, "flags": ["clipped"], "against_last": None,
-        "response": RESPONSE, "text": ["Quick look"],
+        "response": RESPONSE, "text": ["Quick look"], "validity": Validity(0.6, 0.12).as_json(),
     }  # fmt: skip
     assert read_look(write(tmp_path, "a", **written)) == written
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [None, "0.6", {}, {"predicted_peak_tip_slope_rad": 0.6}, {"predicted_peak_tip_slope_rad": -1.0,
+     "linear_model_error": 0.1}, {"predicted_peak_tip_slope_rad": True, "linear_model_error": 0.1},
+     {"predicted_peak_tip_slope_rad": 10**400, "linear_model_error": 0.1}],
+)  # fmt: skip
+def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
+    look = read_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
+    assert look["validity"] == Validity().as_json()
+    assert "unknown" in look["validity"]["sentence"]
 
 
 def test_what_is_missing_is_empty(tmp_path):

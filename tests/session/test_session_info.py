@@ -36,6 +36,33 @@ def test_counts(gappy):
     assert info.size_bytes == gappy.stat().st_size
 
 
+@pytest.mark.parametrize("stated", [{"recorded": "900", "scheduled": "900"}, {}])
+def test_a_trimmed_copy_is_not_complete(kit, tmp_path, stated):
+    writer = SessionWriter(tmp_path / "a.mcap")
+    writer.begin(kit.START_UTC_NS, kit.METADATA, kit.SEGMENTS, kit.ATTACHMENTS)
+    writer.write_samples(kit.packed(kit.make_samples(300, first_tick=100)))
+    info = describe(writer.close(kit.OUTCOME | stated))
+    text = "\n".join(info.lines())
+    assert "outcome" in text
+    assert "Complete" not in text
+    assert "it was trimmed" in text
+    assert ("600 of the 900 samples" if stated else "Samples of rest and sweep") in text
+    assert "ticks 100 to 399" in text
+    assert info.as_dict()["absent"] == info.absent
+
+
+def test_a_whole_one_lacks_nothing(kit, tmp_path):
+    writer = SessionWriter(tmp_path / "a.mcap")
+    writer.begin(kit.START_UTC_NS, kit.METADATA, kit.SEGMENTS, kit.ATTACHMENTS)
+    writer.write_samples(kit.packed(kit.make_samples(900)))
+    counts = {"recorded": "900", "scheduled": "900", "missed": "0", "late": "0", "lost": "0"}
+    info = describe(writer.close(kit.OUTCOME | counts))
+    assert info.absent == ""
+    assert any(
+        line.endswith("Complete: 900 of 900 samples, 0 missed, 0 late") for line in info.lines()
+    )
+
+
 def test_the_document_is_json(gappy, kit):
     document = json.loads(json.dumps(describe(gappy).as_dict()))
     assert document["segments"] == {"rest": [0, 10], "sweep": [10, 900]}

@@ -14,7 +14,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from rigd.session import SessionError, SessionExistsError, SessionWriter, read_session, read_timings
+from rigd.session import (
+    SessionError,
+    SessionExistsError,
+    SessionWriter,
+    read_session,
+    read_timings,
+    recover,
+)
 from rigd.session._format import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
 from rigd.session._schema import message_class
 
@@ -232,6 +239,36 @@ def test_without_hard_links_a_session_still_gets_its_name(kit, tmp_path, monkeyp
     assert writer.close(kit.OUTCOME) == tmp_path / "a.mcap"
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
     assert len(read_session(tmp_path / "a.mcap").samples) == 3
+
+
+def test_a_name_that_could_not_be_given_is_free_again(kit, tmp_path, monkeypatch):
+    """Without hard links the name is reserved by an empty file, which would block a recovery."""
+    forbid_hard_links(monkeypatch)
+
+    def replace(self, target):
+        raise OSError(errno.EIO, "Input/output error")
+
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(3)))
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "replace", replace)
+        with pytest.raises(SessionError, match="Input/output error"):
+            writer.close(kit.OUTCOME)
+    writer.abandon()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap.part"]
+    assert len(read_session(recover(writer.part).path).samples) == 3
+
+
+@pytest.mark.parametrize("size", [0, 100, 20_000])
+def test_a_file_that_another_program_shortens_is_not_complete(kit, tmp_path, size):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(250)))
+    os.truncate(writer.part, size)
+    writer.write_samples(kit.packed(kit.make_samples(500, first_tick=250)))
+    with pytest.raises(SessionError, match="shortened or written to by another program"):
+        writer.close(kit.OUTCOME)
+    assert not writer.path.exists()
+    assert writer.abandon() == writer.part
 
 
 def test_of_many_writers_of_one_name_one_wins(tmp_path):

@@ -153,6 +153,7 @@ class Cia402Drive:
             ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None where it has
             none), ``device_name``, ``supported_modes`` (object 6502), ``rated_torque_counts``
             (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft;
+            ``gear_ratio`` (6091) and ``encoder_step_rad`` (608F, 6092), None where it states none;
             ``quick_stop_option`` (605A) and ``fault_reaction_option`` (605E) where it has them.
         """
         return {} if self._outfit is None else dict(self._outfit.identity)
@@ -167,14 +168,20 @@ class Cia402Drive:
         Returns
         -------
         dict
-            ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks something that the
-            profile accepts by name, ``drive_without``; where something stands in for an object,
-            ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
+            ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks
+            something that the profile accepts by name, ``drive_without``; where something stands
+            in for an object, ``drive_stand_ins``; objects that the profile has set,
+            ``drive_objects_set``.
         """
         outfit = self._outfit
         if outfit is None:
             return {}
+        numbers = ("vendor_id", "product_code", "revision", "serial_number")
         told = {
+            "drive_identity": " ".join(
+                f"0x{number:X}" if isinstance(number := outfit.identity.get(key), int) else "-"
+                for key in numbers
+            ),
             "drive_watchdog": outfit.watchdog.value,
             "drive_watchdog_s": repr(outfit.watchdog_s),
         }

@@ -49,6 +49,12 @@ POLARITY: Final = 0x607E
 """Bit 7 turns the position round, bit 6 the speed, bit 5 the torque."""
 MAX_SPEED_RPM: Final = 0x6080
 """Highest speed of the motor."""
+ENCODER_RESOLUTION: Final = 0x608F
+"""Sub 1: increments of the position encoder; sub 2: in so many turns of the motor."""
+GEAR_RATIO: Final = 0x6091
+"""Sub 1: turns of the motor; sub 2: in so many turns of the output shaft."""
+FEED_CONSTANT: Final = 0x6092
+"""Sub 1: units of the position; sub 2: in so many turns of the output shaft."""
 INTERPOLATION_TIME: Final = 0x60C2
 """Sub 1: value; sub 2: power of ten of its unit in s."""
 SUPPORTED_MODES: Final = 0x6502

@@ -14,6 +14,7 @@ from enum import Enum, Flag, auto
 from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
+from rigd.devices import unknown_values
 from rigd.devices.cia402 import _objects as objects
 
 if TYPE_CHECKING:
@@ -401,6 +402,25 @@ OPTIONAL: Final = (
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
         fit=Fit.ANY,
     ),
+    *(
+        Requirement(
+            index,
+            sub,
+            name,
+            False,
+            _R,
+            "the probing move before the first session (docs/safety.md)",
+            fit=Fit.ANY,
+        )
+        for index, sub, name in (
+            (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
+            (objects.ENCODER_RESOLUTION, 2, "Motor revolutions"),
+            (objects.GEAR_RATIO, 1, "Motor shaft revolutions"),
+            (objects.GEAR_RATIO, 2, "Driving shaft revolutions"),
+            (objects.FEED_CONSTANT, 1, "Feed"),
+            (objects.FEED_CONSTANT, 2, "Driving shaft revolutions of the feed"),
+        )
+    ),
     Requirement(
         objects.ACTUAL_TORQUE,
         0,
@@ -506,7 +526,8 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
 def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     """Return what the set-up has the drive's objects hold, by index and sub-index.
 
-    Only what the set-up asks the drive about, such as which watchdog it has, is not among it.
+    Only what the set-up asks the drive about, such as which watchdog it has, is not among it; nor
+    is what follows from a value that the profile does not know.
 
     Parameters
     ----------
@@ -523,7 +544,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     at_sync = settings.torque_delivery == "at_sync"
     period_us = sync_period_us(rig.rate_hz)
     value, exponent = interpolation_time(rig.rate_hz)
-    limit = torque_limit_per_mille(rig)
+    unknown = unknown_values(rig)
     wanted = fixed_values(settings.node_id) | {
         (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
@@ -532,10 +553,12 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
         (objects.ABORT_OPTION, 0): settings.abort_option,
         (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
         (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
-        (objects.MAX_TORQUE, 0): limit,
-        **{(index, 0): limit for index in objects.TORQUE_LIMITS},
     }
-    if settings.max_speed_rad_s > 0:
+    if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown):
+        limit = torque_limit_per_mille(rig)
+        limiting = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
+        wanted |= {(index, 0): limit for index in limiting}
+    if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown:
         wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
     return wanted
 

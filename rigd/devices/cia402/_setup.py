@@ -6,6 +6,7 @@ its row there.
 """
 
 from dataclasses import dataclass
+from math import tau
 
 from rigd.devices import DeviceError, RigParameters, ServoDrive
 from rigd.devices.canbus import CanPort
@@ -43,6 +44,7 @@ _ABORTS = {
 
 _MODE_PATIENCE_S = 0.3
 _RATED_TORQUE_TOLERANCE = 0.02
+_SCALE_TOLERANCE = 0.02
 _DUPLICATE_WATCHES = 127
 """Most entries that 1016 can have."""
 
@@ -130,6 +132,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
         work = _SetUp(sdo, settings, name, wanted)
         work.assign()
         work.check_torque(identity, rig)
+        work.check_scales(identity, rig)
         work.configure_torque()
         work.configure_speed()
         work.configure_sync()
@@ -294,6 +297,55 @@ class _SetUp:
                 f"the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every torque "
                 "would be wrong by that ratio. Correct the profile or the drive."
             )
+
+    def check_scales(self, identity: dict[str, object], rig: RigParameters) -> None:
+        """Compare gear and encoder step with the profile's, as far as the drive states them.
+
+        Raises
+        ------
+        DeviceError
+            If they differ by more than 2 %.
+        """
+        gear = self._ratio(objects.GEAR_RATIO)
+        increments = self._ratio(objects.ENCODER_RESOLUTION)
+        units = self._ratio(objects.FEED_CONSTANT)
+        stated_gear = self._settings.gear_ratio
+        identity["gear_ratio"] = gear
+        if gear is not None and not _is_near(gear, stated_gear):
+            raise DeviceError(
+                f"{self._name}: its gear (object 6091) is {gear:.5g} turns of the motor in one of "
+                f"the output shaft, cia402.gear_ratio says {stated_gear:.5g}. Correct the profile "
+                "or the drive."
+            )
+        # Units of the position in a turn of the output shaft: increments, unless the drive has a
+        # feed constant that makes them others.
+        increments_a_turn = None if increments is None else increments * (gear or stated_gear)
+        turns = [turn for turn in (units, increments_a_turn) if turn is not None]
+        identity["encoder_step_rad"] = tau / turns[0] if turns else None
+        step_rad = rig.encoder.resolution_rad
+        if not turns or any(_is_near(tau / turn, step_rad) for turn in turns):
+            return
+        objects_told = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
+        raise DeviceError(
+            f"{self._name}: its encoder step (object {objects_told}) is {tau / turns[0]:.4g} rad "
+            f"at the output shaft ({turns[0]:.6g} steps a turn), encoder.resolution_rad says "
+            f"{step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
+            f"{tau / turns[0] / step_rad:.3g}. Correct the profile or the drive."
+        )
+
+    def _ratio(self, index: int) -> float | None:
+        """Return the ratio of an object's two numbers; None where it states none.
+
+        Drives that were never set up for it have it as 1 to 1.
+        """
+        try:
+            above = self._sdo.read_if_there(index, 1)
+            below = self._sdo.read_if_there(index, 2)
+        except SdoRefusal:
+            return None
+        if above is None or below is None or above <= 0 or below <= 0 or above == below == 1:
+            return None
+        return above / below
 
     def configure_torque(self) -> None:
         """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
@@ -516,6 +568,10 @@ class _SetUp:
     def _reads(self, index: int, values: tuple[int, ...]) -> bool:
         """Whether sub-indices 0 and on of an object read as given."""
         return all(self._sdo.read_if_there(index, sub) == value for sub, value in enumerate(values))
+
+
+def _is_near(stated: float, wanted: float) -> bool:
+    return abs(stated - wanted) <= _SCALE_TOLERANCE * wanted
 
 
 def _disable_others(sdo: SdoAccess, communication: int) -> None:

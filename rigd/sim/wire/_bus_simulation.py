@@ -517,6 +517,8 @@ class BusSimulation:
             self._stand(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
+        elif fault.kind == "object":
+            drive.state_object(values["index"], values["sub"], values.get("value"))
         elif fault.kind in ("restart", "power_cycle"):
             device = drive if values["device"] == "drive" else sensor
             (device.reset if fault.kind == "restart" else device.power_cycle)()

@@ -189,7 +189,9 @@ class DriveNode:
         self._limited = self._following = self._too_fast = False
 
         objects = self._objects = ObjectDictionary()
-        own = self._own = add_drive_objects(objects, rig.motor, rig.cia402, rig.rate_hz)
+        own = self._own = add_drive_objects(
+            objects, rig.motor, rig.cia402, rig.rate_hz, rig.encoder.resolution_rad
+        )
         self._emergencies = Emergencies(objects, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(objects)
         watches = WATCHES if file is None else file.subs(0x1016)
@@ -278,6 +280,10 @@ class DriveNode:
     def power_cycle(self) -> None:
         """Take its power away and give it back, which makes no difference here."""
         self.reset()
+
+    def state_object(self, index: int, sub: int, value: int | None) -> None:
+        """Have an object hold another value, or be absent."""
+        self._objects.override(index, sub, value)
 
     @property
     def sto_dropped(self) -> bool:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from rigd.devices.contracts import DeviceError
@@ -188,11 +189,13 @@ _SUPPORTED_MODES = 1 << (CYCLIC_SYNCHRONOUS_TORQUE - 1)
 
 _SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
 _IDENTITY = 0x1018
-_IN_SERVICE = (0x6076,)
+_IN_SERVICE = (0x6076, 0x608F, 0x6091)
 """Set when a drive is commissioned for its motor: no file contains it."""
 _NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 
+_ENCODER_TURNS, _MOST_TURNS = 1000, 1000
+"""Turns of the motor that object 608F states its increments for, and most turns in 6091."""
 _TORQUE_UNIT_NM = 1e-3
 """Unit of object 6076 where the profile does not state one."""
 _MAX_SPEED_RPM = 20_000
@@ -262,7 +265,11 @@ def peak_per_mille(motor: Motor) -> int:
 
 
 def add_drive_objects(
-    objects: ObjectDictionary, motor: Motor, drive: ServoDrive, rate_hz: float
+    objects: ObjectDictionary,
+    motor: Motor,
+    drive: ServoDrive,
+    rate_hz: float,
+    resolution_rad: float,
 ) -> DriveObjects:
     """Add the objects, at their power-on values, and return those the drive works with."""
 
@@ -297,6 +304,15 @@ def add_drive_objects(
     def check_mode(value: int) -> None:
         if value != NO_MODE and not (value > 0 and supported.value >> (value - 1) & 1):
             raise Abort(AbortCode.VALUE)
+
+    gear = Fraction(drive.gear_ratio).limit_denominator(_MOST_TURNS)
+    increments = round(_ENCODER_TURNS * math.tau / resolution_rad / drive.gear_ratio)
+    scales = {
+        0x608F: (increments, _ENCODER_TURNS),
+        0x6091: (gear.numerator, gear.denominator),
+    }
+    for index, ratio in scales.items():
+        objects.add_record(index, {sub: Entry("I", n, "ro") for sub, n in enumerate(ratio, 1)})
 
     interpolation = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
     interpolation[2] = Entry("b", -3, low=-6, high=0)

@@ -111,11 +111,16 @@ KINDS: dict[str, dict[str, _Key]] = {
     "no_pre_operational": {"for": _FOR},
     "no_bit_12": {"for": _FOR},
     "no_watch": {"for": _FOR},
+    "object": {
+        "index": _whole(0x1000, 0xFFFF, needed=True),
+        "sub": _whole(0, 255, default=0),
+        "value": _whole(0, 0xFFFF_FFFF),
+    },
     "obstacle": {"x": _FOUND, "angle": _FOUND, "stiffness": _TEXT, "damping": _TEXT}
     | {"side": _TEXT, "rate": _TEXT, "for": _FOR},
     "knock": {"x": _FOUND, "force": _FOUND, "duration": _FOUND},
 }
-_MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "knock")
+_MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
 ENCOUNTERS = ("obstacle", "knock")

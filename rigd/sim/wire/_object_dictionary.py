@@ -274,6 +274,16 @@ class ObjectDictionary:
                 entry.become(said, None if index in own else said.default)
             self.add(index, entry, sub)
 
+    def override(self, index: int, sub: int, value: int | None) -> None:
+        """Have an entry hold another value from now on, or be absent; one that is not is added."""
+        if value is None:
+            self._entries.pop((index, sub), None)
+            return
+        entry = self._entries.get((index, sub))
+        if entry is None:
+            entry = self.add(index, Entry("I"), sub)
+        entry.value = entry.default = value
+
     def find(self, index: int, sub: int) -> Entry:
         """Return an entry.
 

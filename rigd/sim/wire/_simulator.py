@@ -24,6 +24,7 @@ from rigd.devices import (
     SimulatorAddress,
     announce,
     ask_simulator,
+    describe_unknown_values,
     described,
     find_simulator,
     forget,
@@ -250,12 +251,14 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     Raises
     ------
     WrongUseError
-        If the profile cannot be simulated on the wire, a fault is none that this rig can have, or
-        the log's name is taken.
+        If the profile cannot be simulated on the wire or has unknown values, a fault is none that
+        this rig can have, or the log's name is taken.
     DeviceError
         If its simulated rig is already running, or if sockets or files cannot be made.
     """
     check_on_wire(rig)
+    if unknown := describe_unknown_values(rig):
+        raise WrongUseError(unknown)
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:

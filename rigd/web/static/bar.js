@@ -13,6 +13,7 @@ const PHASES = {
   preparing: "preparing", settling: "settling", taring: "taring", ready: "waiting for the recorder",
   running: "recording", returning: "returning", off: "drive off",
   waiting: "waiting for the beam to rest",
+  probing: "probing move",
 };
 
 export class Bar {

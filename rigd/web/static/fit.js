@@ -25,7 +25,8 @@ export class Fit {
     setText(byId("fit-search"), searchInWords(fit?.search));
     byId("fit-result").replaceChildren(
       this.#targets(fit?.search?.targets ?? []), this.#modes(fit?.modes ?? []),
-      ...[fit?.problem, ...(fit?.findings ?? [])].filter(Boolean).map((text) =>
+      ...[fit?.modes?.length ? fit.validity?.sentence : "", fit?.problem,
+        ...(fit?.findings ?? [])].filter(Boolean).map((text) =>
         make("p", { class: "muted" }, text)));
   }
 

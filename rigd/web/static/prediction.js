@@ -52,9 +52,12 @@ export class Prediction {
     const { tip } = plan;
     if (tip) {
       bars.push(peakBar("Tip slope, linear model", tip.slope_rad, limits.tip_slope_rad, "rad"));
-      bars.push(peakBar("Tip deflection", 1e3 * tip.deflection_m, undefined, "mm"));
-      bars.push(peakBar("Tip speed", tip.speed_m_s, undefined, "m/s"));
+      if (tip.physical !== false) {
+        bars.push(peakBar("Tip deflection", 1e3 * tip.deflection_m, undefined, "mm"));
+        bars.push(peakBar("Tip speed", tip.speed_m_s, undefined, "m/s"));
+      }
     }
+    if (tip && plan.tip_in_words) bars.push(make("p", { class: "muted" }, plan.tip_in_words));
     const words = [];
     if (plan.refused) words.push(make("p", { class: "refused" }, plan.refused));
     for (const warning of plan.warnings ?? []) {

@@ -3,14 +3,21 @@
 import { make } from "./dom.js";
 import { estimate, level } from "./format.js";
 
+/** What is said of numbers from a daemon or a look of before an update. */
+const NOT_KNOWN = "The slope of the tip, and with it the error of the linear model, is unknown.";
+
 /** Modes in short, as a cell of the table of sessions has them. */
-export function modesInShort(modes) {
-  return modes.slice(0, 3).map(({ frequency_hz: frequency, damping_ratio: damping }) => {
+export function modesInShort(modes, validity) {
+  const parts = modes.slice(0, 3).map(({ frequency_hz: frequency, damping_ratio: damping }) => {
     const flagged = frequency?.flag || damping?.flag;
     return make("span", { class: "line", title: [frequency?.flag, damping?.flag]
       .filter(Boolean).join(" ") },
     `${estimate(frequency, 1, 1).value} Hz, ${estimate(damping, 100, 1).value} %${flagged ? " (flagged)" : ""}`);
   });
+  if (modes.length) {
+    parts.push(make("div", { class: "muted" }, validity?.sentence ?? NOT_KNOWN));
+  }
+  return parts;
 }
 
 function modeTable(modes) {
@@ -30,8 +37,9 @@ function modeTable(modes) {
 export function lookElements(look) {
   if (!look) return [make("p", { class: "muted" }, "No quick look at this session.")];
   const parts = [];
-  if (look.modes?.length) parts.push(modeTable(look.modes));
-  else parts.push(make("p", {}, "No mode was identified."));
+  if (look.modes?.length) {
+    parts.push(modeTable(look.modes), make("p", {}, look.validity?.sentence ?? NOT_KNOWN));
+  } else parts.push(make("p", {}, "No mode was identified."));
   if (Number.isFinite(look.coherence?.mean)) {
     const bands = (look.coherence.low_bands ?? []).map(([from, to]) =>
       `${level(from)} to ${level(to)} Hz`);

@@ -108,7 +108,7 @@ export class Sessions {
       make("td", { "data-label": "Operator" }, session.operator || "–"),
       make("td", { title: session.reason ?? "" }, make("span",
         { class: `outcome ${session.outcome}` }, session.outcome || "unknown")),
-      make("td", { class: "modes" }, ...modesInShort(session.modes ?? [])),
+      make("td", { class: "modes" }, ...modesInShort(session.modes ?? [], session.validity)),
       make("td", { class: "files" }, ...this.#files(session)));
     return [row, detail];
   }

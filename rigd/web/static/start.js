@@ -17,12 +17,14 @@ export class StartForm {
   #inputs = new Map();
   #prediction = new Prediction((amplitude) => this.#take(amplitude));
   #state = "";
+  #failedChecks = "";  // of the profile, as the daemon reported them last
 
   constructor(link) {
     this.#link = link;
     link.on("hello", (hello) => this.#offer(hello));
     link.on("status", (status) => {
       setText(byId("what-moves"), status.daemon?.what_moves ?? "");
+      this.#showFailedChecks(status.daemon?.failed_checks ?? []);
       this.#enable(status.doing ? "busy" : status.state);
     });
     link.on("state", ({ to }) => this.#enable(to));
@@ -102,6 +104,29 @@ export class StartForm {
     this.#predict();
   }
 
+  #showFailedChecks(rows) {
+    const found = JSON.stringify(rows);
+    if (found === this.#failedChecks) return;  // else a prediction's, with another specimen, go on
+    this.#failedChecks = found;
+    this.#offerAcceptance(rows);
+  }
+
+  /** List the failed rows of check; those that can be accepted get a box, for one start. */
+  #offerAcceptance(rows) {
+    show(byId("failed-checks"), rows.length > 0);
+    const ticked = this.#accepted();
+    byId("failed-rows").replaceChildren(...rows.map(({ name, text, acceptable }) =>
+      make("label", { class: "check" },
+        acceptable
+          ? make("input", { type: "checkbox", value: name, checked: ticked.includes(name) }) : null,
+        make("span", {}, make("span", { class: "refused" }, `${name}: ${text}`),
+          acceptable ? ` Accept it for this start (--accept ${name}).` : ""))));
+  }
+
+  #accepted() {
+    return [...byId("failed-rows").querySelectorAll("input:checked")].map(({ value }) => value);
+  }
+
   // Metadata
 
   #pairs() {
@@ -169,9 +194,24 @@ export class StartForm {
     }
     if (Object.keys(meta).length) notes.meta = meta;
     const force = byId("force").checked;
+    const slope = this.#tipSlope();
+    if (slope === null) return null;
     const excitation = byId("excitation").value;
     const watch = byId("watch-fit").checked && excitation !== "until" ? { watch_fit: true } : {};
-    return { excitation, parameters, repeat, notes, force, ...watch };
+    const accepted = this.#accepted();
+    const accept = accepted.length ? { accept: accepted } : {};
+    return { excitation, parameters, repeat, notes, force, ...watch, ...accept, ...slope };
+  }
+
+  /** The limit of the tip's slope for this session, as a member; null if it is not a number. */
+  #tipSlope() {
+    const text = byId("tip-slope").value.trim();
+    if (text === "") return {};
+    const value = Number(text.replace(/^(\d*),(\d+)$/, "$1.$2"));
+    byId("tip-slope").setAttribute("aria-invalid", String(!(value > 0 && Number.isFinite(value))));
+    if (value > 0 && Number.isFinite(value)) return { tip_slope_rad: value };
+    this.#say(`Tip slope limit ${text} is not a number above 0; give one in rad.`);
+    return null;
   }
 
   async #predict() {
@@ -183,6 +223,7 @@ export class StartForm {
       this.#say(reply.error);
       return;
     }
+    this.#offerAcceptance(reply.plan.failed_checks ?? []);
     this.#prediction.show(reply.plan, reply.largest_amplitude_rad);
   }
 
@@ -193,7 +234,10 @@ export class StartForm {
     byId("start-button").disabled = true;  // until the state is told again: one press, one session
     const reply = await this.#link.command("start", request);
     if (reply.ok) {
-      byId("force").checked = false;  // for one session: the next one is asked for again
+      // For one session: the next one is asked for again.
+      byId("force").checked = false;
+      for (const box of byId("failed-rows").querySelectorAll("input")) box.checked = false;
+      byId("tip-slope").value = "";
       this.#prediction.show(reply.plan, null);
     } else {
       this.#enable(this.#state);

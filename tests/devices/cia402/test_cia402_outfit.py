@@ -131,6 +131,7 @@ class TestTheWatchdog:
         drive = make()
         drive.connect()
         assert drive.statement() == {
+            "drive_identity": "0x1234 0xABCD 0x10002 0x4D",
             "drive_watchdog": "heartbeat consumer (1016:1)",
             "drive_watchdog_s": "0.05",
         }

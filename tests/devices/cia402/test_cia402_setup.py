@@ -4,6 +4,7 @@ import struct
 import threading
 import time
 from dataclasses import replace
+from math import tau
 
 import pytest
 
@@ -153,6 +154,8 @@ def test_who_the_drive_is(drive):
         "supported_modes": 0x3ED,
         "rated_torque_counts": 5,
         "rated_torque_nm": pytest.approx(0.5),
+        "gear_ratio": None,
+        "encoder_step_rad": None,
     }
 
 
@@ -182,6 +185,48 @@ def test_a_drive_that_is_not_the_profiles(drive, scripted, place, value, words):
     for word in words:
         assert word in str(caught.value)
     assert not [place for place in scripted.writes if place[0] != 0x6040]
+
+
+STEPS = round(tau / 7e-5)
+"""Encoder steps in a turn of the output shaft, as the profile has it."""
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ({0x6091: (50, 1)}, ["object 6091", "50 turns", "cia402.gear_ratio says 100"]),
+        ({0x608F: (STEPS // 4, 100)}, ["608F", "resolution_rad says 7e-05", "the ratio 4"]),
+        ({0x608F: (STEPS, 50), 0x6091: (100, 1)}, ["608F and 6091", "the ratio 0.5"]),
+        ({0x6092: (4 * STEPS, 1)}, ["object 6092", "the ratio 0.25"]),
+    ],
+)
+def test_scales_that_contradict_the_profile_are_refused(drive, scripted, stated, words):
+    for index, ratio in stated.items():
+        scripted.objects |= {(index, 1): ratio[0], (index, 2): ratio[1]}
+    with pytest.raises(DeviceError, match="node 5") as caught:
+        drive.connect()
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stated", "gear", "step"),
+    [
+        ({0x608F: (STEPS, 100), 0x6091: (100, 1)}, 100.0, 7e-5),
+        # As a drive has them that was never set up for its gear.
+        ({0x608F: (STEPS, 100), 0x6091: (1, 1), 0x6092: (1, 1)}, None, 7e-5),
+        # A feed constant in the units that the position has.
+        ({0x608F: (10, 1), 0x6091: (100, 1), 0x6092: (STEPS, 1)}, 100.0, 7e-5),
+        ({0x608F: (0, 0), 0x6091: (100, 0)}, None, None),
+    ],
+)
+def test_scales_that_the_drive_states(drive, scripted, stated, gear, step):
+    for index, ratio in stated.items():
+        scripted.objects |= {(index, 1): ratio[0], (index, 2): ratio[1]}
+    drive.connect()
+    identity = drive.identity()
+    assert identity["gear_ratio"] == gear
+    assert identity["encoder_step_rad"] == (step and pytest.approx(step, rel=1e-3))
 
 
 def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, scripted):

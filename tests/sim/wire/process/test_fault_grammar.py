@@ -38,6 +38,10 @@ OPTIONAL = {
     "no_pre_operational": ({}, {"for": positive}),
     "no_bit_12": ({}, {"for": positive}),
     "no_watch": ({}, {"for": positive}),
+    "object": (
+        {"index": whole(0x1000, 0xFFFF)},
+        {"sub": whole(0, 255), "value": whole(0, 2**32 - 1)},
+    ),
     "obstacle": (
         {"x": text(st.floats(1e-3, 100)), "angle": text(st.floats(-10, 10))},
         {

@@ -1,0 +1,82 @@
+"""Values of a rig that its profile states as unknown: NaN in the parameters, refused by name.
+
+A profile writes such a value as ``{ source = "unknown" }``. Nothing may be computed from it, and no
+device is opened with it.
+"""
+
+from math import isnan
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from rigd.devices.parameters import RigParameters
+
+MAY_BE_UNKNOWN: Final = {
+    "motor.inertia_kg_m2": (
+        "data sheets: inertia of the rotor times the square of the gear ratio, plus that of the "
+        "gear at its output; rigd identify motor measures it afterwards"
+    ),
+    "motor.viscous_nm_s_per_rad": (
+        "data sheet of the gear: slope of its running torque over the speed; rigd identify motor "
+        "measures it afterwards"
+    ),
+    "motor.coulomb_nm": (
+        "data sheet of the gear: no-load running torque; rigd identify motor measures it afterwards"
+    ),
+    "motor.rated_torque_nm": (
+        "data sheet of the motor: rated torque (torque constant times rated current, object 6076 "
+        "of the drive), times the gear ratio"
+    ),
+    "motor.peak_torque_nm": (
+        "data sheets: peak torque of the motor times the gear ratio, or that of the gear if it is "
+        "less"
+    ),
+    "motor.continuous_torque_nm": (
+        "data sheet of the motor: torque that it bears for ever, times the gear ratio"
+    ),
+    "motor.thermal_time_constant_s": "data sheet of the motor: time constant of its winding",
+    "encoder.resolution_rad": (
+        "data sheet of the encoder: 2 pi over its counts per turn (times the gear ratio if it is "
+        "on the motor's shaft)"
+    ),
+    "cia402.gear_ratio": "name plate or data sheet of the gear",
+    "cia402.rated_torque_unit_nm": (
+        "manual of the drive, object 6076: one count in N·m (mN·m: 1e-3, µN·m: 1e-6)"
+    ),
+}
+"""Keys of a profile that may have no value yet, and where to find it."""
+
+
+def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
+    """Return the keys whose values are unknown.
+
+    Parameters
+    ----------
+    rig
+        Parameters of a profile.
+
+    Returns
+    -------
+    tuple of str
+        Keys of `MAY_BE_UNKNOWN`, in its order.
+    """
+
+    def unknown(key: str) -> bool:
+        section, _, name = key.partition(".")
+        parameters = getattr(rig, section)
+        return parameters is not None and isnan(getattr(parameters, name))
+
+    return tuple(key for key in MAY_BE_UNKNOWN if unknown(key))
+
+
+def describe_unknown_values(rig: "RigParameters") -> str:
+    """Name the unknown values, a line for each with the place to find it; empty: none.
+
+    Parameters
+    ----------
+    rig
+        Parameters of a profile.
+    """
+    return "\n".join(
+        f"{key} is unknown; enter its value in the profile ({MAY_BE_UNKNOWN[key]})."
+        for key in unknown_values(rig)
+    )

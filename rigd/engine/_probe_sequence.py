@@ -1,0 +1,81 @@
+"""Sequence of a probing move: tare, enable, strokes, disable.
+
+It runs through the cycle of a session, with its interlocks, stops and watchdogs; only the
+controller is another one, and there is no record.
+"""
+
+from typing import TYPE_CHECKING, Any, cast
+
+from rigd.engine._cycle import Cycle, Standstill
+from rigd.engine._ipc import Parent
+from rigd.engine._messages import Ending
+from rigd.engine._probed_rig import probed_rig
+from rigd.engine._publish import Display
+from rigd.engine._session_sequence import SessionEnd, SessionSequence
+from rigd.engine._shared_state import Phase, Word
+from rigd.engine._timing import Clock, TickScheduler
+from rigd.engine._topics import Channels
+from rigd.profile import Profile
+from rigd.runtime import StopRequest
+from rigd.safety import ProbingMove, estimate_probe, plan_probe
+
+if TYPE_CHECKING:
+    from rigd.control import PidController
+
+
+class ProbeSequence(SessionSequence):
+    """One probing move on connected devices; parameters as for a `SessionSequence`."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        cycle: Cycle,
+        clock: Clock,
+        metronome: TickScheduler,
+        standstill: Standstill,
+        channels: Channels,
+        display: Display,
+        parent: Parent,
+        stop: StopRequest,
+    ) -> None:
+        super().__init__(
+            profile, (0.0,), cycle, clock, metronome, standstill, channels, display, parent, stop,
+            Ending(),
+        )  # fmt: skip
+        self._rig = probed_rig(profile)
+        self._move: ProbingMove | None = None
+        self._last_tick = 0
+
+    def move(self) -> dict[str, Any]:
+        """Make the strokes; the drive has just been enabled, and is off when this returns.
+
+        Returns
+        -------
+        dict
+            ``end``: why it ended, and the fields of a `rigd.safety.ProbeEstimate`.
+
+        Raises
+        ------
+        SessionEnd
+            If it is stopped, or an interlock ends it.
+        """
+        self._board[Word.PHASE] = Phase.PROBING
+        self._standstill.forget()
+        cycle = self._cycle
+        start_rad = cycle.angle_rad
+        move = ProbingMove(self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm)
+        cycle.encoder_watch = None  # the move itself compares angle and torques
+        cycle.start(self._rest_spread_nm)
+        cycle.controller = cast("PidController", move)  # the cycle only steps it
+        self._tick(start_rad, excused=True)  # enabling takes its time
+        self._move, self._last_tick = move, self._metronome.tick
+        while move.end is None:
+            self._tick(cycle.angle_rad)
+        cycle.torque_off()
+        return {"end": move.end.name} | estimate_probe(self._rig, move).as_dict()
+
+    def _step(self, reference_rad: float) -> SessionEnd | None:
+        if self._move is not None:
+            self._move.missed = max(0, self._metronome.tick - self._last_tick - 1)
+            self._last_tick = self._metronome.tick
+        return super()._step(reference_rad)
