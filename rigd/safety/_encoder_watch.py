@@ -151,6 +151,10 @@ class EncoderWatch:
         self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
         self._repeats: deque[int] = deque(maxlen=_MOST_REPEATS)
         self._pending: deque[float] = deque(maxlen=delay_ticks)
+        self.test_nm = 0.0
+        self._test_step_nm = 0.0
+        self._test_start_rad = 0.0
+        self.tests = 0
         self.reset(0.0, 0.0)
 
     def reset(self, angle_rad: float, noise_nm: float) -> None:
