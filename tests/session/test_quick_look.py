@@ -18,6 +18,12 @@ RESPONSE = {
     "magnitude": [3.0, 4.0],
     "phase_rad": [0.1, 0.2],
     "coherence": [0.9, 0.8],
+    "resolution_hz": 0.05,
+}
+MODEL = {
+    **{name: RESPONSE[name] for name in ("frequency_hz", "magnitude", "phase_rad")},
+    "magnitude_low_95": [2.9, 3.9],
+    "magnitude_high_95": [3.1, 4.1],
 }
 
 
@@ -33,7 +39,7 @@ def test_what_is_written_is_read(tmp_path):
         "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
         "modes": [{"mode": 2, "shown": False, **mode(2.5)}],
         "coherence": {"mean": None, "low_bands": []}, "flags": ["clipped"], "against_last": None,
-        "response": RESPONSE, "text": ["Quick look"], "validity": Validity(0.6, 0.12).as_json(),
+        "response": RESPONSE, "model": MODEL, "text": ["Quick look"], "validity": Validity(0.6, 0.12).as_json(),
     }  # fmt: skip
     assert read_look(write(tmp_path, "a", **written)) == written
 
