@@ -78,6 +78,7 @@ def files(folder):
         yield {"command": "start", "excitation": kind, "parameters": {"path": str(path)}}
 
 
+@pytest.mark.further  # what it refuses is tried one by one in tests/daemon and tests/recovery
 def test_its_memory_stays_and_it_answers_others(daemon, tmp_path):
     requests = list(files(tmp_path))
     for line in LINES:

@@ -39,7 +39,8 @@ def test_what_is_written_is_read(tmp_path):
         "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
         "modes": [{"mode": 2, "shown": False, **mode(2.5)}],
         "coherence": {"mean": None, "low_bands": []}, "flags": ["clipped"], "against_last": None,
-        "response": RESPONSE, "model": MODEL, "text": ["Quick look"], "validity": Validity(0.6, 0.12).as_json(),
+        "response": RESPONSE, "model": MODEL, "text": ["Quick look"],
+        "validity": Validity(0.6, 0.12).as_json(),
     }  # fmt: skip
     assert read_look(write(tmp_path, "a", **written)) == written
 

@@ -113,7 +113,7 @@ AGAIN = {
     "wrench lost",
 }
 """What the loop does then another row shows as well, or the same fault of the other device."""
-FURTHER = {"controller off the bus", "emergency message", "serial line cut"}
+FURTHER = {"controller off the bus", "emergency message", "sensor frozen", "serial line cut"}
 """Lost devices and faults of drives, as other rows have them by other ways."""
 
 

@@ -97,6 +97,7 @@ def test_one_that_it_does_not_state_is_found_by_the_probing_move(rig_on_wire, st
         rig_on_wire(stated)
 
 
+@pytest.mark.further  # as tests/safety/test_probing_move.py on the plant
 def test_a_rig_within_a_quarter_is_probed_once(rig_on_wire, tmp_path):
     results, texts, rig, profile = rig_on_wire({"motor.inertia_kg_m2": "2.3e-3"})
     assert [result.outcome for result in results] == ["complete"]
