@@ -343,7 +343,7 @@ def _settled(
 def _known_to(refit: Refit) -> float:
     """Relative deviation of the drag, of one number."""
     law, (_, std) = _law_at(refit), refit.amplitudes()
-    return float(std[0]) / max(law.constant_m, np.finfo(float).tiny)
+    return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
 
 def _law_at(refit: Refit) -> DragLaw:

@@ -10,6 +10,7 @@ SERIAL = b"FT99001\0"
 FIRMWARE = (3, 8, 2)
 NEWTON, NEWTON_METRE = 2, 3
 
+_NOISE_COUNTS = 10.0
 # Six gauges, each axis seen by several: an orthogonal pattern, scaled to the axis' range.
 _PATTERN = np.linalg.qr(np.random.default_rng(40).normal(size=(6, 6)))[0]
 _RANGES = np.array([20.0, 20.0, 60.0, 1.0, 1.0, 1.0])
@@ -41,6 +42,7 @@ class NetCanOemBox:
         self._first = base << 4
         self._wrench, self._send = wrench, send
         self._to_gauges = np.linalg.inv(MATRIX) * COUNTS_PER_UNIT
+        self._noise = np.random.default_rng(41)
         self.status = 0
 
     def take(self, can_id: int, data: bytes) -> None:
@@ -65,6 +67,7 @@ class NetCanOemBox:
 
     def _send_gauges(self) -> None:
         raw = self._to_gauges @ np.array(self._wrench()) + _OFFSET
+        raw += self._noise.normal(scale=_NOISE_COUNTS, size=6)
         gauges = [int(each) for each in np.clip(np.rint(raw), -32768, 32767)]
         self._send(self._first, struct.pack(">H3h", self.status, *gauges[0::2]))
         self._send(self._first + 1, struct.pack(">3h", *gauges[1::2]))
