@@ -44,7 +44,7 @@ class BeamPrediction:
     about the root are ``4 ρ L³/λ⁴``, of which the first is 97 % of ``ρ L³/3``.
     """
 
-    __slots__ = ("_angle_rad", "_dot", "_gain", "_rest_rad", "_size", "_vectors", "first_rad_s")
+    __slots__ = ("_dot", "_gain", "_rest_rad", "_size", "_vectors", "first_rad_s")
 
     def __init__(self, beam: Beam, damping: Damping, rate_hz: float) -> None:
         period_s = 1.0 / rate_hz
@@ -90,7 +90,6 @@ class BeamPrediction:
         for vector in self._vectors:
             vector[:] = 0.0
         self._rest_rad = angle_rad
-        self._angle_rad = angle_rad
 
     def step(self, angle_rad: float, torque_nm: float) -> float:
         """Return the measured coupling torque less the predicted one, in N·m.
@@ -106,7 +105,6 @@ class BeamPrediction:
         input_[size + 1] = torque_nm
         self._dot(input_, output[:-1])
         self._vectors = output, input_
-        self._angle_rad = angle_rad
         return float(output[size])
 
     def skip(self, angle_rad: float) -> None:

@@ -317,7 +317,7 @@ class EncoderWatch:
         )
         if needed_nm <= allowed_nm:
             return None
-        return _violation("stopped encoder", needed_nm, allowed_nm)
+        return BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
 
     def _check_net_torque(self, ticks: int, turn_nm: float) -> Violation | None:
         """Check the mean net torque on a shaft that seems to stand still."""
@@ -326,7 +326,7 @@ class EncoderWatch:
         limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
         if -limit_nm < net_nm < limit_nm:
             return None
-        return _violation("frozen encoder", net_nm, limit_nm)
+        return BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
 
     def _compare_coupling_torque(self, ticks: int) -> None:
         """Begin a test of the encoder if the beam pulls at a shaft that seems to stand still."""
@@ -360,7 +360,7 @@ class EncoderWatch:
         repeats.append(self._count)
         if len(repeats) < _MOST_REPEATS or self._count - repeats[0] >= _REPEAT_TICKS:
             return None
-        return _violation("repeated angle", len(repeats), _MOST_REPEATS - 1)
+        return BY_NAME["repeated angle"].violated(len(repeats), _MOST_REPEATS - 1)
 
     def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
         """Compare the acceleration over the last `WINDOW_TICKS` with the net torque."""
@@ -396,8 +396,3 @@ class EncoderWatch:
 
     def _end_test(self) -> None:
         self.test_nm = self._test_step_nm = 0.0
-
-
-def _violation(name: str, value: float, limit: float) -> Violation:
-    row = BY_NAME[name]
-    return Violation(row.channel, value, limit, row.unit, row.remedy, row.limit)

@@ -182,6 +182,23 @@ class Interlock:
     below: bool = False
     follows_missed_ticks: bool = False
 
+    def violated(
+        self, value: float, limit: float, part: str = "", *, below: bool = False
+    ) -> Violation:
+        """Return the violation of this interlock by a value.
+
+        Parameters
+        ----------
+        value, limit
+            The value, and the limit that it left.
+        part
+            Part of the channel that is meant, where the table leaves it open.
+        below
+            The value is less than the limit allows.
+        """
+        channel = self.channel.format(channel=part) if part else self.channel
+        return Violation(channel, value, limit, self.unit, self.remedy, self.limit, below=below)
+
 
 OVERLOADED: Final = "The computer is overloaded: close other programs."
 """Said of whatever came of a computer that was too busy."""

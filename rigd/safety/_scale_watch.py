@@ -105,9 +105,7 @@ class ScaleWatch:
         low, high = ratio - _SURE * deviation, ratio + _SURE * deviation
         limit = self._limit
         if low > limit:
-            return Violation(row.channel, ratio, limit, row.unit, row.remedy, row.limit)
+            return row.violated(ratio, limit)
         if high < 1.0 / limit:
-            return Violation(
-                row.channel, ratio, 1.0 / limit, row.unit, row.remedy, row.limit, below=True
-            )
+            return row.violated(ratio, 1.0 / limit, below=True)
         return None

@@ -106,7 +106,7 @@ class SensorWatch:
         self._repeated = [0] * len(shares)
         self._counted = 0
         if self._noisy[-1] and shares[-1] > _QUIET:
-            return _violation("frozen sensor", "", self._runs[-1], least)
+            return BY_NAME["frozen sensor"].violated(self._runs[-1], least)
         for channel, share, noisy in zip(self._channels[:-1], shares, self._noisy, strict=False):
             if noisy and share > _QUIET:
                 self._notices.append(
@@ -140,7 +140,7 @@ class SensorWatch:
         runs, limits = self._runs, self._limits
         assert limits is not None
         if runs[-1] > limits[-1]:
-            return _violation("frozen sensor", "", runs[-1], limits[-1])
+            return BY_NAME["frozen sensor"].violated(runs[-1], limits[-1])
         self._counted += 1
         if self._counted >= _COUNTED:
             repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
@@ -148,15 +148,15 @@ class SensorWatch:
                 share, limit = count / _COUNTED, self._shares[number]
                 if limit < share and limit < _LARGEST_SHARE and runs[number] <= limits[number]:
                     together = 2 * repeated[-1] > count
-                    channel = "" if together else self._channels[number]
-                    return _violation("repeated wrench", channel, 100.0 * share, 100.0 * limit)
+                    part = "whole wrench" if together else self._channels[number]
+                    return BY_NAME["repeated wrench"].violated(100.0 * share, 100.0 * limit, part)
         if max(runs) <= min(limits):
             return None
         for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):
             if run <= limit:
                 continue
             if run > _CHANNEL_FACTOR * limit:
-                return _violation("frozen channel", channel, run, _CHANNEL_FACTOR * limit)
+                return BY_NAME["frozen channel"].violated(run, _CHANNEL_FACTOR * limit, channel)
             if channel not in self._warned:
                 self._warned.add(channel)
                 self._notices.append(
@@ -169,9 +169,3 @@ class SensorWatch:
         """Return the warnings since the last call."""
         notices, self._notices = self._notices, []
         return notices
-
-
-def _violation(name: str, channel: str, value: float, limit: float) -> Violation:
-    row = BY_NAME[name]
-    what = row.channel.format(channel=channel or "whole wrench")
-    return Violation(what, value, limit, row.unit, row.remedy, row.limit)
