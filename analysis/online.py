@@ -170,8 +170,6 @@ class OnlineEstimate:
         told, fit = self.headline, self.predicting
         if told is not None and fit is not None and self.analysis is not None:
             content |= headline_json(None, told, self.orders, self.findings, self.validity)
-            for mode, shown in zip(content["modes"], told.modes, strict=True):
-                mode["shown"] = shown.shown
             content |= {
                 "uniform_beam": not (
                     told.fit.plant.stiffness_offsets or "tip_mass_kg" in told.fit.parameters

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from analysis.identify._drag_torque import DragLaw
     from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
+    from analysis.identify._modal_model import ModalModel
     from analysis.identify._noise import Noise
     from analysis.identify._plant import Plant
 
@@ -287,7 +288,7 @@ class Comparison:
         """Decimated samples up to the record's end."""
         return int(self.decimation.inside(self.measurement.angle_rad.size).stop)
 
-    def following_reference(self, plant: Plant) -> Comparison:
+    def following_reference(self, plant: Plant | ModalModel) -> Comparison:
         """Use the part of the angle coherent with the reference as input, and take out the rest.
 
         Parameters
@@ -306,7 +307,10 @@ class Comparison:
         return self._split(self.angle_rad, followed, plant)
 
     def _split(
-        self, moved_rad: NDArray[np.float64], followed: NDArray[np.float64], plant: Plant
+        self,
+        moved_rad: NDArray[np.float64],
+        followed: NDArray[np.float64],
+        plant: Plant | ModalModel,
     ) -> Comparison:
         """Use a part of the angle as input, and take out what a plant makes of the rest."""
         return replace(
@@ -316,7 +320,7 @@ class Comparison:
             rest_rad=moved_rad - followed,
         ).with_rest_of(plant)
 
-    def with_rest_of(self, plant: Plant) -> Comparison:
+    def with_rest_of(self, plant: Plant | ModalModel) -> Comparison:
         """Take out what a plant makes of the angle that followed no reference, in place of before.
 
         Parameters
@@ -333,7 +337,7 @@ class Comparison:
         told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
         return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
 
-    def renewed(self, plant: Plant, noise: Noise) -> Comparison:
+    def renewed(self, plant: Plant | ModalModel, noise: Noise) -> Comparison:
         """Tell anew what followed the reference, with a plant better than the one before.
 
         Parameters
@@ -459,7 +463,7 @@ class Comparison:
             total += later.gradient(poles, amplitudes[number * each :])
         return total
 
-    def filled(self, plant: Plant) -> Comparison:
+    def filled(self, plant: Plant | ModalModel) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.
 
         The squares that remain have their minimum where that of the known samples is, once the

@@ -9,7 +9,7 @@ true. What a simpler one would give stands beside it, as a condition.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
@@ -31,10 +31,13 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
+    from analysis.identify._modal_fit import ModalFit
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
+    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify._verdict import OrderVerdict
     from rigd.session import Validity
 
+EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
 UNEXPLAINED: Final = "part of the record is unexplained"
 MISREAD: Final = "the record contradicts its file"
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
@@ -185,6 +188,10 @@ class Mode:
     """Share of the critical damping."""
     shown: bool
     """Whether the record shows it; else it is computed from the model."""
+    source: Literal["modal", "beam"] = "beam"
+    """Model that the numbers are of: the modal one, or the beam."""
+    participation: Quantity | None = None
+    """Inertia about the motor axis that takes part in it, in kg m²; None of a beam's mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +231,14 @@ class Numbers:
         The simplest structure that would do, if it is not that one.
     drag_speed_m_s : float or None
         Speed at which the parameter ``drag`` is told; None without drag.
+    exact : Numbers or None
+        The same on condition that the beam is uniform to 1e-5; None where that is what these are.
+    uniform_beam : UniformBeamTest or None
+        Whether a uniform beam predicts the modal constants; None if no mode shows.
+    tolerant : TolerantEstimate or None
+        Estimate that parameters and sizes are of, if they allow for a tolerance of the geometry.
+    modal : ModalFit or None
+        Fit of the modal model.
     """
 
     name: str
@@ -233,6 +248,11 @@ class Numbers:
     structures: tuple[tuple[str, StructureStatus], ...]
     simpler: Simpler | None
     drag_speed_m_s: float | None
+    _: KW_ONLY
+    exact: Numbers | None = None
+    uniform_beam: UniformBeamTest | None = None
+    tolerant: TolerantEstimate | None = None
+    modal: ModalFit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -629,24 +649,23 @@ def headline_json(
     dict
         Numbers may be not finite.
     """
+    uniform_beam = None if told.uniform_beam is None else told.uniform_beam.as_json()
     return {
         "file": file,
         "type": told.name,
-        "validity": validity.as_json(),
+        "validity": {**validity.as_json(), "uniform_beam": uniform_beam},
         "parameters": {name: each.as_json() for name, each in told.parameters.items()},
         "drag_speed_m_s": told.drag_speed_m_s,
         "sizes": [
             {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
             for each in told.sizes
         ],
-        "modes": [
-            {
-                "mode": each.number,
-                "frequency_hz": each.frequency_hz.as_json(),
-                "damping_ratio": each.damping_ratio.as_json(),
-            }
-            for each in told.modes
-        ],
+        "modes": [_mode_json(each) for each in told.modes],
+        "uniformity_percent": None if told.tolerant is None else 100 * told.tolerant.uniformity,
+        "basis": None if told.tolerant is None else told.tolerant.basis,
+        "covariance": None if told.tolerant is None else told.tolerant.covariance_json(),
+        "modal_model": None if told.modal is None else told.modal.as_json(),
+        "exact_geometry": None if told.exact is None else _exact_json(told.exact),
         "structures": [{"type": name, "status": status} for name, status in told.structures],
         "orders": {
             each.order: {
@@ -671,4 +690,25 @@ def headline_json(
             }
             for each in findings
         ],
+    }
+
+
+def _mode_json(mode: Mode) -> dict[str, Any]:
+    participation = mode.participation
+    return {
+        "mode": mode.number,
+        "frequency_hz": mode.frequency_hz.as_json(),
+        "damping_ratio": mode.damping_ratio.as_json(),
+        "participation": None if participation is None else participation.as_json(),
+        "source": mode.source,
+        "shown": mode.shown,
+    }
+
+
+def _exact_json(exact: Numbers) -> dict[str, Any]:
+    """Numbers that hold if the beam is uniform to 1e-5."""
+    return {
+        "condition": EXACT_CONDITION,
+        "parameters": {name: each.as_json() for name, each in exact.parameters.items()},
+        "modes": [_mode_json(each) for each in exact.modes],
     }

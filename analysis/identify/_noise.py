@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _BLOCKS: Final = 24
 _FEWEST_BINS: Final = 40
+_FINE_BINS: Final = 60
 _MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
 
 _LINE: Final = 20.0
@@ -106,7 +107,7 @@ def noise_of(
     return Noise(power, counts, tuple(lines))
 
 
-def smooth_power(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
+def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:
     """Smooth power of a residual's spectrum, shape (K,): the expected ``|residual|²`` of each bin.
 
     The power of noise in one bin is exponentially distributed, so its mean is the median over
@@ -118,9 +119,11 @@ def smooth_power(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
     ----------
     residual : ndarray of complex, shape (K,)
         Spectrum on neighbouring bins.
+    finely : bool
+        Whether all blocks are narrow, which follow a peak in the noise.
     """
     power = residual.real**2 + residual.imag**2
-    edges = _edges(power.size)
+    edges = _fine_edges(power.size) if finely else _edges(power.size)
     logs = np.array(
         [
             np.log(max(float(np.median(power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
@@ -140,6 +143,11 @@ def _edges(bins: int) -> NDArray[np.intp]:
         if place - edges[-1] >= _FEWEST_BINS and bins - place >= _FEWEST_BINS:
             edges.append(round(float(place)))
     return np.array([*edges, bins])
+
+
+def _fine_edges(bins: int) -> NDArray[np.intp]:
+    """Borders of equal blocks of `_FINE_BINS` or a little more."""
+    return np.linspace(0, bins, max(bins // _FINE_BINS, 1) + 1).round().astype(np.intp)
 
 
 def _standing_out(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:

@@ -24,11 +24,12 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 import numpy as np
 
 from analysis.identify._data import fast_length
+from analysis.identify._modal_model import ModalModel
 from analysis.identify._plant import Plant
 from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, differentiated_response
 
@@ -284,29 +285,52 @@ class Prediction:
         other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
         return other
 
+    @property
+    def s(self) -> NDArray[np.complex128]:
+        """Grid of the Laplace variable on which a response is taken, in rad/s."""
+        return self._response.s
+
+    def in_time(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return the torque of any responses to the angle at the retained samples, (..., m).
+
+        Parameters
+        ----------
+        responses : ndarray of complex, shape (..., n)
+            On `s`.
+        """
+        spectra = responses * self._spectrum
+        torque: NDArray[np.float64] = np.fft.irfft(spectra, self._length)[..., self._kept]
+        return torque * self._growth
+
     def torque(
-        self, plant: Plant, wrt: Sequence[str] = ()
+        self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Torque in N·m at the samples kept, and its derivatives.
 
         Parameters
         ----------
-        plant : Plant
+        plant : Plant or ModalModel
             Where to evaluate.
         wrt : sequence of str
-            As `ResponseGrid.evaluate` takes them.
+            As `ResponseGrid.evaluate` takes them; none of a modal model.
 
         Returns
         -------
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
-        if plant.clock_rate_difference or CLOCK in wrt:
+        if _has_other_clock(plant, wrt):
             places = np.arange(self._kept.start, self._kept.stop)
             return self._by_other_clock(plant, wrt, places / self.rate_hz)
-        spectra = self._response.evaluate(plant, wrt, self._spectrum)
+        spectra = self._spectra(plant, wrt)
         in_time = np.fft.irfft(spectra, self._length)[:, self._kept] * self._growth
         return in_time[0], in_time[1:]
+
+    def _spectra(self, plant: Plant | ModalModel, wrt: Sequence[str]) -> NDArray[np.complex128]:
+        """Transform of the torque and its derivatives, shape (1 + k, n)."""
+        if isinstance(plant, ModalModel):
+            return (plant.response(self.s) * self._spectrum)[None]
+        return self._response.evaluate(plant, wrt, self._spectrum)
 
     def _by_other_clock(
         self, plant: Plant, wrt: Sequence[str], time_s: NDArray[np.float64]
@@ -336,13 +360,17 @@ class Prediction:
         return at[0], at[1:]
 
     def torque_between(
-        self, plant: Plant, factor: int, places: NDArray[np.intp], wrt: Sequence[str] = ()
+        self,
+        plant: Plant | ModalModel,
+        factor: int,
+        places: NDArray[np.intp],
+        wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Predict the same at a multiple of the rate, at some places only.
 
         Parameters
         ----------
-        plant : Plant
+        plant : Plant or ModalModel
             Beam and rig.
         wrt : sequence of str
             Names of the derivatives, k of them.
@@ -356,12 +384,12 @@ class Prediction:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        if plant.clock_rate_difference or CLOCK in wrt:
+        if _has_other_clock(plant, wrt):
             every = np.arange(factor * self._length) / (factor * self.rate_hz)
             torque, gradient = self._by_other_clock(plant, wrt, every)
             return torque[places], gradient[:, places]
         growth = np.exp(self._sigma * places / (factor * self.rate_hz))
-        spectra = self._response.evaluate(plant, wrt, self._spectrum)
+        spectra = self._spectra(plant, wrt)
         # As many short transforms, each of them shifted by a tick, as the factor says: they stay
         # in the cache, and take less than half the time of a long one.
         shifts = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
@@ -374,6 +402,11 @@ class Prediction:
             row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
         at *= growth
         return at[0], at[1:]
+
+
+def _has_other_clock(plant: Plant | ModalModel, wrt: Sequence[str]) -> TypeGuard[Plant]:
+    """Whether the torque was sampled by a clock of another rate than the angle."""
+    return isinstance(plant, Plant) and (plant.clock_rate_difference != 0 or CLOCK in wrt)
 
 
 def _fourier_sums(

@@ -20,6 +20,8 @@ from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
 from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
+from analysis.identify._modal_fit import fit_modes
+from analysis.identify._modal_headline import tolerant_order, with_modal_model
 from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
 from analysis.identify._residual_tests import (
@@ -32,6 +34,7 @@ from analysis.identify._residual_tests import (
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
 from analysis.identify._time_varying import along_time, changing
+from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
     NOT_DETERMINED,
@@ -52,6 +55,8 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate, Kind
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
+    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._profile_likelihood import Order
     from analysis.identify._residual_tests import Harmonic
@@ -204,23 +209,23 @@ def _selected(
     before = earlier.candidates if earlier else ()
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of_uniform(measurement, fixed, band_hz)
-    field = linear if again else with_evident_drag(linear)
-    if field is linear:
-        linear = again or linear.with_other_rigs(fixed, band_hz)
-        field = linear if linear.misread else with_air_drag(linear)
-    visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
-    field, changes = along_time(field.with_orders_free())
-    if forces or field.drag is not None:
-        # What changes along the record may have looked like an amplitude, which does so as well.
-        other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
-        if other_changes and other.bic < field.bic:
-            field, forces, changes = other, (), other_changes
+    modal = _modal(linear)
+    field = linear
+    forces: tuple[NonlinearForce, ...] = ()
+    changes: tuple[Change, ...] = ()
+    if modal is None or not _linear_and_constant(linear, modal, band_hz):
+        field, forces, changes = _with_effects(linear, fixed, band_hz, again=bool(again))
+        modal = _modal(field)
+    field = field.with_orders_free()
+    visible = _visible(field, modal)
+    test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
+    refused = test is not None and test.status == "refused"
     # Another valley that a part of the record excludes, all of it does as well.
     settled = earlier.settled(field.freest.kind) if earlier and again else ()
-    field, *profiles = profiled(field, settled, walk=untold_reason(field, visible) is None)
+    walk = untold_reason(field, visible) is None and not refused
+    field, *profiles = profiled(field, settled, walk=walk)
     told = field.led_by(field.freest)
-    white, related, multiples = _tests(told, band_hz)
+    white, related, multiples = _tests(told, modal, band_hz)
     explained = white.white and not related.related
     found = findings(told, forces, multiples, visible)
     kinds = {finding.kind for finding in found}
@@ -231,6 +236,16 @@ def _selected(
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
+    if modal is not None and test is not None:
+        tolerant = None
+        if measurement.uniformity and wrong != MISREAD:
+            tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
+        numbers = with_modal_model(numbers, modal, test, tolerant, doubt)
+        if tolerant is not None:
+            alpha, lambda_ = (
+                tolerant_order(each.order, tolerant, each, doubt) for each in profiles
+            )
+            orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
         numbers = numbers.with_law_assumed()
     said, advice = [], []
@@ -272,6 +287,61 @@ def _selected(
         ),
     )
     return _Told(selection, told, explained, kinds)
+
+
+def _modal(field: CandidateSet) -> ModalFit | None:
+    """Fit the modal model to what a set of candidates was fitted to; None if no mode shows."""
+    if field.misread:
+        return None
+    starts = [
+        (mode.number, mode.frequency_hz, mode.damping_ratio)
+        for mode in field.likeliest.modes
+        if mode.frequency_hz > 0
+    ]
+    return fit_modes(field.comparison, field.noise, starts, field.columns)
+
+
+def _visible(field: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
+    """Numbers of the modes that a record shows."""
+    if modal is None:
+        return visible_modes(field.comparison, field.noise, field.best.fit)
+    return modal.visible
+
+
+def _linear_and_constant(
+    field: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
+) -> bool:
+    """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
+    _, _, multiples = _tests(field, modal, band_hz)
+    return modal.explained and not any(each.present for each in multiples)
+
+
+def _with_effects(
+    linear: CandidateSet, fixed: tuple[Setting, ...], band_hz: tuple[float, float], *, again: bool
+) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[Change, ...]]:
+    """Look for what no linear constant antenna does.
+
+    Returns
+    -------
+    field : CandidateSet
+        With what explains the record best.
+    forces : tuple of NonlinearForce
+    changes : tuple of Change
+        Along the record.
+    """
+    field = linear if again else with_evident_drag(linear)
+    if field is linear:
+        linear = linear if again else linear.with_other_rigs(fixed, band_hz)
+        field = linear if linear.misread else with_air_drag(linear)
+    visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
+    field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
+    field, changes = along_time(field.with_orders_free())
+    if forces or field.drag is not None:
+        # What changes along the record may have looked like an amplitude, which does so as well.
+        other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
+        if other_changes and other.bic < field.bic:
+            return other, (), other_changes
+    return field, forces, changes
 
 
 def freest_alone(
@@ -318,8 +388,9 @@ def _freest_alone(
     if not misread:
         field = field.with_special_cases()
         field = field if like is None else field.with_kind_of(like)
-    visible = visible_modes(field.comparison, field.noise, field.best.fit)
-    white, related, multiples = _tests(field, band_hz)
+    modal = _modal(field)
+    visible = _visible(field, modal)
+    white, related, multiples = _tests(field, modal, band_hz)
     found = findings(field, (), multiples, visible)
     kinds = {finding.kind for finding in found}
     explained = white.white and not related.related
@@ -339,6 +410,13 @@ def _freest_alone(
         found = _as_sure(found, (), wrong, doubt, told.flags, explained=explained)
         found = _with_knocks_and_rest(field, found, white, related)
     told = told.doubted(_CLIPPED) if "clipping" in kinds else told
+    if modal is not None:
+        doubt = wrong or _doubt((), clipped="clipping" in kinds)
+        test = uniform_beam_test(modal, measurement.nominal)
+        tolerant = None
+        if measurement.uniformity and wrong != MISREAD:
+            tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
+        told = with_modal_model(told, modal, test, tolerant, doubt)
     others = (each.fit for each in field.candidates if each.structure is INTEGER)
     analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
     return _Told((told, found, analysis), field, explained, kinds)
@@ -426,16 +504,20 @@ def _with_knocks_and_rest(
 
 
 def _tests(
-    field: CandidateSet, band_hz: tuple[float, float]
+    field: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
-    """Test what the first candidate leaves."""
-    comparison, residual = field.comparison, field.best.fit.residual
-    counts, angle_rad = field.noise.counts, comparison.angle_rad[comparison.kept]
+    """Test what the modal model leaves, or the first candidate where there is none."""
+    comparison, counts = field.comparison, field.noise.counts
+    residual = field.best.fit.residual if modal is None else modal.residual
+    angle_rad = comparison.angle_rad[comparison.kept]
     of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
+    multiples = harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz)
+    if modal is not None:
+        return modal.whiteness, modal.input_relation, multiples
     return (
         whiteness(residual[counts], comparison.frequency_hz[counts]),
         input_relation(residual, comparison.spectrum(angle_rad), comparison.frequency_hz),
-        harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz),
+        multiples,
     )
 
 

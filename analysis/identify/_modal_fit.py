@@ -1,0 +1,458 @@
+"""Fit of the modal model to a record, by output error as that of the beam.
+
+The linear parameters (residues and background) are eliminated at each point, so that the search is
+over frequency and damping of each mode alone (variable projection). With numerators of one size
+within the band::
+
+    G(s) = sum_k (A_k + B_k q) q² / (1 + eta_k q + q²) + b0 + … + b4 s⁴,    q = s / omega_k
+
+is the pole-residue form (`ModalModel`) with another background. The spectrum of the noise is
+estimated from the residual, in turns with the fit; it may have any smooth shape.
+
+References
+----------
+G. H. Golub and V. Pereyra, Separable nonlinear least squares, Inverse Problems 19 (2003) R1-R26.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from analysis.identify._free_decay import Pole
+from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
+from analysis.identify._noise import smooth_power
+from analysis.identify._residual_tests import input_relation, whiteness
+from analysis.optimizer import Box, NormalEquations, descend
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._comparison import Comparison
+    from analysis.identify._noise import Noise
+    from analysis.identify._residual_tests import InputRelation, Whiteness
+
+_TOLERANCE: Final = 1e-8
+_NARROWEST: Final = 1e-5
+_WIDEST: Final = 1.0
+"""Least and largest eta, twice the damping ratio."""
+
+_NEAR: Final = 0.15
+"""How far a mode may be from where the search begins, relatively."""
+
+_LOWEST: Final = 0.12
+"""Lowest frequency compared, relative to the first mode: below are drift and 1/f noise, and nothing
+that determines a mode."""
+
+_NOISE_PASSES: Final = 3
+_SETTLED: Final = 0.02
+"""Change of the noise's mean logarithm below which it is not estimated again."""
+
+_MOST_FURTHER: Final = 3
+"""Resonances beyond those of the beam that are looked for: of the sensor or the mount."""
+
+_EVIDENCE: Final = 60.0
+"""Deviance that a further resonance must save."""
+
+_VISIBLE: Final = 400.0
+"""Deviance by which a mode must improve the fit: its damping ratio is then known to a tenth."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModalFit:
+    """Modal model fitted to a record.
+
+    Attributes
+    ----------
+    model : ModalModel
+    numbers : tuple of int
+        Number of each mode of the model among those of the beam, from 1; 0 for a resonance of
+        something else.
+    constants : ndarray, shape (4 n,)
+        `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
+    covariance : ndarray, shape (4 n, 4 n)
+        Of the constants.
+    evidence : tuple of float
+        Deviance that each mode saves.
+    residual : ndarray of complex, shape (K,)
+        Whitened; parts of variance 1 where chance is all that remains.
+    deviance : float
+        ``-2 ln`` likelihood but for a constant: squares, and twice the logarithms of the noise.
+    parameters : int
+    noise : Noise
+        As estimated from this residual; bins below the first mode do not count.
+    whiteness : Whiteness
+    input_relation : InputRelation
+    """
+
+    model: ModalModel
+    numbers: tuple[int, ...]
+    constants: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    evidence: tuple[float, ...]
+    residual: NDArray[np.complex128]
+    deviance: float
+    parameters: int
+    noise: Noise
+    whiteness: Whiteness
+    input_relation: InputRelation
+
+    @property
+    def explained(self) -> bool:
+        """Whether nothing but noise remains."""
+        return self.whiteness.white and not self.input_relation.related
+
+    @property
+    def visible(self) -> tuple[int, ...]:
+        """Numbers of the beam's modes that the record shows."""
+        shown = zip(self.numbers, self.evidence, strict=True)
+        return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
+
+    def as_json(self) -> dict[str, Any]:
+        """Modal model with the covariance of its constants, as `json.dumps` takes it."""
+        names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
+        return {
+            **self.model.as_json(),
+            "modes": list(self.numbers),
+            "constants": self.constants.tolist(),
+            "names": names,
+            "covariance": self.covariance.tolist(),
+        }
+
+    def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
+        """Places of the constants of some modes, shape (4 m,).
+
+        Parameters
+        ----------
+        numbers : sequence of int
+        """
+        each = np.arange(len(CONSTANTS))
+        return np.concatenate([each + each.size * self.numbers.index(n) for n in numbers])
+
+
+def fit_modes(
+    comparison: Comparison,
+    noise: Noise,
+    starts: Sequence[tuple[int, float, float]],
+    columns: NDArray[np.complex128] | None = None,
+) -> ModalFit | None:
+    """Fit the modal model.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    noise : Noise
+        First estimate; its lines stay left out.
+    starts : sequence of (int, float, float)
+        Number, frequency (Hz) and damping ratio of each mode, roughly.
+    columns : ndarray of complex, shape (c, K), optional
+        Spectra of known shape and unknown size, as `Objective` takes them.
+
+    Returns
+    -------
+    ModalFit or None
+        None if no mode is within the band.
+    """
+    inside = [each for each in starts if each[1] <= comparison.frequency_hz[-1]]
+    if not inside:
+        return None
+    further = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+    further = further if columns is None else columns
+    lowest_hz = _LOWEST * min(hz for _, hz, _ in inside)
+    counts = noise.counts & (comparison.frequency_hz >= lowest_hz)
+    search = _Search(
+        comparison,
+        replace(noise, counts=counts),
+        further,
+        tuple(number for number, _, _ in inside),
+        np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
+    )
+    return search.settled().with_further_resonances().without_idle_modes().fit()
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Modes at one point of the search, under one estimate of the noise."""
+
+    comparison: Comparison
+    noise: Noise
+    further: NDArray[np.complex128]
+    numbers: tuple[int, ...]
+    x: NDArray[np.float64]
+
+    def problem(self) -> _Problem:
+        """Residual of these modes under this noise."""
+        return _Problem(self.comparison, self.noise.weight, self.further)
+
+    def descended(self) -> _Search:
+        """Descend under this noise."""
+        low = np.column_stack([self.x[::2] - _NEAR, np.full(len(self.numbers), _NARROWEST)])
+        high = np.column_stack([self.x[::2] + _NEAR, np.full(len(self.numbers), _WIDEST)])
+        found = descend(
+            self.problem().normal_equations,
+            self.x,
+            Box(low.ravel(), high.ravel()),
+            relative_tolerance=_TOLERANCE,
+            max_evaluations=60,
+        )
+        return replace(self, x=found.x)
+
+    def settled(self) -> _Search:
+        """Descend, and estimate the noise and what is unknown of the record, in turns."""
+        search = self
+        for _ in range(_NOISE_PASSES):
+            search = search.descended()
+            model, residual = search.problem().model_and_residual(search.x)
+            comparison = search.comparison.renewed(model, search.noise).filled(model)
+            power = smooth_power(residual, finely=True) / comparison.measurement.torque_share
+            counts = search.noise.counts
+            change = np.abs(np.log(power / search.noise.power)[counts]).mean()
+            search = replace(
+                search, comparison=comparison, noise=replace(search.noise, power=power)
+            )
+            if change < _SETTLED and comparison.measurement.torque_known.all():
+                break
+        return search.descended()
+
+    def cost(self) -> float:
+        """Sum of whitened squares at this point."""
+        residual = self.problem().at(self.x).residual
+        return float(residual @ residual)
+
+    def with_further_resonances(self) -> _Search:
+        """Add a resonance where the residual still follows the angle, if that explains it."""
+        search = self
+        for _ in range(_MOST_FURTHER):
+            related = search.relation()
+            if not related.related:
+                break
+            start = [math.log(2 * math.pi * related.at_hz), 0.02]
+            more = replace(
+                search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
+            ).settled()
+            at = replace(search, noise=more.noise, comparison=more.comparison).descended()
+            if at.cost() - more.cost() < _EVIDENCE:
+                break
+            search = more
+        return search
+
+    def without_idle_modes(self) -> _Search:
+        """Leave out modes that save nothing: there frequency and damping are undetermined."""
+        search = self
+        while search.numbers:
+            saved = search.evidence()
+            least = int(np.argmin(saved))
+            if saved[least] > _EVIDENCE:
+                break
+            search = search._without(least).descended()
+        return search
+
+    def _without(self, place: int) -> _Search:
+        numbers = self.numbers[:place] + self.numbers[place + 1 :]
+        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * place, 2 * place + 1]))
+
+    def evidence(self) -> NDArray[np.float64]:
+        """Sum of squares that each mode saves with the others where they are, shape (n,)."""
+        own = self.cost()
+        return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
+
+    def relation(self) -> InputRelation:
+        """Relation of the residual to the angle."""
+        residual = self.problem().at(self.x).residual.view(np.complex128)
+        angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
+        counts = self.noise.counts
+        first = int(np.argmax(counts))
+        return input_relation(residual[first:], angle[first:], self.comparison.frequency_hz[first:])
+
+    def fit(self) -> ModalFit | None:
+        """Return the fit at this point."""
+        if not self.numbers:
+            return None
+        order = np.argsort(self.x[::2])
+        x = self.x.reshape(-1, 2)[order].ravel()
+        numbers = tuple(self.numbers[i] for i in order)
+        search = replace(self, x=x, numbers=numbers)
+        problem = search.problem()
+        model, _ = problem.model_and_residual(x)
+        point = problem.at(x)
+        constants, covariance = problem.constants(point, x)
+        residual = point.residual.view(np.complex128)
+        counts = search.noise.counts
+        squares = float(point.residual @ point.residual)
+        return ModalFit(
+            model=model,
+            numbers=numbers,
+            constants=constants,
+            covariance=covariance,
+            evidence=tuple(search.evidence().tolist()),
+            residual=residual,
+            deviance=squares + 2 * float(np.sum(np.log(search.noise.power[counts]))),
+            parameters=x.size + 2 * len(numbers) + BACKGROUND,
+            noise=search.noise,
+            whiteness=whiteness(residual[counts], search.comparison.frequency_hz[counts]),
+            input_relation=search.relation(),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Whitened residual of the best linear parameters at one point, and its derivatives."""
+
+    residual: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    full_jacobian: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+
+def _unit_pole(eta: float) -> complex:
+    """Upper root of ``1 + eta q + q²``."""
+    return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
+
+
+class _Problem:
+    """Whitened residual of a number of modes over their frequencies and damping."""
+
+    def __init__(
+        self,
+        comparison: Comparison,
+        weight: NDArray[np.float64],
+        further: NDArray[np.complex128],
+    ) -> None:
+        self._comparison = comparison
+        self._weight = weight
+        self._further = further
+        self._s = comparison.prediction.s
+        self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
+        self._measured = self._white(comparison.spectrum(comparison.torque_nm[comparison.kept]))
+        background = np.array([(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND)])
+        self._background = self._spectra(background)
+
+    def _white(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
+        return np.ascontiguousarray(spectra * self._weight).view(np.float64)
+
+    def _spectra(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+        comparison = self._comparison
+        return self._white(comparison.spectrum(comparison.prediction.in_time(responses)))
+
+    def _nuisance(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
+        none = np.zeros(0, dtype=np.complex128)
+        poles = [
+            Pole(number, math.exp(log_omega) * _unit_pole(eta), none)
+            for number, (log_omega, eta) in enumerate(x.reshape(-1, 2), start=1)
+        ]
+        return np.concatenate([self._comparison.nuisance(poles), self._further])
+
+    def at(self, x: NDArray[np.float64]) -> _Point:
+        """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``."""
+        modes = x.reshape(-1, 2)
+        rows: list[NDArray[np.complex128]] = []
+        slopes: list[NDArray[np.complex128]] = []
+        for log_omega, eta in modes:
+            omega = math.exp(log_omega)
+            q = self._s / omega
+            over = 1 / (1 + eta * q + q * q)
+            numerators = (q * q * over, q**3 * over)
+            rows += numerators
+            # d/d eta and d/d ln omega of either numerator over the denominator
+            for power, row in zip((2, 3), numerators, strict=True):
+                slopes.append(row * ((eta * q + 2 * q * q) * over - power))
+                slopes.append(-row * q * over)
+        count = len(rows)
+        spectra = self._spectra(np.array(rows + slopes))
+        nuisance = self._white(self._nuisance(x))
+        columns = np.concatenate([spectra[:count], self._background, nuisance])
+        scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
+        scale[scale == 0] = 1.0
+        scaled = columns / scale[:, None]
+        gram = scaled @ scaled.T
+        gram[np.diag_indices_from(gram)] += 1e-13
+        factor = np.linalg.cholesky(gram)
+        solved = np.linalg.solve(factor, scaled)  # orthonormal rows
+        along = solved @ self._measured
+        residual = along @ solved - self._measured
+        linear = np.linalg.solve(factor.T, along) / scale
+        jacobian = np.empty((x.size, residual.size))
+        for k in range(len(modes)):
+            a, b = linear[2 * k : 2 * k + 2]
+            four = spectra[count + 4 * k : count + 4 * k + 4]
+            jacobian[2 * k] = a * four[0] + b * four[2]
+            jacobian[2 * k + 1] = a * four[1] + b * four[3]
+        projected = jacobian - (jacobian @ solved.T) @ solved
+        return _Point(residual, linear, columns, jacobian, projected)
+
+    def model_and_residual(
+        self, x: NDArray[np.float64]
+    ) -> tuple[ModalModel, NDArray[np.complex128]]:
+        """Modal model at a point, and its residual in N·m, not whitened."""
+        linear = self.at(x).linear
+        modes = x.reshape(-1, 2)
+        poles, residues = [], []
+        first = 2 * len(modes)
+        background = linear[first : first + BACKGROUND] / self.scale_rad_s ** np.arange(BACKGROUND)
+        for k, (log_omega, eta) in enumerate(modes):
+            omega, (a, b) = math.exp(log_omega), linear[2 * k : 2 * k + 2]
+            q = _unit_pole(eta)
+            poles.append(omega * q)
+            residues.append(omega * (a + b * q) * q * q / (2j * q.imag))
+            # (a + b q) q² over the denominator, less its remainder
+            background[0] += a - b * eta
+            background[1] += b / omega
+        model = ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
+        columns = self._nuisance(x)
+        comparison = self._comparison
+        torque = comparison.prediction.torque(model)[0]
+        bare = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        return model, bare + linear[first + BACKGROUND :] @ columns
+
+    def constants(
+        self, point: _Point, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`CONSTANTS` of all modes and their covariance."""
+        count = x.size // 2
+        total = np.concatenate([point.full_jacobian, point.columns])
+        scale = np.sqrt(np.einsum("ij,ij->i", total, total))
+        scale[scale == 0] = 1.0
+        gram = (total / scale[:, None]) @ (total / scale[:, None]).T
+        gram[np.diag_indices_from(gram)] += 1e-14
+        covariance = np.linalg.inv(gram) / np.outer(scale, scale)
+        constants = np.empty(4 * count)
+        chain = np.zeros((4 * count, x.size + 2 * count))
+        for k in range(count):
+            log_omega, eta = x[2 * k : 2 * k + 2]
+            a, b = point.linear[2 * k : 2 * k + 2]
+            q = _unit_pole(eta)
+            over = a + b * q
+            # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
+            log_residue = np.log(-over * q * q / (2 * q.imag)) + log_omega
+            by_eta_q = complex(-0.5, -eta / (4 * q.imag))
+            by_eta = (b / over + 2 / q) * by_eta_q - by_eta_q.imag / q.imag
+            by_a, by_b = 1 / over, q / over
+            constants[4 * k : 4 * k + 4] = (
+                log_omega + math.log(q.imag / (2 * math.pi)),
+                math.log(eta / 2),
+                log_residue.real,
+                log_residue.imag,
+            )
+            rows = chain[4 * k : 4 * k + 4]
+            omega_at, eta_at, a_at, b_at = 2 * k, 2 * k + 1, x.size + 2 * k, x.size + 2 * k + 1
+            rows[0, [omega_at, eta_at]] = 1.0, by_eta_q.imag / q.imag
+            rows[1, eta_at] = 1 / eta
+            rows[2, [omega_at, eta_at, a_at, b_at]] = 1.0, by_eta.real, by_a.real, by_b.real
+            rows[3, [eta_at, a_at, b_at]] = by_eta.imag, by_a.imag, by_b.imag
+        own = covariance[: chain.shape[1], : chain.shape[1]]
+        return constants, chain @ own @ chain.T
+
+    def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
+        """As the descent takes them (Kaufman's Jacobian)."""
+        point = self.at(x)
+        return NormalEquations(
+            cost=float(point.residual @ point.residual),
+            gradient=point.jacobian @ point.residual,
+            hessian=point.jacobian @ point.jacobian.T,
+        )

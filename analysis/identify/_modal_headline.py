@@ -1,0 +1,232 @@
+"""Headline of a record from its modal model, and from a beam with a tolerance of the geometry.
+
+Modes are those of the modal model, which no antenna contradicts. Damping and stiffness are those of
+a beam whose modes may lie where those of a uniform one do not, by a stated tolerance: what an order
+of the damping does to a frequency, an unevenness of a thousandth does as well. What the record
+would tell of a beam that is uniform to 1e-5 is reported as a condition.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._headline import Headline, Mode, Numbers, Quantity, Size
+from analysis.identify._plant import OF_BEAM
+from analysis.identify._profile_likelihood import WIDEST_SHARE
+from analysis.identify._uncertainty import damping_size
+from analysis.identify._uniform_beam import PARAMETERS
+from analysis.identify._verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
+from analysis.models import COEFFICIENT_OF, ORDER_RANGE
+from analysis.statistics import NORMAL_95
+
+if TYPE_CHECKING:
+    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
+
+NOT_UNIFORM: Final = (
+    "an effective value: the modes are not those of a uniform beam, and what makes them differ may "
+    "change it"
+)
+NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
+_UNDETERMINED: Final = 5.0
+"""Standard deviation of a logarithm from which its value says nothing."""
+
+
+def refused_reason(test: UniformBeamTest) -> str | None:
+    """Say why values of a uniform beam are not to be believed; None where they may be."""
+    if test.status != "refused":
+        return None
+    return f"a uniform beam does not predict the modal constants (p = {test.p_value:.1g})"
+
+
+def with_modal_model(
+    exact: Headline,
+    modal: ModalFit,
+    test: UniformBeamTest,
+    tolerant: TolerantEstimate | None,
+    doubt: str | None,
+) -> Headline:
+    """Put modes and tolerant parameters in front of those of an exactly uniform beam.
+
+    Parameters
+    ----------
+    exact : Headline
+        That of the exactly uniform beam.
+    modal : ModalFit
+    test : UniformBeamTest
+    tolerant : TolerantEstimate or None
+        None to keep the parameters: the beam is stated to be uniform, or too few modes show.
+    doubt : str or None
+        Why no number of the record is to be believed.
+    """
+    refused = refused_reason(test)
+    effective = None if refused is None else NOT_UNIFORM
+    condition = exact if refused is None else exact.doubted(refused)
+    exactly = exact.fit.modes if tolerant is None and refused is None else ()
+    modes = _modes(condition, modal, doubt, own=bool(exactly))
+    told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
+    if tolerant is None:
+        return told
+    return replace(
+        told,
+        parameters={
+            **{
+                name: quantity
+                for name, quantity in condition.parameters.items()
+                if name not in PARAMETERS
+            },
+            **_parameters(tolerant, doubt, effective),
+        },
+        sizes=_sizes(tolerant, doubt),
+        simpler=None,
+        exact=Numbers(
+            name=condition.name,
+            parameters=condition.parameters,
+            sizes=condition.sizes,
+            modes=condition.modes,
+            structures=condition.structures,
+            simpler=condition.simpler,
+            drag_speed_m_s=condition.drag_speed_m_s,
+        ),
+        tolerant=tolerant,
+    )
+
+
+def _modes(told: Headline, modal: ModalFit, doubt: str | None, *, own: bool) -> tuple[Mode, ...]:
+    """Modes that show by the modal model, the others as the beam has them."""
+    std = np.sqrt(np.diag(modal.covariance)).reshape(-1, 4)
+    constants = modal.constants.reshape(-1, 4)
+    found: dict[int, Mode] = {mode.number: mode for mode in told.modes}
+    for place, number in enumerate(modal.numbers):
+        if number not in modal.visible:
+            continue
+        ln_frequency, ln_ratio, *_ = constants[place]
+        inertia = modal.model.effective_inertias_kg_m2[place]
+        # ln of the inertia: ln of the residue less three times ln of the frequency
+        rows = slice(4 * place, 4 * place + 4)
+        slope = np.array([-3.0, 0.0, 1.0, 0.0])
+        spread = math.sqrt(float(slope @ modal.covariance[rows, rows] @ slope))
+        mode = Mode(
+            number,
+            _relative(math.exp(ln_frequency), std[place, 0], doubt),
+            _relative(math.exp(ln_ratio), std[place, 1], doubt),
+            shown=True,
+            source="modal",
+            participation=_relative(inertia, spread, doubt),
+        )
+        if own and number in found:
+            before = found[number]
+            mode = replace(before, shown=True, participation=mode.participation)
+        found[number] = mode
+    return tuple(
+        each if each.number in modal.visible else replace(each, shown=False)
+        for _, each in sorted(found.items())
+    )
+
+
+def _relative(value: float, spread: float, flag: str | None) -> Quantity:
+    """Quantity with a relative standard deviation."""
+    half = NORMAL_95 * spread
+    return Quantity(value, value * spread, (value * (1 - half), value * (1 + half)), flag)
+
+
+def _parameters(
+    estimate: TolerantEstimate, doubt: str | None, effective: str | None
+) -> dict[str, Quantity]:
+    """Parameters of the nearly uniform beam, with flags where the modes do not determine them.
+
+    Parameters
+    ----------
+    estimate : TolerantEstimate
+    doubt : str or None
+        Why no number of the record is to be believed.
+    effective : str or None
+        Why stiffness and density are not those of the beam alone: a mass at the tip or an elastic
+        clamp changes all modes alike, by far more than the tolerance.
+    """
+    return {
+        name: Quantity(
+            estimate.values[name],
+            estimate.std[name],
+            estimate.interval[name],
+            doubt or (effective if name in OF_BEAM else None) or _reason(estimate, name),
+        )
+        for name in PARAMETERS
+    }
+
+
+def _reason(estimate: TolerantEstimate, name: str) -> str | None:
+    """Say why a parameter is not to be believed; None if it may be."""
+    if estimate.basis == "none":
+        return NO_ORDER
+    for order, coefficient in COEFFICIENT_OF.items():
+        if name in (order, coefficient) and not identifiable(estimate, order):
+            return NOT_DETERMINED
+    return None
+
+
+def identifiable(estimate: TolerantEstimate, order: str) -> bool:
+    """Whether the modes bound an order within less than half of its range."""
+    low, high = estimate.interval[order]
+    coefficient = COEFFICIENT_OF[order]
+    spread = estimate.std[coefficient] / max(estimate.values[coefficient], 1e-300)
+    wide = WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
+    return high - low <= wide and spread < _UNDETERMINED
+
+
+def _sizes(estimate: TolerantEstimate, doubt: str | None) -> tuple[Size, ...]:
+    """Loss factors where they depend least on their orders."""
+    values = dict(estimate.values)
+    found = []
+    for damping, coefficient, order in (
+        ("internal", "zeta", "alpha"),
+        ("external", "gamma", "lambda"),
+    ):
+        size = damping_size(
+            coefficient, order, values, PARAMETERS, estimate.covariance, estimate.first_rad_s
+        )
+        if size is None:
+            continue
+        spread = size.std / size.value
+        ends = (
+            size.value * math.exp(-NORMAL_95 * spread),
+            size.value * math.exp(min(NORMAL_95 * spread, 300.0)),
+        )
+        flag = doubt or (NO_ORDER if estimate.basis == "none" else None)
+        quantity = Quantity(size.value, size.std, ends, flag)
+        found.append(Size(damping, size.omega_rad_s, quantity))  # type: ignore[arg-type]
+    return tuple(found)
+
+
+def tolerant_order(
+    order: Order, estimate: TolerantEstimate, profile: Profile, doubt: str | None
+) -> OrderVerdict:
+    """Judge one order with a tolerance of the geometry.
+
+    Parameters
+    ----------
+    order : str
+    estimate : TolerantEstimate
+    profile : Profile
+        Profile of the order on an exactly uniform beam.
+    doubt : str or None
+        Why no number of the record is to be believed.
+    """
+    if estimate.basis == "none":
+        return OrderVerdict(order, "not identifiable", None, None, NO_ORDER, profile)
+    if not identifiable(estimate, order):
+        return OrderVerdict(order, "not identifiable", None, None, NOT_DETERMINED, profile)
+    low, high = estimate.interval[order]
+    value = estimate.values[order]
+    if doubt is not None:
+        return OrderVerdict(order, "open", value, (low, high), doubt, profile)
+    if low <= 1 <= high:
+        return OrderVerdict(order, "compatible", value, (low, high), None, profile)
+    fractional = estimate.deviance_of_one[order] > EXCLUDED[0]
+    status: Status = "fractional" if fractional else "open"
+    return OrderVerdict(order, status, value, (low, high), None, profile)
