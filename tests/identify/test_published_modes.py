@@ -26,7 +26,7 @@ def test_mode_of_the_impact_test(estimate, published):
     band = RESPONSE.within(published.first_hz, published.last_hz)
     (mode,) = estimate(band, [212.0], 5)
     assert mode.frequency_hz == pytest.approx(published.resonance.frequency_hz, rel=1e-4)
-    # The published fit weights lines far from the resonance most: wide bands bias its damping ratio.
+    # The published fit weights lines far from the resonance most: a wide band biases its result.
     within = 0.02 if published.last_hz - published.first_hz < 30 else 0.07
     assert mode.damping_ratio == pytest.approx(published.resonance.damping_ratio, rel=within)
 
