@@ -1,0 +1,83 @@
+"""Modes of published measurements: what others found, and what independent fits find.
+
+``bench_published_modes.py [--files FOLDER]``
+
+The impact test is part of the project (tests/data/impact_test). Two more data sets may not be
+redistributed here (one has no licence, the other is under the GPL); they are read from FOLDER if
+you put them there:
+
+* ``SBPA_lame.mat`` of github.com/opatiny/matlab-scripts, in heig-vd/regul/labos/lame-flexible/data:
+  a flexible blade with an actuator, driven by a pseudo-random binary signal at 1 kHz. Its author's
+  model (reponse_freq_lame.m): 116 rad/s, damping ratio 0.005, delay 0.75 ms, adjusted by hand.
+* ``ForcedFrequencyResponses.mat`` of github.com/mattiacenedese/BRBtesting: first bending mode of a
+  free Brake-Reuss beam, acceleration over force at eight constant amplitudes (Chen et al. 2022,
+  doi.org/10.1016/j.ymssp.2021.108401; Jin et al. 2022, doi.org/10.1016/j.ymssp.2021.108402). At a
+  constant amplitude a nonlinear mode responds as a linear one. The second result is from the phase
+  alone.
+"""
+
+import argparse
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from published_data import (
+    Resonance,
+    blade,
+    brake_reuss_beam,
+    fit_poles,
+    impact_test,
+    phase_resonance,
+)
+
+SUMS = {
+    "SBPA_lame.mat": "b9d3f33a6f39dc32fa31b0896224a69759af8089098823d199e61ea035247dfd",
+    "ForcedFrequencyResponses.mat": (
+        "e4bfe248b921edbd23153c24a37c3a9e1556fb1bf59fe6d9e63ae8e2177f1100"
+    ),
+}
+AUTHORS_BLADE_MODEL = Resonance(116 / (2 * np.pi), 0.005)
+
+
+def line(name: str, reference: Resonance, found: Resonance) -> str:
+    """Return a row of the table."""
+    frequency = found.frequency_hz / reference.frequency_hz - 1
+    ratio = found.damping_ratio / reference.damping_ratio - 1
+    return (
+        f"| {name} | {reference.frequency_hz:.3f} | {found.frequency_hz:.3f} ({frequency:+.3%}) | "
+        f"{reference.damping_ratio:.3%} | {found.damping_ratio:.3%} ({ratio:+.1%}) |"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--files", type=Path, help="folder with the files that are not shipped")
+    folder: Path | None = parser.parse_args().files
+    print("| data | reference (Hz) | vector fitting (Hz) | reference | vector fitting |")
+    print("|---|---|---|---|---|")
+    measured, published = impact_test()
+    for mode in published:
+        band = measured.within(mode.first_hz, mode.last_hz)
+        (found,) = fit_poles(band, [212.0], 5)
+        print(line(f"impact test, {mode.first_hz:g}-{mode.last_hz:g} Hz", mode.resonance, found))
+    for name in SUMS if folder else ():
+        path = folder / name
+        if not path.exists():
+            print(f"{path} is missing: see --help.")
+            continue
+        if hashlib.sha256(path.read_bytes()).hexdigest() != SUMS[name]:
+            print(f"{path} is another version than the one that was compared.")
+        if name == "SBPA_lame.mat":
+            _, response = blade(path)
+            for first_hz, last_hz in ((10.0, 30.0), (5.0, 35.0), (1.0, 50.0)):
+                (found,) = fit_poles(response.within(first_hz, last_hz), [18.5], 5)
+                print(line(f"blade, {first_hz:g}-{last_hz:g} Hz", AUTHORS_BLADE_MODEL, found))
+        else:
+            for level in brake_reuss_beam(path):
+                (found,) = fit_poles(level, [80.0], 1)
+                print(line(level.name, phase_resonance(level), found))
+
+
+if __name__ == "__main__":
+    main()
