@@ -28,6 +28,7 @@ from analysis.record_checks import (
     stated_tool_inertia_kg_m2,
     stated_torque_filter_s,
     stated_uncertainty,
+    stated_uniformity,
 )
 from rigd.session import Session, Status, read_session, readable_texts
 
@@ -127,6 +128,9 @@ class Record:
         Time constants of the torque channel's low-pass filter, of first and of second order.
     uncertainty
         Relative standard uncertainties of `record_checks.SCALES`, those that the file states.
+    uniformity
+        Relative standard deviation of each mode's frequency from that of a uniform beam, 0.001 if
+        the file states none.
     sweep
         Range of samples with the excitation.
     rest_angle_rad
@@ -157,6 +161,7 @@ class Record:
     tool_inertia_kg_m2: float
     torque_filter_s: tuple[float, float]
     uncertainty: Mapping[str, float]
+    uniformity: float
     sweep: slice
     rest_angle_rad: float | None
     gaps: Gaps
@@ -269,6 +274,7 @@ def record_of(session: Session) -> Record:
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
         torque_filter_s=stated_torque_filter_s(session),
         uncertainty=stated_uncertainty(session),
+        uniformity=stated_uniformity(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,

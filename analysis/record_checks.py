@@ -39,6 +39,8 @@ _BEAM_RANGES: Final = {
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
 MAX_UNCERTAINTY_PERCENT: Final = 50.0
+MAX_UNIFORMITY_PERCENT: Final = 10.0
+_DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
 _FIRST_ROOT: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
@@ -192,6 +194,24 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
         if percent:
             stated[name] = percent / 100
     return stated
+
+
+def stated_uniformity(session: Session) -> float:
+    """Relative standard deviation of each mode's frequency from that of a uniform beam.
+
+    0.001, that of an antenna made with care, if the file states none.
+
+    Raises
+    ------
+    RecordError
+        It is negative, or larger than a model of a uniform beam allows.
+    """
+    key = "uniformity_percent"
+    percent = session.number(key, _DEFAULT_UNIFORMITY_PERCENT)
+    if not 0.0 <= percent <= MAX_UNIFORMITY_PERCENT:
+        rule = f"must lie between 0 and {MAX_UNIFORMITY_PERCENT:g}"
+        raise _wrong(session, key, percent, rule)
+    return percent / 100
 
 
 def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import ExchangeError
-from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
+from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, MAX_UNIFORMITY_PERCENT, SCALES
 from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml, read_text
 from rigd.units import finite_number, unit_of
@@ -14,6 +14,8 @@ from rigd.units import finite_number, unit_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+
+_UNIFORMITY: Final = "uniformity_percent"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +29,14 @@ class Specimen:
         Inertia about the motor's axis of what sits between torque sensor and beam.
     uncertainty_percent : mapping of str to float
         Relative standard uncertainties of `analysis.record_checks.SCALES`, those stated.
+    uniformity_percent : float or None
+        Relative standard deviation of each mode's frequency from that of a uniform beam, if stated.
     """
 
     beam: Beam
     tool_inertia_kg_m2: float = 0.0
     uncertainty_percent: Mapping[str, float] = field(default_factory=dict)
+    uniformity_percent: float | None = None
 
 
 def read_specimen(path: Path) -> Specimen:
@@ -75,10 +80,13 @@ def read_specimen(path: Path) -> Specimen:
         ),
         tool_inertia_kg_m2,
         {
-            name: _uncertainty_percent(path, uncertainty, key)
+            name: _percent(path, uncertainty, key, MAX_UNCERTAINTY_PERCENT)
             for name in SCALES
             if (key := f"{name}_percent") in uncertainty
         },
+        _percent(path, uncertainty, _UNIFORMITY, MAX_UNIFORMITY_PERCENT)
+        if _UNIFORMITY in uncertainty
+        else None,
     )
 
 
@@ -98,12 +106,11 @@ def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
     return value
 
 
-def _uncertainty_percent(path: Path, section: Mapping[str, Any], key: str) -> float:
+def _percent(path: Path, section: Mapping[str, Any], key: str, most: float) -> float:
     percent = _number(path, "uncertainty", section, key)
-    if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
+    if not 0.0 <= percent <= most:
         raise ExchangeError(
-            f"{path}: uncertainty.{key} is {percent:g} %, but must lie between 0 and "
-            f"{MAX_UNCERTAINTY_PERCENT:g}."
+            f"{path}: uncertainty.{key} is {percent:g} %, but must lie between 0 and {most:g}."
         )
     return percent
 

@@ -172,6 +172,8 @@ class Measurement:
         follow it is taken to be the noise's doing.
     knocks : tuple of Knock
         What is known to have struck the beam. Their sizes stay free.
+    uniformity : float
+        Relative standard deviation of each mode's frequency from that of a uniform beam.
     """
 
     name: str
@@ -188,6 +190,7 @@ class Measurement:
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
     knocks: tuple[Knock, ...] = ()
+    uniformity: float = 1e-3
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -217,6 +220,7 @@ class Measurement:
             reference_rad=record.reference_rad,
             filter_time_constant_s=record.torque_filter_s[0],
             second_order_filter_time_constant_s=record.torque_filter_s[1],
+            uniformity=record.uniformity,
         )
 
     def check(self, highest_hz: float) -> None:

@@ -79,7 +79,7 @@ class ScaleUncertainty:
     """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
 
     They do not average out, and no session shows them: an analysis adds them to its statistical
-    intervals. Zero: not stated.
+    intervals. Zero: not stated, except for the uniformity, where zero is a uniform beam.
     """
 
     torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
@@ -88,13 +88,14 @@ class ScaleUncertainty:
     """Length of the beam."""
     density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
     """Mass per length of the beam, such as from weighing it."""
+    uniformity_percent: Annotated[float, Ge(0), Le(10)] = field(default=0.1, metadata=OPTIONAL)
+    """Frequency of each mode relative to that of a uniform beam."""
 
     @property
     def stated(self) -> dict[str, float]:
-        """Those that the profile states, by the names of the fields."""
-        return {
-            each.name: value for each in fields(self) if (value := getattr(self, each.name)) > 0
-        }
+        """Uncertainties of scales that the profile states, by the names of the fields."""
+        names = ("torque_scale_percent", "length_percent", "density_percent")
+        return {name: value for name in names if (value := getattr(self, name)) > 0}
 
 
 @dataclass(frozen=True, slots=True)

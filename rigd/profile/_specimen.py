@@ -55,7 +55,8 @@ def load_specimen(path: Path) -> Specimen:
         del values[key]
         problems.append(
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
-            "[uncertainty] length_percent and density_percent, and note; remove it."
+            "[uncertainty] length_percent, density_percent and uniformity_percent, and note; "
+            "remove it."
         )
     sections = {_BEAM, _UNCERTAINTY}
     sections |= {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}

@@ -363,6 +363,8 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "id": order.path.stem,
         "rate_hz": repr(rig.rate_hz),
         "excitation": order.excitation.kind,
+        "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
+        # A session may state another uniformity among its parameters.
         **{name: _text(value) for name, value in order.excitation.parameters.items()},
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),

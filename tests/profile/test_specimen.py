@@ -6,6 +6,7 @@ import pytest
 
 from rigd.beam import Beam, Damping
 from rigd.profile import ProfileError, load_profile, load_specimen, specimen_files, with_specimen
+from rigd.profile._schema import ScaleUncertainty
 from rigd.testing import write_profile
 
 BEAM = """
@@ -76,8 +77,9 @@ def test_how_well_its_beam_is_known_is_its_own(write, tmp_path):
         "torque_scale_percent": 2.0, "length_percent": 0.3, "density_percent": 4.0
     }  # fmt: skip
     write(BEAM + '[uncertainty]\nlength_percent = { value = 0.1, source = "measured" }\n')
-    stated = with_specimen(profile, "antenna 4").uncertainty.stated
-    assert stated == {"torque_scale_percent": 2.0, "length_percent": 0.1}
+    assert with_specimen(profile, "antenna 4").uncertainty == ScaleUncertainty(2.0, 0.1, 0.0, 0.1)
+    write(BEAM + '[uncertainty]\nuniformity_percent = { value = 0.5, source = "measured" }\n')
+    assert with_specimen(profile, "antenna 4").uncertainty == ScaleUncertainty(2.0, 0.0, 0.0, 0.5)
 
 
 def test_the_same_beam_is_said_to_be_the_same(write):
