@@ -161,11 +161,14 @@ class WholeRecord:
     def headline_json(self) -> dict[str, Any]:
         """Write the headline as the JSON document has it."""
         from analysis.identify import headline_json
+        from analysis.record_checks import SCALES
 
         file, findings = str(self.record.path), self.verdict.findings
         return {
             **headline_json(file, self.headline, self.orders, findings, self.validity),
-            "scale_uncertainty": dict(self.record.uncertainty),
+            "scale_uncertainty": {
+                name: value for name, value in self.record.uncertainty.items() if name in SCALES
+            },
             "combined": {name: each.as_json() for name, each in self.combined.items()},
         }
 

@@ -402,6 +402,10 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
     if rig.ati_serial is not None:
         metadata["sensor_filter"] = rig.ati_serial.filter
         metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    if order.profile.tip_mass_kg is not None:
+        metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
+    if order.profile.axis_tilt_deg is not None:
+        metadata["axis_tilt_deg"] = repr(order.profile.axis_tilt_deg)
     if any(rig.sensor.shear_projection):
         metadata["shear_projection"] = ",".join(map(repr, rig.sensor.shear_projection))
     if rig.sensor.filter_hz > 0:

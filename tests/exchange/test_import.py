@@ -288,6 +288,19 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
     assert (specimen.uncertainty_percent, specimen.uniformity_percent) == ({"length": 0.1}, 0.0)
 
 
+def test_tip_mass_and_tilt_of_a_profile_go_into_the_session(csv_of, make_plan, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        "[rig]\naxis_tilt_deg = -0.3\n[beam]\nlength_m = 0.98\ndensity_kg_per_m = 4.7e-3\n"
+        "bending_stiffness_n_m2 = 0.090275\n"
+        "tip_mass_kg = { value = 1e-4, source = 'measured' }\n"
+    )
+    plan = replace(make_plan(rate_hz=1e3), specimen=read_specimen(path))
+    done = import_record(csv_of(angle=ANGLE, torque=TORQUE), tmp_path / "a.mcap", plan)
+    record = load_record(done.path)
+    assert (record.beam, record.tip_mass_kg, record.axis_tilt_deg) == (BEAM, 1e-4, -0.3)
+
+
 @pytest.mark.parametrize(("percent", "uniformity"), [(None, 1e-3), (0.0, 0.0), (0.5, 5e-3)])
 def test_the_uniformity_of_the_specimen_goes_into_the_session(
     csv_of, make_plan, tmp_path, percent, uniformity
@@ -316,6 +329,11 @@ def test_the_uniformity_of_the_specimen_goes_into_the_session(
             "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
             "[uncertainty]\nuniformity_percent = 11",
             ("uncertainty.uniformity_percent is 11 %", "10"),
+        ),
+        (
+            "[rig]\naxis_tilt_deg = 91\n"
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n",
+            ("rig.axis_tilt_deg is 91 °", "between -90 and 90"),
         ),
         ("[sensor]\ntool_inertia_kg_m2 = -1.0", ("sensor.tool_inertia_kg_m2", "negative")),
         ("[beam", ("not valid TOML",)),
