@@ -22,12 +22,15 @@ from analysis.record_checks import (
     check_sensor,
     check_span,
     longest_run,
+    stated_axis_tilt_deg,
     stated_beam,
     stated_delay_s,
     stated_rate_hz,
+    stated_tip_mass_kg,
     stated_tool_inertia_kg_m2,
     stated_torque_filter_s,
     stated_uncertainty,
+    stated_uniformity,
 )
 from rigd.session import Session, Status, read_session, readable_texts
 
@@ -126,7 +129,15 @@ class Record:
     torque_filter_s
         Time constants of the torque channel's low-pass filter, of first and of second order.
     uncertainty
-        Relative standard uncertainties of `record_checks.SCALES`, those that the file states.
+        Relative standard uncertainties of `record_checks.UNCERTAIN`, those that the file states.
+    uniformity
+        Relative standard deviation of each mode's frequency from that of a uniform beam, 0.001 if
+        the file states none.
+    tip_mass_kg
+        Point mass at the beam's tip, None if the file states none.
+    axis_tilt_deg
+        Inclination of the plane of motion along the beam at rest, positive where the tip is lower
+        than the motor's axis; None if the file states none.
     sweep
         Range of samples with the excitation.
     rest_angle_rad
@@ -157,6 +168,9 @@ class Record:
     tool_inertia_kg_m2: float
     torque_filter_s: tuple[float, float]
     uncertainty: Mapping[str, float]
+    uniformity: float
+    tip_mass_kg: float | None
+    axis_tilt_deg: float | None
     sweep: slice
     rest_angle_rad: float | None
     gaps: Gaps
@@ -269,6 +283,9 @@ def record_of(session: Session) -> Record:
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
         torque_filter_s=stated_torque_filter_s(session),
         uncertainty=stated_uncertainty(session),
+        uniformity=stated_uniformity(session),
+        tip_mass_kg=stated_tip_mass_kg(session),
+        axis_tilt_deg=stated_axis_tilt_deg(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,

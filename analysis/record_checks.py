@@ -38,7 +38,11 @@ _BEAM_RANGES: Final = {
 }
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
+MAX_TIP_MASS_KG: Final = 1e3
+MAX_AXIS_TILT_DEG: Final = 90.0
 MAX_UNCERTAINTY_PERCENT: Final = 50.0
+MAX_UNIFORMITY_PERCENT: Final = 10.0
+_DEFAULT_UNIFORMITY_PERCENT: Final = 0.1
 _FIRST_ROOT: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
@@ -128,6 +132,39 @@ def stated_tool_inertia_kg_m2(session: Session) -> float:
     return inertia_kg_m2
 
 
+def stated_tip_mass_kg(session: Session) -> float | None:
+    """Point mass at the beam's tip, None if the file states none.
+
+    Raises
+    ------
+    RecordError
+        It is negative, or that of a vehicle.
+    """
+    return _stated_between(session, "tip_mass_kg", 0.0, MAX_TIP_MASS_KG)
+
+
+def stated_axis_tilt_deg(session: Session) -> float | None:
+    """Inclination of the plane of motion along the beam at rest, None if the file states none.
+
+    Positive where the tip is lower than the motor's axis.
+
+    Raises
+    ------
+    RecordError
+        It is more than a right angle.
+    """
+    return _stated_between(session, "axis_tilt_deg", -MAX_AXIS_TILT_DEG, MAX_AXIS_TILT_DEG)
+
+
+def _stated_between(session: Session, key: str, low: float, high: float) -> float | None:
+    if key not in session.metadata:
+        return None
+    value = session.number(key)
+    if not low <= value <= high:
+        raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
+    return value
+
+
 def stated_delay_s(session: Session, key: str) -> float:
     """Age of a channel's values at their time stamps in s, 0 if the file has none.
 
@@ -173,9 +210,12 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
 SCALES: Final = ("torque_scale", "length", "density")
 """What no session shows, and its file may state the uncertainty of."""
 
+UNCERTAIN: Final = (*SCALES, "tip_mass")
+"""All values of a file whose uncertainty it may state."""
+
 
 def stated_uncertainty(session: Session) -> dict[str, float]:
-    """Relative standard uncertainties of the `SCALES` that the file states, by their names.
+    """Relative standard uncertainties of `UNCERTAIN` values that the file states, by their names.
 
     Raises
     ------
@@ -183,7 +223,7 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
         One is negative, or so large that the value would not be known at all.
     """
     stated = {}
-    for name in SCALES:
+    for name in UNCERTAIN:
         key = f"uncertainty_{name}_percent"
         percent = session.number(key, 0.0)
         if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
@@ -192,6 +232,24 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
         if percent:
             stated[name] = percent / 100
     return stated
+
+
+def stated_uniformity(session: Session) -> float:
+    """Relative standard deviation of each mode's frequency from that of a uniform beam.
+
+    0.001, that of an antenna made with care, if the file states none.
+
+    Raises
+    ------
+    RecordError
+        It is negative, or larger than a model of a uniform beam allows.
+    """
+    key = "uniformity_percent"
+    percent = session.number(key, _DEFAULT_UNIFORMITY_PERCENT)
+    if not 0.0 <= percent <= MAX_UNIFORMITY_PERCENT:
+        rule = f"must lie between 0 and {MAX_UNIFORMITY_PERCENT:g}"
+        raise _wrong(session, key, percent, rule)
+    return percent / 100
 
 
 def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:

@@ -54,6 +54,9 @@ class Routes:
         Band of both; None takes what suits the record.
     figures : tuple of str
         Formats of the report's figures.
+    uniformity : float or None
+        Relative standard deviation of each mode's frequency from that of a uniform beam; None takes
+        the file's.
     """
 
     settings: WelchSettings
@@ -62,6 +65,7 @@ class Routes:
     fixed: tuple[Setting, ...]
     band_hz: tuple[float, float] | None = None
     figures: tuple[FigureFormat, ...] = DEFAULT_FORMATS
+    uniformity: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,11 +161,14 @@ class WholeRecord:
     def headline_json(self) -> dict[str, Any]:
         """Write the headline as the JSON document has it."""
         from analysis.identify import headline_json
+        from analysis.record_checks import SCALES
 
         file, findings = str(self.record.path), self.verdict.findings
         return {
             **headline_json(file, self.headline, self.orders, findings, self.validity),
-            "scale_uncertainty": dict(self.record.uncertainty),
+            "scale_uncertainty": {
+                name: value for name, value in self.record.uncertainty.items() if name in SCALES
+            },
             "combined": {name: each.as_json() for name, each in self.combined.items()},
         }
 
@@ -278,7 +285,7 @@ def record_result(
     from analysis.record import load_record
     from analysis.suited import check_record_band, remarks, welch_analysis
 
-    record = load_record(path)
+    record = with_uniformity(load_record(path), routes.uniformity)
     record = _with_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
     if not routes.paper:
@@ -302,6 +309,17 @@ def record_result(
                 raise
             warn(f"{error} Only the Welch fits were run.")
     return RecordResult(record, whole, welch)
+
+
+def with_uniformity(record: Record, uniformity: float | None) -> Record:
+    """Replace the uniformity of a record by a stated one; None leaves the file's.
+
+    Parameters
+    ----------
+    record : Record
+    uniformity : float or None
+    """
+    return record if uniformity is None else replace(record, uniformity=uniformity)
 
 
 def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:

@@ -22,6 +22,7 @@ UNITS: Final = MappingProxyType(
         "_rad": "rad",
         "_per_s": "1/s",
         "_hpa": "hPa",
+        "_deg": "°",
         "_kg": "kg",
         "_mm": "mm",
         "_nm": "N·m",

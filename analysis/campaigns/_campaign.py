@@ -122,6 +122,7 @@ def campaign(
     band_hz: tuple[float, float] | None = None,
     jobs: int | None = None,
     dask: str | None = None,
+    uniformity: float | None = None,
     on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
 ) -> CampaignResult:
     """Analyse a campaign of sessions of one specimen on one rig.
@@ -147,6 +148,9 @@ def campaign(
     dask : str, optional
         Address of a Dask scheduler whose workers are used instead; they find the files under the
         same absolute paths.
+    uniformity : float, optional
+        Relative standard deviation of each mode's frequency from that of a uniform beam, in place
+        of what the files state.
     on_progress : callable, optional
         Called with the steps done, their number and a file's name.
 
@@ -165,7 +169,7 @@ def campaign(
     if dask is not None:
         paths = [path.absolute() for path in paths]
     settings = settings or WelchSettings()
-    task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz)
+    task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
     done, total = 0, 2 * len(paths)
 
     def step(name: str) -> None:

@@ -12,7 +12,7 @@ from analysis.campaigns._estimates import RecordEstimate, WelchFit
 from analysis.campaigns._experiment import Experiment, task_errors
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
-from analysis.results import RecordResult, whole_record
+from analysis.results import RecordResult, whole_record, with_uniformity
 from rigd.session import Validity, sample_digests
 from rigd.spectral import FrequencyResponse
 
@@ -152,12 +152,16 @@ class SessionTask:
         Settings that stay at the file's values in those fits.
     band_hz : tuple of float or None
         Band of all fits; None takes what suits each record.
+    uniformity : float or None
+        Relative standard deviation of each mode's frequency from that of a uniform beam; None takes
+        each file's.
     """
 
     settings: WelchSettings
     structures: tuple[str, ...]
     fixed: tuple[Setting, ...]
     band_hz: tuple[float, float] | None
+    uniformity: float | None = None
 
 
 def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
@@ -178,7 +182,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     failures = task_errors()
     experiment = None
     try:
-        record = load_record(path)
+        record = with_uniformity(load_record(path), task.uniformity)
         experiment = Experiment.of(record)
         unfinished = experiment.unfinished(record.outcome)
         if unfinished:

@@ -204,6 +204,14 @@ def analyze(
     segment: Segment = None,
     overlap: Overlap = None,
     nfft: Nfft = None,
+    uniformity: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PERCENT",
+            help="Deviation of each mode's frequency from that of a uniform beam (standard "
+            "deviation, % of it); 0: exactly uniform.  [default: the file's, or 0.1]",
+        ),
+    ] = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -284,6 +292,12 @@ def analyze(
             "the Welch fits take all of them from the file; leave it out, or take --method all.",
             param_hint="--fix",
         )
+    if uniformity is not None and method == "welch":
+        raise typer.BadParameter(
+            "the Welch fits, as in the paper, take the beam for exactly uniform; leave it out, or "
+            "take --method all.",
+            param_hint="--uniformity",
+        )
     if method == "record":
         _check_without_paper(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
@@ -294,6 +308,7 @@ def analyze(
         fixed=_fixed(fix),
         band_hz=band_hz(band),
         figures=_figure_formats(figures),
+        uniformity=None if uniformity is None else _relative(uniformity),
     )
     outputs = Outputs(report, json, overwrite, verbose)
     try:
@@ -313,7 +328,7 @@ def analyze(
                     files, settings, outputs,
                     structures=tuple(STRUCTURES) if routes.whole_record else (),
                     fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
-                    with_paper=paper, formats=routes.figures,
+                    uniformity=routes.uniformity, with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, outputs)
@@ -382,6 +397,17 @@ def _fixed(text: str) -> tuple[Setting, ...]:
             param_hint="--fix",
         )
     return tuple(name for name in SETTINGS if name in names)
+
+
+def _relative(uniformity_percent: float) -> float:
+    from analysis.record_checks import MAX_UNIFORMITY_PERCENT
+
+    if not 0.0 <= uniformity_percent <= MAX_UNIFORMITY_PERCENT:
+        raise typer.BadParameter(
+            f"{uniformity_percent:g} % must lie between 0 and {MAX_UNIFORMITY_PERCENT:g} %.",
+            param_hint="--uniformity",
+        )
+    return uniformity_percent / 100
 
 
 def _figure_formats(text: str) -> tuple[FigureFormat, ...]:

@@ -33,6 +33,7 @@ def campaign_command(
     band_hz: tuple[float, float] | None = None,
     jobs: int | None = None,
     dask: str | None = None,
+    uniformity: float | None = None,
     with_paper: bool = False,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> int:
@@ -56,6 +57,9 @@ def campaign_command(
         Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler to use instead.
+    uniformity : float, optional
+        Relative standard deviation of each mode's frequency from that of a uniform beam, in place
+        of what the files state.
     with_paper : bool
         Whether the paper's numbers stand beside these.
     formats : sequence of str
@@ -88,7 +92,7 @@ def campaign_command(
     (folder,) = report_folders([first], outputs.report, overwrite=outputs.overwrite)
     run = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
-        dask=dask,
+        dask=dask, uniformity=uniformity,
     )  # fmt: skip
     found = _analysed(run, len(files), folder, outputs, with_paper=with_paper, formats=formats)
     lines = [f"Report of the campaign: {folder / 'report.html'}"]

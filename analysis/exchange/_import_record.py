@@ -306,6 +306,10 @@ def _metadata(
         "torque_delay_s": plan.torque_delay_s,
         **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
+    for key in ("uniformity_percent", "tip_mass_kg", "axis_tilt_deg"):
+        stated = getattr(plan.specimen, key)
+        if stated is not None:
+            numbers[key] = stated
     with source.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     mapping = {f"import_{name}": str(choice) for name, choice in plan.channels.items()}

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from analysis.exchange._source import ExchangeError
-from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
+from analysis.record_checks import (
+    MAX_AXIS_TILT_DEG,
+    MAX_TIP_MASS_KG,
+    MAX_UNCERTAINTY_PERCENT,
+    MAX_UNIFORMITY_PERCENT,
+    UNCERTAIN,
+)
 from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml, read_text
 from rigd.units import finite_number, unit_of
@@ -26,16 +33,26 @@ class Specimen:
     tool_inertia_kg_m2 : float
         Inertia about the motor's axis of what sits between torque sensor and beam.
     uncertainty_percent : mapping of str to float
-        Relative standard uncertainties of `analysis.record_checks.SCALES`, those stated.
+        Relative standard uncertainties of `analysis.record_checks.UNCERTAIN`, those stated.
+    uniformity_percent : float or None
+        Relative standard deviation of each mode's frequency from that of a uniform beam, if stated.
+    tip_mass_kg : float or None
+        Point mass at the beam's tip, if stated.
+    axis_tilt_deg : float or None
+        Inclination of the plane of motion along the beam at rest, positive where the tip is lower
+        than the motor's axis, if stated.
     """
 
     beam: Beam
     tool_inertia_kg_m2: float = 0.0
     uncertainty_percent: Mapping[str, float] = field(default_factory=dict)
+    uniformity_percent: float | None = None
+    tip_mass_kg: float | None = None
+    axis_tilt_deg: float | None = None
 
 
 def read_specimen(path: Path) -> Specimen:
-    """Read ``[beam]`` and, if there are any, ``[sensor] tool_inertia_kg_m2``, ``[uncertainty]``.
+    """Read ``[beam]`` and, as far as they are stated, tool inertia, tilt and ``[uncertainty]``.
 
     A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
     Nothing else of a profile is used: delays, rate and limits are those of the rig's own recorder.
@@ -56,9 +73,10 @@ def read_specimen(path: Path) -> Specimen:
         content = parse_toml(read_text(path))
     except DocumentError as error:
         raise ExchangeError(f"{path}: {error}.") from error
-    beam, sensor, uncertainty = (
-        _section(path, content, name) for name in ("beam", "sensor", "uncertainty")
+    rig, beam, sensor, uncertainty = (
+        _section(path, content, name) for name in ("rig", "beam", "sensor", "uncertainty")
     )
+    percent = partial(_between, path, "uncertainty", uncertainty, low=0.0)
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor:
         tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2")
@@ -75,10 +93,13 @@ def read_specimen(path: Path) -> Specimen:
         ),
         tool_inertia_kg_m2,
         {
-            name: _uncertainty_percent(path, uncertainty, key)
-            for name in SCALES
-            if (key := f"{name}_percent") in uncertainty
+            name: value
+            for name in UNCERTAIN
+            if (value := percent(f"{name}_percent", high=MAX_UNCERTAINTY_PERCENT)) is not None
         },
+        percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
+        _between(path, "beam", beam, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
+        _between(path, "rig", rig, "axis_tilt_deg", low=-MAX_AXIS_TILT_DEG, high=MAX_AXIS_TILT_DEG),
     )
 
 
@@ -98,14 +119,19 @@ def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
     return value
 
 
-def _uncertainty_percent(path: Path, section: Mapping[str, Any], key: str) -> float:
-    percent = _number(path, "uncertainty", section, key)
-    if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
+def _between(
+    path: Path, name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
+) -> float | None:
+    """Return an optional number of a section, None if it is not stated."""
+    if key not in section:
+        return None
+    value = _number(path, name, section, key)
+    if not low <= value <= high:
         raise ExchangeError(
-            f"{path}: uncertainty.{key} is {percent:g} %, but must lie between 0 and "
-            f"{MAX_UNCERTAINTY_PERCENT:g}."
+            f"{path}: {name}.{key} is {value:g} {unit_of(key)}, but must lie between {low:g} and "
+            f"{high:g}."
         )
-    return percent
+    return value
 
 
 def _number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:

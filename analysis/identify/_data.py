@@ -174,6 +174,11 @@ class Measurement:
         What is known to have struck the beam. Their sizes stay free.
     uniformity : float
         Relative standard deviation of each mode's frequency from that of a uniform beam.
+    tip_mass_kg : float or None
+        Point mass at the beam's tip as the file states it, None if it is not known.
+    axis_tilt_deg : float or None
+        Inclination of the plane of motion along the beam at rest as the file states it, positive
+        where the tip is lower than the motor's axis; None if it was not measured.
     """
 
     name: str
@@ -191,6 +196,8 @@ class Measurement:
     second_order_filter_time_constant_s: float = 0.0
     knocks: tuple[Knock, ...] = ()
     uniformity: float = 1e-3
+    tip_mass_kg: float | None = None
+    axis_tilt_deg: float | None = None
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -220,6 +227,9 @@ class Measurement:
             reference_rad=record.reference_rad,
             filter_time_constant_s=record.torque_filter_s[0],
             second_order_filter_time_constant_s=record.torque_filter_s[1],
+            uniformity=record.uniformity,
+            tip_mass_kg=record.tip_mass_kg,
+            axis_tilt_deg=record.axis_tilt_deg,
         )
 
     def check(self, highest_hz: float) -> None:

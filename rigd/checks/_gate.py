@@ -53,6 +53,7 @@ PAPER_CHECKS: Final = (
     PaperCheck(paper.drive_file_rows, (paper.EDS,), needs_values=False),
     PaperCheck(paper.profile_rows, needs_values=False),
     PaperCheck(paper.record_rows, needs_values=False),
+    PaperCheck(paper.plumb_rows, needs_values=False),
     PaperCheck(
         paper.unknown_rows,
         (paper.UNKNOWN_VALUES,),

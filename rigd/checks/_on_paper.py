@@ -31,11 +31,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from inspect import signature
-from math import degrees, inf, isfinite, isinf, log1p, log10, radians
+from math import degrees, inf, isfinite, isinf, log1p, log10, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.beam import RealisationError
+from rigd.beam import Beam, RealisationError, undamped_frequencies_rad_s
 from rigd.checks._rows import Row, Verdict, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values
@@ -432,6 +432,41 @@ def record_rows(profile: Profile) -> Iterator[Row]:
         grade(fail=False, warn=longest_s < usual_s),
         f"A chirp of {usual_s:g} s is refused: {limit}." if longest_s < usual_s else "",
     )
+
+
+_GRAVITY_M_PER_S2 = 9.81
+_AXIAL_LOAD = 1.5709
+"""Integral of (1 - x) φ'(x)² over that of φ(x)², x from 0 to 1, for mode 1 of a clamped-free beam:
+the stiffness that its own weight along it adds (Rayleigh), over the modal mass, in g / L."""
+_EXAMPLE_TILT_DEG = 0.5
+
+
+def plumb_rows(profile: Profile) -> Iterator[Row]:
+    """Say whether the motor's axis is known to be vertical; no session is refused for it."""
+    if profile.rig.devices.drive == "sim":
+        found, detail, verdict = "the simulated rig has no gravity", "", Verdict.SKIPPED
+    elif profile.axis_tilt_deg is None:
+        found, verdict = "not known", Verdict.WARNING
+        shift = _tilt_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
+        detail = (
+            f"Axis plumb: gravity along the beam shifts its modes, mode 1 by {shift:.2g} % for "
+            f"{_EXAMPLE_TILT_DEG:g}°, which an analysis can mistake for damping or for a mass at "
+            "the tip. Measure the inclination of the motor's flange along the resting beam with a "
+            "level, and state it as rig.axis_tilt_deg (positive: the tip is lower)."
+        )
+    else:
+        shift = _tilt_shift_percent(profile.rig.beam, profile.axis_tilt_deg)
+        found = f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {shift:+.2g} %"
+        detail, verdict = "", Verdict.OK
+    yield Row("profile", "axis plumb", found, "measured", verdict, detail)
+
+
+def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
+    """Return the relative change of mode 1's frequency by gravity along the beam, first order."""
+    first_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
+    along_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
+    share = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
+    return float(100.0 * share)
 
 
 UNKNOWN_VALUES = "unknown_values"

@@ -406,7 +406,16 @@ def until(
     ] = 52.0,
     scan_s: Annotated[float, typer.Option("--scan", help="Duration of the scan (s).")] = 5.0,
     rest_s: Rest = 1.0,
-) -> "dict[str, Value]":
+    uniformity_percent: Annotated[
+        float | None,
+        typer.Option(
+            "--uniformity",
+            metavar="PERCENT",
+            help="Deviation of each mode's frequency from that of a uniform beam (standard "
+            "deviation, % of it); 0: exactly uniform (default: the profile's).",
+        ),
+    ] = None,
+) -> "dict[str, Value | None]":
     """Excite what tells most until a precision is reached.
 
     A quick scan finds the modes; then each piece is planned by what the record has told so far.
@@ -426,6 +435,7 @@ def until(
         "stop_hz": stop_hz,
         "scan_s": scan_s,
         "rest_s": rest_s,
+        "uniformity_percent": uniformity_percent,
     }
 
 

@@ -42,6 +42,7 @@ there with an amplitude that rises in a straight line.
 """
 _BEND: Final = 1.25
 """Power of the time with which the frequency rises: low modes take longer."""
+_MAX_UNIFORMITY_PERCENT: Final = 10.0
 _EXAMPLE: Final = "--damping 1%"
 
 
@@ -92,6 +93,7 @@ def until(
     stop_hz: float = 52.0,
     scan_s: float = 5.0,
     rest_s: float = 1.0,
+    uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
     """Scan all modes quickly, then excite what tells most until a precision is reached.
@@ -117,6 +119,9 @@ def until(
         Duration of the scan.
     rest_s
         Time before it.
+    uniformity_percent
+        Relative standard deviation of each mode's frequency from that of a uniform beam, for the
+        fits; None: that of the profile.
     rig
         Limits the amplitude and suits it to its modes; without it, it is one for all frequencies.
 
@@ -139,6 +144,11 @@ def until(
     positive("tip_slope_rad", tip_slope_rad, "rad")
     frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
     frequency("stop_hz", stop_hz, rate_hz)
+    if uniformity_percent is not None and not 0.0 <= uniformity_percent <= _MAX_UNIFORMITY_PERCENT:
+        raise ExcitationError(
+            f"uniformity_percent = {uniformity_percent:g} % must lie between 0 and "
+            f"{_MAX_UNIFORMITY_PERCENT:g} %."
+        )
     segments = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
     first, end = segments["sweep"]
     if scan_s < 2 * _FADE_S:
@@ -176,6 +186,7 @@ def until(
             "stop_hz": stop_hz,
             "scan_s": scan_s,
             "rest_s": rest_s,
+            **({} if uniformity_percent is None else {"uniformity_percent": uniformity_percent}),
         },
         rate_hz=rate_hz,
         reference_rad=reference_rad,

@@ -115,7 +115,7 @@ def profile_of(text: str, path: Path) -> Profile:
         text=text,
         rig=RigParameters(
             rate_hz=section["rig"].rate_hz,
-            beam=section["beam"],
+            beam=section["beam"].uniform,
             damping=section["beam.damping"],
             motor=section["motor"],
             encoder=section["encoder"],
@@ -137,6 +137,8 @@ def profile_of(text: str, path: Path) -> Profile:
         metadata=section["metadata"],
         uncertainty=section["uncertainty"],
         sources=sources,
+        tip_mass_kg=section["beam"].tip_mass_kg,
+        axis_tilt_deg=section["rig"].axis_tilt_deg,
     )
 
 

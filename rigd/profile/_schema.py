@@ -79,7 +79,7 @@ class ScaleUncertainty:
     """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
 
     They do not average out, and no session shows them: an analysis adds them to its statistical
-    intervals. Zero: not stated.
+    intervals. Zero: not stated, except for the uniformity, where zero is a uniform beam.
     """
 
     torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
@@ -88,12 +88,18 @@ class ScaleUncertainty:
     """Length of the beam."""
     density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
     """Mass per length of the beam, such as from weighing it."""
+    tip_mass_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Mass at the tip of the beam: the balance."""
+    uniformity_percent: Annotated[float, Ge(0), Le(10)] = field(default=0.1, metadata=OPTIONAL)
+    """Frequency of each mode relative to that of a uniform beam."""
 
     @property
     def stated(self) -> dict[str, float]:
-        """Those that the profile states, by the names of the fields."""
+        """Uncertainties that the profile states, by the names of the fields."""
         return {
-            each.name: value for each in fields(self) if (value := getattr(self, each.name)) > 0
+            each.name: value
+            for each in fields(self)
+            if each.name != "uniformity_percent" and (value := getattr(self, each.name)) > 0
         }
 
 
@@ -111,11 +117,27 @@ class RigSection:
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
     """Slower loops check the other processes too seldom."""
+    axis_tilt_deg: Annotated[float, Ge(-90), Le(90)] | None = field(default=None, metadata=OPTIONAL)
+    """Inclination of the plane of motion along the beam at rest, positive where the tip is lower
+    than the motor's axis: gravity acts along the beam with its sine; None: not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class BeamSection(Beam):
+    """Section of the beam: the uniform beam, and what was weighed at its tip."""
+
+    tip_mass_kg: Annotated[float, Ge(0)] | None = field(default=None, metadata=OPTIONAL)
+    """Point mass at the tip; None: not known."""
+
+    @property
+    def uniform(self) -> Beam:
+        """The beam alone."""
+        return Beam(self.length_m, self.density_kg_per_m, self.bending_stiffness_n_m2)
 
 
 SECTIONS: dict[str, type] = {
     "rig": RigSection,
-    "beam": Beam,
+    "beam": BeamSection,
     "beam.damping": Damping,
     "motor": Motor,
     "encoder": Encoder,
@@ -211,6 +233,8 @@ class Specimen:
     """How well its length and density are known; the torque's scale is the rig's."""
     note: str
     """Whatever else is to be known of it."""
+    tip_mass_kg: float | None = None
+    """Point mass at its tip; None: not known."""
 
 
 _BREAKAWAY = 5.0
@@ -253,6 +277,11 @@ class Profile:
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None
     """The motor that the controller is designed for, where that is not the profile's."""
+    tip_mass_kg: float | None = None
+    """Point mass at the beam's tip, as weighed; None: not known."""
+    axis_tilt_deg: float | None = None
+    """Inclination of the plane of motion along the beam at rest, positive where the tip is lower;
+    None: not measured."""
     specimen: Specimen | None = None
     """Specimen that is mounted, where a file describes it: the rig's beam is its own then."""
     specimen_in_words: str = ""
@@ -295,4 +324,5 @@ class Profile:
             angle_delay_s=rig.encoder.delay_s,
             torque_delay_s=rig.sensor.delay_s,
             settings=self.control,
+            tip_mass_kg=self.tip_mass_kg or 0.0,
         )

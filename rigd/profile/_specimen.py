@@ -1,6 +1,6 @@
 """Specimens in their own files: ``specimens/NAME.toml``, with the beam as a profile has it."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
 
@@ -9,7 +9,14 @@ from rigd.devices import WhatMoves, reality
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
 from rigd.profile._places import specimen_files
-from rigd.profile._schema import SECTIONS, Profile, ScaleUncertainty, Specimen, fields_of
+from rigd.profile._schema import (
+    SECTIONS,
+    BeamSection,
+    Profile,
+    ScaleUncertainty,
+    Specimen,
+    fields_of,
+)
 from rigd.units import suffix_of, unit_of
 
 _BEAM: Final = "beam"
@@ -55,7 +62,7 @@ def load_specimen(path: Path) -> Specimen:
         del values[key]
         problems.append(
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
-            "[uncertainty] length_percent and density_percent, and note; remove it."
+            f"[uncertainty] all but {_OF_THE_RIG.partition('.')[2]}, and note; remove it."
         )
     sections = {_BEAM, _UNCERTAINTY}
     sections |= {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}
@@ -64,12 +71,14 @@ def load_specimen(path: Path) -> Specimen:
         problems.extend(diagnostics.first_mode(values))
     if problems:
         raise complaint(path, problems)
-    beam = Beam(**{field: values[key] for key, field in fields_of(_BEAM)})
+    beam = BeamSection(**{field: values[key] for key, field in fields_of(_BEAM)})
     damping = None
     if _DAMPING in sections:
         damping = Damping(**{field: values[key] for key, field in fields_of(_DAMPING)})
     uncertainty = ScaleUncertainty(**{field: values[key] for key, field in fields_of(_UNCERTAINTY)})
-    return Specimen(path.stem, path, text, beam, damping, uncertainty, note)
+    return Specimen(
+        path.stem, path, text, beam.uniform, damping, uncertainty, note, beam.tip_mass_kg
+    )
 
 
 def with_specimen(profile: Profile, name: str) -> Profile:
@@ -102,6 +111,7 @@ def with_specimen(profile: Profile, name: str) -> Profile:
         profile,
         rig=rig,
         uncertainty=replace(specimen.uncertainty, torque_scale_percent=scale_percent),
+        tip_mass_kg=specimen.tip_mass_kg,
         specimen=specimen,
         specimen_in_words=_in_words(profile, specimen),
     )
@@ -110,11 +120,13 @@ def with_specimen(profile: Profile, name: str) -> Profile:
 def _in_words(profile: Profile, specimen: Specimen) -> str:
     head = f"Specimen {specimen.name} ({specimen.path}): "
     different = [
-        f"{key.partition('.')[2].removesuffix(suffix_of(key)).replace('_', ' ')} "
-        f"{own:g} {unit_of(key)} (profile: {its:g})"
-        for key, field in fields_of(_BEAM)
-        if (own := getattr(specimen.beam, field)) != (its := getattr(profile.rig.beam, field))
+        f"{name.removesuffix(suffix_of(name)).replace('_', ' ')} "
+        f"{own:g} {unit_of(name)} (profile: {its:g})"
+        for name in (each.name for each in fields(Beam))
+        if (own := getattr(specimen.beam, name)) != (its := getattr(profile.rig.beam, name))
     ]
+    if specimen.tip_mass_kg is not None:
+        different.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
     if specimen.damping not in (None, profile.rig.damping):
         different.append("nominal damping of its own")
     if not different:

@@ -363,6 +363,8 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "id": order.path.stem,
         "rate_hz": repr(rig.rate_hz),
         "excitation": order.excitation.kind,
+        "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
+        # A session may state another uniformity among its parameters.
         **{name: _text(value) for name, value in order.excitation.parameters.items()},
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
@@ -400,6 +402,10 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
     if rig.ati_serial is not None:
         metadata["sensor_filter"] = rig.ati_serial.filter
         metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    if order.profile.tip_mass_kg is not None:
+        metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
+    if order.profile.axis_tilt_deg is not None:
+        metadata["axis_tilt_deg"] = repr(order.profile.axis_tilt_deg)
     if any(rig.sensor.shear_projection):
         metadata["shear_projection"] = ",".join(map(repr, rig.sensor.shear_projection))
     if rig.sensor.filter_hz > 0:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from analysis.identify import Measurement
 from analysis.record import MAX_UNKNOWN_SHARE, RecordError, load_record
 from rigd.session import SessionError
 from rigd.session._format import Status
@@ -159,12 +160,43 @@ def test_values_that_are_not_finite_are_refused_by_field_and_tick(
      ("beam_length_m", "980"), ("beam_length_m", "0.01"), ("beam_density_kg_per_m", "1e300"),
      ("beam_bending_stiffness_n_m2", "1e-300"), ("beam_bending_stiffness_n_m2", "1e300"),
      ("torque_delay_s", "300"), ("angle_delay_s", "-1e300"), ("tool_inertia_kg_m2", "1e300"),
-     ("uncertainty_length_percent", "-1"), ("uncertainty_density_percent", "80")],
+     ("uncertainty_length_percent", "-1"), ("uncertainty_density_percent", "80"),
+     ("uniformity_percent", "-0.1"), ("uniformity_percent", "11"), ("uniformity_percent", "nan"),
+     ("tip_mass_kg", "-1e-3"), ("tip_mass_kg", "heavy"), ("axis_tilt_deg", "-91"),
+     ("axis_tilt_deg", "inf"), ("uncertainty_tip_mass_percent", "51")],
 )  # fmt: skip
 def test_absurd_metadata_is_refused_by_key(tmp_path, write_session, short_signals, key, value):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata={key: value})
     with pytest.raises((RecordError, SessionError), match=key):
         load_record(path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "uniformity"),
+    [({}, 1e-3), ({"uniformity_percent": "0"}, 0.0), ({"uniformity_percent": "0.3"}, 3e-3)],
+)
+def test_the_uniformity_is_that_of_the_file(
+    tmp_path, write_session, short_signals, metadata, uniformity
+):
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata=metadata)
+    record = load_record(path)
+    assert (record.uniformity, Measurement.of_record(record).uniformity) == (uniformity, uniformity)
+
+
+def test_a_tip_mass_and_a_tilt_that_nobody_states_are_unknown(
+    tmp_path, write_session, short_signals
+):
+    def of(**stated):
+        path = write_session(tmp_path / f"{len(stated)}.mcap", short_signals, metadata=stated)
+        record = load_record(path)
+        measurement = Measurement.of_record(record)
+        values = record.tip_mass_kg, record.axis_tilt_deg
+        assert (measurement.tip_mass_kg, measurement.axis_tilt_deg) == values
+        return (*values, record.uncertainty)
+
+    assert of() == (None, None, {})
+    stated = {"tip_mass_kg": "0", "axis_tilt_deg": "-0.4", "uncertainty_tip_mass_percent": "2"}
+    assert of(**stated) == (0.0, -0.4, {"tip_mass": 0.02})
 
 
 def test_a_beam_in_wrong_units_is_told_by_where_its_first_mode_would_be(

@@ -1,10 +1,15 @@
 """What a profile alone shows, before anything is connected."""
 
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from rigd.checks._on_paper import profile_rows, record_rows, wiring_rows
+from rigd.beam import mode_shape, undamped_frequencies_rad_s
+from rigd.checks import check_on_paper
+from rigd.checks._gate import paper_rows
+from rigd.checks._on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
 from rigd.checks._rows import Row, Verdict, overall
 from rigd.devices.canbus._budget import bus_load
 from rigd.excitation import ExcitationError, chirp
@@ -53,6 +58,34 @@ def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
     assert "2400000 samples can be analysed" in row.detail
     with pytest.raises(ExcitationError, match="120 s is the most"):
         chirp(rate_hz=20_000.0)
+
+
+def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profile):
+    (row,) = plumb_rows(can_profile)
+    assert (row.found, row.verdict) == ("not known", Verdict.WARNING)
+    for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
+        assert words in row.detail
+    assert row in paper_rows(can_profile)
+    assert not check_on_paper(can_profile).refusals
+    (row,) = plumb_rows(load_profile("sim"))
+    assert row.verdict is Verdict.SKIPPED
+
+
+@pytest.mark.parametrize("tilt_deg", [0.5, -2.0])
+def test_a_measured_tilt_says_by_how_much_it_shifts_mode_1(can_profile, tilt_deg):
+    """By Rayleigh's quotient with the shape of the mode, integrated here."""
+    beam = can_profile.rig.beam
+    x = np.linspace(0.0, 1.0, 4001)
+    shape = mode_shape(1, x)
+    slope = np.gradient(shape, x)
+    load = 9.81 * np.sin(np.radians(tilt_deg)) / beam.length_m
+    added = load * np.trapezoid((1 - x) * slope**2, x) / np.trapezoid(shape**2, x)
+    squared = undamped_frequencies_rad_s(beam, 1)[0] ** 2
+    percent = 100 * (np.sqrt(1 + added / squared) - 1)
+    (row,) = plumb_rows(replace(can_profile, axis_tilt_deg=tilt_deg))
+    assert (row.verdict, row.detail) == (Verdict.OK, "")
+    number = re.search(r"shifted by (\S+) %", row.found)[1]
+    assert float(number) == pytest.approx(percent, rel=0.05)
 
 
 def test_the_shipped_wiring_is_fine(can_profile, serial_profile):

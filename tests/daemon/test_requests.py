@@ -40,6 +40,8 @@ def test_a_precision_is_asked_for_in_words():
     parameters = {"targets": "damping 1%; alpha 0.01", "at_most_s": 60.0}
     assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
     assert parse(START | {"watch_fit": True}).watch_fit
+    parameters |= {"uniformity_percent": 0.0}
+    assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
     assert not parse(START).watch_fit
 
 

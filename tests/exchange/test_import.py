@@ -3,6 +3,7 @@
 import hashlib
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -280,11 +281,33 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
     path.write_text(
         "[beam]\nlength_m = 1\ndensity_kg_per_m = 5e-3\nbending_stiffness_n_m2 = 0.1\n"
         "[sensor]\ntool_inertia_kg_m2 = { value = 1e-5, source = 'measured' }\n"
-        "[uncertainty]\nlength_percent = 0.1\n"
+        "[uncertainty]\nlength_percent = 0.1\nuniformity_percent = 0\n"
     )
     specimen = read_specimen(path)
     assert (specimen.beam.length_m, specimen.tool_inertia_kg_m2) == (1.0, 1e-5)
-    assert specimen.uncertainty_percent == {"length": 0.1}
+    assert (specimen.uncertainty_percent, specimen.uniformity_percent) == ({"length": 0.1}, 0.0)
+
+
+def test_tip_mass_and_tilt_of_a_profile_go_into_the_session(csv_of, make_plan, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        "[rig]\naxis_tilt_deg = -0.3\n[beam]\nlength_m = 0.98\ndensity_kg_per_m = 4.7e-3\n"
+        "bending_stiffness_n_m2 = 0.090275\n"
+        "tip_mass_kg = { value = 1e-4, source = 'measured' }\n"
+    )
+    plan = replace(make_plan(rate_hz=1e3), specimen=read_specimen(path))
+    done = import_record(csv_of(angle=ANGLE, torque=TORQUE), tmp_path / "a.mcap", plan)
+    record = load_record(done.path)
+    assert (record.beam, record.tip_mass_kg, record.axis_tilt_deg) == (BEAM, 1e-4, -0.3)
+
+
+@pytest.mark.parametrize(("percent", "uniformity"), [(None, 1e-3), (0.0, 0.0), (0.5, 5e-3)])
+def test_the_uniformity_of_the_specimen_goes_into_the_session(
+    csv_of, make_plan, tmp_path, percent, uniformity
+):
+    plan = replace(make_plan(rate_hz=1e3), specimen=Specimen(BEAM, uniformity_percent=percent))
+    done = import_record(csv_of(angle=ANGLE, torque=TORQUE), tmp_path / "a.mcap", plan)
+    assert load_record(done.path).uniformity == uniformity
 
 
 @pytest.mark.parametrize(
@@ -301,6 +324,16 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
             "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
             "[uncertainty]\nlength_percent = 51",
             ("uncertainty.length_percent is 51 %", "50"),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[uncertainty]\nuniformity_percent = 11",
+            ("uncertainty.uniformity_percent is 11 %", "10"),
+        ),
+        (
+            "[rig]\naxis_tilt_deg = 91\n"
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n",
+            ("rig.axis_tilt_deg is 91 °", "between -90 and 90"),
         ),
         ("[sensor]\ntool_inertia_kg_m2 = -1.0", ("sensor.tool_inertia_kg_m2", "negative")),
         ("[beam", ("not valid TOML",)),

@@ -1,11 +1,13 @@
 """Specimens in their own files: found by name, validated as profiles are, mounted on a rig."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
 from rigd.beam import Beam, Damping
 from rigd.profile import ProfileError, load_profile, load_specimen, specimen_files, with_specimen
+from rigd.profile._schema import ScaleUncertainty
 from rigd.testing import write_profile
 
 BEAM = """
@@ -76,8 +78,23 @@ def test_how_well_its_beam_is_known_is_its_own(write, tmp_path):
         "torque_scale_percent": 2.0, "length_percent": 0.3, "density_percent": 4.0
     }  # fmt: skip
     write(BEAM + '[uncertainty]\nlength_percent = { value = 0.1, source = "measured" }\n')
-    stated = with_specimen(profile, "antenna 4").uncertainty.stated
-    assert stated == {"torque_scale_percent": 2.0, "length_percent": 0.1}
+    assert with_specimen(profile, "antenna 4").uncertainty == ScaleUncertainty(2.0, 0.1)
+    write(BEAM + '[uncertainty]\nuniformity_percent = { value = 0.5, source = "measured" }\n')
+    assert with_specimen(profile, "antenna 4").uncertainty == ScaleUncertainty(
+        2.0, uniformity_percent=0.5
+    )
+
+
+def test_a_mass_at_the_tip_is_the_specimen_s_own(write):
+    profile = replace(load_profile("sim"), tip_mass_kg=3e-4, axis_tilt_deg=1.0)
+    write(BEAM)
+    mounted = with_specimen(profile, "antenna 4")
+    assert (mounted.tip_mass_kg, mounted.axis_tilt_deg) == (None, 1.0)
+    write(f'{BEAM}tip_mass_kg = {{ value = 5.0e-4, source = "measured" }}\n')
+    mounted = with_specimen(profile, "antenna 4")
+    assert (mounted.tip_mass_kg, mounted.axis_tilt_deg) == (5e-4, 1.0)
+    assert mounted.rig.beam == Beam(0.95, 4.7e-3, 0.0903)
+    assert "tip mass 0.5 g" in mounted.specimen_in_words
 
 
 def test_the_same_beam_is_said_to_be_the_same(write):

@@ -218,6 +218,9 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
         (("b.mcap", "--each", "--jobs", "2"), ("--jobs", "--each", "omit one of the two")),
         (("b.mcap", "--dask", "tcp://x:1", "--jobs", "2"), ("--jobs", "those of --dask")),
         (("--method", "welch", "--fix", "delay_s"), ("--fix", "--method all")),
+        (("--method", "welch", "--uniformity", "0"), ("--uniformity", "--method all")),
+        (("--uniformity", "-1"), ("--uniformity", "-1 % must lie between 0 and 10 %")),
+        (("--uniformity", "nan"), ("--uniformity", "nan % must lie between 0 and 10 %")),
     ],
 )
 def test_wrong_options_are_refused(session, tmp_path, analyze_here, options, words):
@@ -376,16 +379,18 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 
 @pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
 def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
-    fixed, formats = [], []
+    fixed, formats, uniformity = [], [], []
 
     def run(_files, routes, *_):
         fixed.append(routes.fixed)
         formats.append(routes.figures)
+        uniformity.append(routes.uniformity)
         return 0
 
     def campaign(*_, **options):
         fixed.append(options["fixed"])
         formats.append(options["formats"])
+        uniformity.append(options["uniformity"])
         return 0
 
     monkeypatch.setattr("analysis.cli.app.session_command", run)
@@ -396,6 +401,8 @@ def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
     assert formats == [("png", "svg")]
     result = CliRunner().invoke(app, [*files, "--figures", "pdf, png"])
     assert formats[1:] == [("png", "pdf")], result.output
+    result = CliRunner().invoke(app, [*files, "--uniformity", "0.3"])
+    assert uniformity == [None, None, pytest.approx(3e-3)], result.output
     for wrong in ("tiff", ","):
         result = CliRunner().invoke(app, [*files, "--figures", wrong])
         assert result.exit_code == 2

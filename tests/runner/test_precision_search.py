@@ -14,7 +14,7 @@ from rigd.engine import (
     put_reference,
     shared_memory_fd,
 )
-from rigd.excitation import Forecast, Piece, parse_target, until
+from rigd.excitation import ExcitationError, Forecast, Piece, parse_target, until
 from rigd.excitation._targets import Precision
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview
@@ -99,6 +99,17 @@ class Bench:
 
     def problem(self, text="Nothing is excited yet."):
         return list(self.search.answered({"tick": self.search.due, "problem": text}, 0, 0))
+
+
+def test_a_search_may_state_the_uniformity_of_the_beam():
+    def stated(**given):
+        excitation = until(rate_hz=RATE_HZ, targets="alpha 0.01", **given)
+        return excitation.parameters.get("uniformity_percent")
+
+    assert (stated(), stated(uniformity_percent=0.0)) == (None, 0.0)
+    for wrong in (-1.0, 10.1, np.nan):
+        with pytest.raises(ExcitationError, match=r"uniformity_percent = \S+ % must lie between"):
+            stated(uniformity_percent=wrong)
 
 
 def designed_at_once(monkeypatch, std):
