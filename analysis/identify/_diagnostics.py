@@ -7,7 +7,6 @@ forces that are not linear, drag, a free decay at the start, and what remains un
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify._channel_checks import clipping, drift_of_zero, stops
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._headline import Headline
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
@@ -62,12 +62,9 @@ def findings(
         *map(_force, forces),
         *_harmonics(multiples),
     )
-    edges = tuple(at_edges(field))
-    if edges:
-        return (*found, *edges)
     if len(visible) < _MODES_TO_JUDGE:
-        return found
-    return (*found, *of_settings(field))
+        return (*found, *at_edges(field))
+    return (*found, *(tuple(at_edges(field)) or of_rig(field)))
 
 
 # Settings at an edge, or not as the file states them
@@ -102,23 +99,44 @@ def at_edges(field: CandidateSet) -> Iterator[Finding]:
             )
 
 
-def of_settings(field: CandidateSet) -> Iterator[Finding]:
-    """Find what of delay, inertia, beam and start is not as the file states it."""
-    differing = {name for name in field.free if _apart(field, name) and not _as_stated(field, name)}
-    yield from _of_instruments(field, differing)
-    yield from _of_beam(field, differing)
-    yield from of_rig(field)
+def of_settings(field: CandidateSet, told: Headline) -> Iterator[Finding]:
+    """Find what of delay, inertia, beam and start is not as the file states it.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    told : Headline
+        Numbers with flags: what carries one is no finding.
+    """
+    yield from _of_instruments(field, told)
+    yield from _of_beam(field, told)
     if _rings(field):
         yield from _of_start(field)
 
 
-def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
+def _difference(
+    field: CandidateSet, told: Headline, name: Setting
+) -> tuple[float, float, float] | None:
+    """By how much a setting differs from what the file states, with the ends of its interval.
+
+    None where it does not beyond chance, or where its value carries a flag.
+    """
+    quantity, stated = told.parameters.get(name), _stated(field, name)
+    if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
+        return None
+    if abs(quantity.value - stated) < SURE * quantity.std:
+        return None
+    low, high = quantity.interval_95
+    return quantity.value - stated, low - stated, high - stated
+
+
+def _of_instruments(field: CandidateSet, told: Headline) -> Iterator[Finding]:
     """Find a delay and an inertia that the file does not state."""
-    fit = field.best.fit
-    if "delay_s" in differing:
-        value, *interval = _difference(field, "delay_s")
+    if off := _difference(field, told, "delay_s"):
+        value, *interval = off
         low, high = interval
         (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
+        delay_s = told.parameters["delay_s"].value
         yield Finding(
             kind="delay",
             sentence=(
@@ -129,14 +147,11 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
             value=value,
             interval=(low, high),
             unit="s",
-            remedy=(
-                "Declare the delay between the channels as "
-                f"{1e3 * fit.parameters['delay_s']:.3f} ms."
-            ),
+            remedy=f"Declare the delay between the channels as {1e3 * delay_s:.3f} ms.",
             parameters=("delay_s",),
         )
-    if "tool_inertia_kg_m2" in differing:
-        value, *interval = _difference(field, "tool_inertia_kg_m2")
+    if off := _difference(field, told, "tool_inertia_kg_m2"):
+        value, *interval = off
         low, high = interval
         (size,) = to_uncertainty((value,), (high - low) / 2, 1e6)
         yield Finding(
@@ -153,7 +168,7 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
         )
 
 
-def _of_beam(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
+def _of_beam(field: CandidateSet, told: Headline) -> Iterator[Finding]:
     """Find density and stiffness that are not the file's."""
     beam: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
@@ -161,8 +176,8 @@ def _of_beam(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
     )
     for name, words in beam:
         stated = _stated(field, name)
-        off = _difference(field, name)
-        if name not in differing or abs(off[0]) < _BEAM_OFF * stated:
+        off = _difference(field, told, name)
+        if off is None or abs(off[0]) < _BEAM_OFF * stated:
             continue
         share, *interval = (part / stated for part in off)
         low, high = interval
@@ -233,50 +248,6 @@ def _stated(field: CandidateSet, name: Setting) -> float:
         "delay_s": measurement.delay_s,
         "tool_inertia_kg_m2": measurement.tool_inertia_kg_m2,
     }[name]
-
-
-def _apart(field: CandidateSet, name: Setting) -> bool:
-    """Whether a setting differs from what the file states by more than chance allows.
-
-    So it must in every structure that is not dismissed.
-    """
-    stated = _stated(field, name)
-    for candidate in (field.best, *rivals(field, STRONG)):
-        fit = candidate.fit
-        std = fit.std.get(name)
-        if not std or fit.interval.get(name) is None:
-            return False
-        if abs(fit.parameters[name] - stated) < SURE * std:
-            return False
-    return True
-
-
-def _as_stated(field: CandidateSet, name: Setting) -> bool:
-    """Whether any structure explains the record about as well with a setting as the file has it.
-
-    A standard deviation tells what is close to the minimum. This tells whether all else, other
-    kinds of damping included, can make up for the setting farther away.
-    """
-    held = replace(field, free=tuple(other for other in field.free if other != name))
-    for candidate in field.candidates:
-        values = candidate.values
-        saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
-        enough = values * math.exp(saved / values)
-        # Where it is not enough with the setting free, it is not with the setting held.
-        if (
-            candidate.fit.cost < enough
-            and held.refit(candidate, 1).promised_cost < enough
-            and held.refit(candidate).cost < enough
-        ):
-            return True
-    return False
-
-
-def _difference(field: CandidateSet, name: Setting) -> tuple[float, float, float]:
-    """By how much a setting differs from what the file states, with the ends of its interval."""
-    best, stated = field.best.fit, _stated(field, name)
-    low, high = best.interval[name] or (stated, stated)
-    return best.parameters[name] - stated, low - stated, high - stated
 
 
 # Disturbances, forces, and what remains

@@ -20,10 +20,11 @@ from analysis.identify._profile_likelihood import WIDEST_SHARE
 from analysis.identify._uncertainty import damping_size
 from analysis.identify._uniform_beam import PARAMETERS
 from analysis.identify._verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
-from analysis.models import COEFFICIENT_OF, ORDER_RANGE
+from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
+    from analysis.identify._headline import StructureStatus
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._profile_likelihood import Order, Profile
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
@@ -33,8 +34,9 @@ NOT_UNIFORM: Final = (
     "change it"
 )
 NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
-_UNDETERMINED: Final = 5.0
-"""Standard deviation of a logarithm from which its value says nothing."""
+
+_EFFECTIVE: Final = (*OF_BEAM, "delay_s")
+"""Parameters that what makes a beam uneven may change by more than the tolerance."""
 
 
 def refused_reason(test: UniformBeamTest) -> str | None:
@@ -83,6 +85,7 @@ def with_modal_model(
             **_parameters(tolerant, doubt, effective),
         },
         sizes=_sizes(tolerant, doubt),
+        structures=_structures(condition, tolerant),
         simpler=None,
         exact=Numbers(
             name=condition.name,
@@ -146,15 +149,15 @@ def _parameters(
     doubt : str or None
         Why no number of the record is to be believed.
     effective : str or None
-        Why stiffness and density are not those of the beam alone: a mass at the tip or an elastic
-        clamp changes all modes alike, by far more than the tolerance.
+        Why stiffness, density and delay are not those of beam and channels alone: a mass at the
+        tip or a clamp that yields changes all modes alike, by far more than the tolerance.
     """
     return {
         name: Quantity(
             estimate.values[name],
             estimate.std[name],
             estimate.interval[name],
-            doubt or (effective if name in OF_BEAM else None) or _reason(estimate, name),
+            doubt or (effective if name in _EFFECTIVE else None) or _reason(estimate, name),
         )
         for name in PARAMETERS
     }
@@ -173,10 +176,32 @@ def _reason(estimate: TolerantEstimate, name: str) -> str | None:
 def identifiable(estimate: TolerantEstimate, order: str) -> bool:
     """Whether the modes bound an order within less than half of its range."""
     low, high = estimate.interval[order]
-    coefficient = COEFFICIENT_OF[order]
-    spread = estimate.std[coefficient] / max(estimate.values[coefficient], 1e-300)
     wide = WIDEST_SHARE * (ORDER_RANGE[1] - ORDER_RANGE[0])
-    return high - low <= wide and spread < _UNDETERMINED
+    shows = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
+    return high - low <= wide and shows
+
+
+def _structures(
+    exact: Headline, estimate: TolerantEstimate
+) -> tuple[tuple[str, StructureStatus], ...]:
+    """Say which structures the losses exclude: what the modes' places would exclude is no proof."""
+
+    def status(name: str, before: StructureStatus) -> StructureStatus:
+        if before == "selected":
+            return before
+        structure = STRUCTURES[name.partition(",")[0]]
+        for order, coefficient in COEFFICIENT_OF.items():
+            if not structure.has(coefficient):
+                rise = estimate.deviance_without[coefficient]
+            elif structure.fixed.get(order) == 1.0:  # type: ignore[call-overload]
+                rise = estimate.deviance_of_one[order]
+            else:
+                continue
+            if rise > EXCLUDED[0]:
+                return "excluded"
+        return "compatible"
+
+    return tuple((name, status(name, before)) for name, before in exact.structures)
 
 
 def _sizes(estimate: TolerantEstimate, doubt: str | None) -> tuple[Size, ...]:

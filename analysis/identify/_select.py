@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
-from analysis.identify._diagnostics import findings, unexplained
+from analysis.identify._diagnostics import findings, of_settings, unexplained
 from analysis.identify._drag import damping_with_amplitude, with_air_drag, with_evident_drag
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
@@ -62,8 +62,10 @@ if TYPE_CHECKING:
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
+    from analysis.identify._uniform_beam import UniformBeamTest
 
 
+_MODES_TO_JUDGE: Final = 2
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
 """Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
@@ -236,16 +238,12 @@ def _selected(
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
-    if modal is not None and test is not None:
-        tolerant = None
-        if measurement.uniformity and wrong != MISREAD:
-            tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
-        numbers = with_modal_model(numbers, modal, test, tolerant, doubt)
-        if tolerant is not None:
-            alpha, lambda_ = (
-                tolerant_order(each.order, tolerant, each, doubt) for each in profiles
-            )
-            orders = alpha, lambda_
+    numbers = _with_modes(numbers, measurement, modal, test, doubt)
+    if numbers.tolerant is not None:
+        alpha, lambda_ = (
+            tolerant_order(each.order, numbers.tolerant, each, doubt) for each in profiles
+        )
+        orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
         numbers = numbers.with_law_assumed()
     said, advice = [], []
@@ -253,6 +251,7 @@ def _selected(
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         along = tuple(changing(changes))
+        found += _settings(told, numbers, kinds)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
@@ -306,6 +305,29 @@ def _visible(field: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
     if modal is None:
         return visible_modes(field.comparison, field.noise, field.best.fit)
     return modal.visible
+
+
+def _with_modes(
+    exact: Headline,
+    measurement: Measurement,
+    modal: ModalFit | None,
+    test: UniformBeamTest | None,
+    doubt: str | None,
+) -> Headline:
+    """Put the modal model in front of a headline, and parameters with the stated tolerance."""
+    if modal is None or test is None:
+        return exact
+    tolerant = None
+    if measurement.uniformity:
+        tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
+    return with_modal_model(exact, modal, test, tolerant, doubt)
+
+
+def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:
+    """Find what the file states otherwise, where at least two modes show and nothing is absurd."""
+    if "implausible" in kinds or len(told.visible_modes) < _MODES_TO_JUDGE:
+        return ()
+    return tuple(of_settings(field, told))
 
 
 def _linear_and_constant(
@@ -403,20 +425,16 @@ def _freest_alone(
         unexplained=wrong,
         both=None if misread else field.with_both_dampings(field.best),
     )
+    doubt = wrong or _doubt((), clipped="clipping" in kinds)
+    test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
+    told = _with_modes(told, measurement, modal, test, doubt)
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        doubt = wrong or _doubt((), clipped="clipping" in kinds)
+        found += _settings(field, told, kinds)
         found = _as_sure(found, (), wrong, doubt, told.flags, explained=explained)
         found = _with_knocks_and_rest(field, found, white, related)
     told = told.doubted(_CLIPPED) if "clipping" in kinds else told
-    if modal is not None:
-        doubt = wrong or _doubt((), clipped="clipping" in kinds)
-        test = uniform_beam_test(modal, measurement.nominal)
-        tolerant = None
-        if measurement.uniformity and wrong != MISREAD:
-            tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
-        told = with_modal_model(told, modal, test, tolerant, doubt)
     others = (each.fit for each in field.candidates if each.structure is INTEGER)
     analysis = RecordAnalysis.of((told.fit, *others), field.noise, field.comparison)
     return _Told((told, found, analysis), field, explained, kinds)

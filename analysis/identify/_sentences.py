@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify._candidate import MODES_FREE
-from analysis.identify._headline import ONE_MODE
+from analysis.identify._headline import EXACT_CONDITION, ONE_MODE
 from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
 from analysis.statistics import NORMAL_95
@@ -38,7 +38,7 @@ _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
 def of_headline(
     told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
 ) -> list[str]:
-    """Say what the beam does, what is excluded, and what would do.
+    """Say what the modes show, what is known of the damping, and on which condition.
 
     Parameters
     ----------
@@ -48,35 +48,112 @@ def of_headline(
     alone : bool
         Whether nothing else explains the record as well.
     """
+    if len(told.visible_modes) < _SEVERAL:
+        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
+    else:
+        said = [*_uniformity(told), *_of_damping(told, orders)]
+    if told.tolerant is None:
+        said += [order(each) for each in orders]
+    else:
+        said += [slope(told, each) for each in orders]
+        said += _if_exact(told)
+    if told.explained:
+        said.append(
+            "The residual is white: this model suffices for this record."
+            if alone
+            else "The residual is white, but another model fits the record equally well."
+        )
+    return said
+
+
+def _uniformity(told: Headline) -> list[str]:
+    """Say whether a uniform beam predicts the modal constants."""
+    test = told.uniform_beam
+    if test is None or test.p_value is None:
+        return []
+    modes = listed([str(number) for number in test.modes])
+    chance = f"p = {test.p_value:.2g}"
+    if test.status == "passed":
+        return [
+            "A uniform beam predicts frequencies, damping ratios and residues of modes "
+            f"{modes} ({chance})."
+        ]
+    return [
+        "A uniform beam does not predict frequencies, damping ratios and residues of modes "
+        f"{modes} ({chance}): the modes are reported without it."
+    ]
+
+
+def _of_damping(told: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
+    """Say which damping there is, and which structures are excluded."""
+    if told.tolerant is not None:
+        excluded = told.with_status("excluded")
+        return [f"Excluded by the losses: {_types(excluded)}."] if excluded else []
     free = told.fit.structure
     kind = told.name.partition(", ")[2]
     beam = f", beside {kind}" if kind else ""
     if kind == MODES_FREE:
         beam = ", on a non-uniform beam (stiffness correction per mode)"
-    if len(told.visible_modes) < _SEVERAL:
-        said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
-    else:
-        dampings = _DAMPING[free.name]
-        if any(each.reason == ANOTHER_DAMPING for each in orders):
-            dampings = dampings.replace("only", "alone would do")
-        said = [f"{dampings}{beam}. Numbers are those of type {told.name}, all orders free."]
-        excluded = told.with_status("excluded")
-        if told.explained and excluded:
-            said.append(f"Excluded: {_types(excluded)}.")
-        if told.simpler is not None and told.simpler.fixed:
-            said.append(_condition(told.simpler))
-    said += [order(each) for each in orders]
-    if told.explained:
-        said.append(
-            "The residual is noise; no unmodelled effect found."
-            if alone
-            else "The residual is noise, but another model fits the record equally well."
-        )
+    dampings = _DAMPING[free.name]
+    if any(each.reason == ANOTHER_DAMPING for each in orders):
+        dampings = dampings.replace("only", "alone would do")
+    said = [f"{dampings}{beam}. Numbers are those of type {told.name}, all orders free."]
+    excluded = told.with_status("excluded")
+    if told.explained and excluded:
+        said.append(f"Excluded: {_types(excluded)}.")
+    if told.simpler is not None and told.simpler.fixed:
+        said.append(_condition(told.simpler))
     return said
 
 
+def slope(told: Headline, verdict: OrderVerdict) -> str:
+    """Say what is known of one order as the slope of a loss over the modes in sight."""
+    estimate = told.tolerant
+    assert estimate is not None
+    name, of = verdict.order, _OF[verdict.order]
+    if verdict.value is None or verdict.interval is None:
+        return f"The order {name} of the {of} is not identifiable: {verdict.reason}."
+    low, high = verdict.interval
+    std = (high - low) / (2 * NORMAL_95)
+    value, first, last = to_uncertainty((verdict.value, low, high), std)
+    shown = [mode.frequency_hz.value for mode in told.modes if mode.shown]
+    grows = "internal loss" if name == "alpha" else "external damping torque"
+    text = (
+        f"Between {min(shown):.3g} and {max(shown):.3g} Hz the {grows} grows as f^{value} "
+        f"({name}; 95 %: {first} to {last})"
+    )
+    if estimate.basis == "geometry":
+        text += (
+            f", if each mode lies where that of a uniform beam does, to "
+            f"{100 * estimate.uniformity:g} %"
+        )
+    else:
+        text += ", by damping ratios and phases alone"
+    if verdict.reason is not None:
+        return f"{text}; not established, because {verdict.reason}."
+    return text + {
+        "compatible": ": consistent with order 1.",
+        "fractional": ": damping ratios and phases alone exclude order 1.",
+    }.get(verdict.status, ": order 1 is doubtful, but damping ratios and phases do not exclude it.")
+
+
+def _if_exact(told: Headline) -> list[str]:
+    """Say what an exactly uniform beam would give, where one predicts the modes."""
+    exact = told.exact
+    if exact is None:
+        return []
+    numbers = [
+        f"{name} = {_with_interval(exact.parameters[name])}"
+        for name in ("alpha", "lambda")
+        if name in exact.parameters and exact.parameters[name].flag is None
+    ]
+    if not numbers:
+        return []
+    return [f"{EXACT_CONDITION.capitalize()}: {', '.join(numbers)}."]
+
+
 def order(verdict: OrderVerdict) -> str:
-    """Say what is known of one order."""
+    """Say what is known of one order on an exactly uniform beam."""
     profile = verdict.profile
     low, high = profile.interval
     name, of = verdict.order, _OF[verdict.order]

@@ -82,6 +82,7 @@ _FEWEST_MODES: Final = 2
 _NO_EFFECT: Final = 1e-4
 """Curvature of chi-square by an unknown that does nothing."""
 
+_COEFFICIENTS: Final = ("zeta", "gamma")
 _PROFILED: Final = ("zeta", "alpha", "gamma", "lambda")
 _PROFILE_STEPS: Final = 8
 _CLOSE: Final = 0.05
@@ -282,6 +283,26 @@ class ConstantsProblem:
         """Minima from all starts, the lowest first."""
         return sorted((self.minimum(x) for x in self.starts()), key=lambda each: each.cost)
 
+    def held_at_edge(self, place: int, x: NDArray[np.float64]) -> Minimum:
+        """Descend with the size of a damping at the lower edge, where it does nothing.
+
+        Parameters
+        ----------
+        place : int
+            Of its coefficient among `PARAMETERS`.
+        x : ndarray, shape (7,)
+            Unknowns from which the search begins.
+        """
+        high = self.upper.copy()
+        high[place] = self.lower[place]
+        return descend(
+            self.equations,
+            x,
+            Box(self.lower, high),
+            relative_tolerance=_TOLERANCE,
+            max_evaluations=_MANY,
+        )
+
     def held(self, place: int, value: float, x: NDArray[np.float64]) -> Minimum:
         """Descend with one of `PARAMETERS` held; `x` of the result are the unknowns.
 
@@ -395,8 +416,10 @@ class TolerantEstimate:
     first_rad_s : float
         Frequency of the first visible mode.
     deviance_of_one : mapping of str to float
-        By how much order 1 raises chi-square of damping ratios and residue phases alone; 0 where
-        the interval holds 1.
+        By how much order 1 raises chi-square of damping ratios and residue phases alone, by order;
+        0 where the interval holds 1.
+    deviance_without : mapping of str to float
+        By how much chi-square rises without a damping, by its coefficient.
     """
 
     basis: Basis
@@ -409,6 +432,7 @@ class TolerantEstimate:
     covariance: NDArray[np.float64]
     first_rad_s: float
     deviance_of_one: dict[str, float]
+    deviance_without: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
         """Covariance of the parameters as `json.dumps` takes it."""
@@ -521,6 +545,10 @@ def _estimate(
     covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
     values = problem.parameters(best.x)
     spreads = np.sqrt(np.diag(covariance))
+    without = {
+        name: problem.held_at_edge(PARAMETERS.index(name), best.x).cost - best.cost
+        for name in _COEFFICIENTS
+    }
     near = [each for each in minima if each.cost - best.cost < NORMAL_95**2]
     ends: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
@@ -547,6 +575,7 @@ def _estimate(
         covariance=covariance,
         first_rad_s=float(2 * np.pi * np.exp(problem.measured[0])),
         deviance_of_one={"alpha": 0.0, "lambda": 0.0},
+        deviance_without=without,
     )
 
 
