@@ -218,7 +218,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     from rigd.view import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
 
     last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
-    segments = segmentation_of(record.sweep_samples, record.rate_hz)
+    segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
     resolution_hz = _HAMMING_BINS * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate(record, segments, last_hz)
@@ -256,12 +256,12 @@ def _estimate(record: Record, segments: Segmentation, last_hz: float) -> Running
 
     from rigd.spectral import RunningResponse
 
-    swept, rest_rad = record.sweep, record.rest_angle_rad or 0.0
+    swept, rest_rad = record.first_sweep, record.rest_angle_rad or 0.0
     running = RunningResponse(
-        record.rate_hz, record.sweep_samples, last_hz=last_hz, segmentation=segments
+        record.rate_hz, record.first_sweep_samples, last_hz=last_hz, segmentation=segments
     )
     running.feed(
-        np.arange(record.sweep_samples),
+        np.arange(record.first_sweep_samples),
         record.reference_rad[swept] - rest_rad,
         record.angle_rad[swept] - rest_rad,
         record.torque_nm[swept],
@@ -277,7 +277,7 @@ def _coherence(
 
     if estimate.response.coherence is None:
         length, overlap = segment_lengths(
-            record.sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
+            record.first_sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
         )
         segments = replace(segments, segment_length=length, overlap=overlap)
         shorter = _estimate(record, segments, last_hz)

@@ -140,6 +140,8 @@ class Record:
         than the motor's axis; None if the file states none.
     sweep
         Range of samples with the excitation.
+    there
+        Range of samples of the first sweep of a chirp there and back; None if there is one sweep.
     rest_angle_rad
         Angle held before the sweep, None if the file has no segment ``rest``.
     gaps
@@ -172,6 +174,7 @@ class Record:
     tip_mass_kg: float | None
     axis_tilt_deg: float | None
     sweep: slice
+    there: slice | None
     rest_angle_rad: float | None
     gaps: Gaps
     flags: Mapping[str, int]
@@ -183,6 +186,16 @@ class Record:
     def sweep_samples(self) -> int:
         """Number of samples in the sweep."""
         return int(self.sweep.stop - self.sweep.start)
+
+    @property
+    def first_sweep(self) -> slice:
+        """Range of samples that Welch's method uses: the way there, or all of a single sweep."""
+        return self.sweep if self.there is None else self.there
+
+    @property
+    def first_sweep_samples(self) -> int:
+        """Number of samples in the first sweep."""
+        return int(self.first_sweep.stop - self.first_sweep.start)
 
 
 def load_record(path: Path) -> Record:
@@ -287,6 +300,7 @@ def record_of(session: Session) -> Record:
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
         sweep=sweep,
+        there=_there(session, first_tick, sweep),
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
         flags=flags,
@@ -313,6 +327,13 @@ def _sweep(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
             "recorded."
         )
     return slice(start, stop), (end - first) - (stop - start)
+
+
+def _there(session: Session, first_tick: int, sweep: slice) -> slice | None:
+    """Find the samples of the first of two sweeps; None if there is one."""
+    first, end = session.segments.get("there", (0, 0))
+    start, stop = max(first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
+    return slice(start, stop) if stop > start else None
 
 
 def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:

@@ -38,6 +38,11 @@ _TOUCH: Final = (
     "nothing. analyze touch finds where, when and how hard it did."
 )
 
+_TWO_SWEEPS: Final = (
+    "The session sweeps there and back: the Welch fits use the way there alone, those of the whole "
+    "record use both."
+)
+
 _WHOLE: Final = 0.99
 """Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
 
@@ -112,6 +117,8 @@ def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
         Band that was asked for, in Hz.
     """
     said = (_TOUCH,) if record.metadata.get("excitation") == "touch" else ()
+    if record.there is not None:
+        said = (*said, _TWO_SWEEPS)
     _, last_hz = record_band_hz(record, asked_hz)
     if asked_hz is not None or last_hz == RECORD_BAND_HZ[1]:
         return said
@@ -185,7 +192,7 @@ def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
         option = "--method welch" if fits else "--method welch --frf fft"
         return f"{_NO_SWEEP[kind]} ({option} makes them nevertheless)"
     planned_s = _number(record, "duration_s")
-    swept_s = record.sweep_samples / record.rate_hz
+    swept_s = record.first_sweep_samples / record.rate_hz
     if asked_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
         return None
     reached_hz = _reached_hz(record, swept_s / planned_s)

@@ -57,7 +57,8 @@ def task_errors() -> tuple[type[Exception], ...]:
     return SessionError, RecordError, EstimateError, MeasurementError
 
 
-_STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s")
+_STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s",
+                  "there_and_back")  # fmt: skip
 LABEL: Final = "specimen"
 """Key of what the operator calls the specimen."""
 
@@ -138,7 +139,11 @@ class Experiment:
     def unfinished(self, outcome: str) -> str:
         """Say that the sweep ended early, as the end of a sentence; empty if it did not."""
         planned_s = self.facts.get("duration_s")
-        if not isinstance(planned_s, float) or self.sweep_s >= _WHOLE * planned_s:
+        if not isinstance(planned_s, float):
+            return ""
+        if self.facts.get("there_and_back") == 1.0:
+            planned_s *= 2
+        if self.sweep_s >= _WHOLE * planned_s:
             return ""
         return (
             f"its sweep ended after {self.sweep_s:.4g} s of {planned_s:g} s (outcome: {outcome}), "

@@ -77,16 +77,16 @@ def estimate(
             response = whole_record
         elif settings.estimator == "iv":
             response = instrumental_response(
-                _moving_reference_rad(record)[record.sweep],
-                angle[record.sweep],
-                record.torque_nm[record.sweep],
+                _moving_reference_rad(record)[record.first_sweep],
+                angle[record.first_sweep],
+                record.torque_nm[record.first_sweep],
                 record.rate_hz,
                 **asdict(segmentation),
             )
         else:
             response = welch_response(
-                angle[record.sweep],
-                record.torque_nm[record.sweep],
+                angle[record.first_sweep],
+                record.torque_nm[record.first_sweep],
                 record.rate_hz,
                 **asdict(segmentation),
                 estimator=settings.estimator,
@@ -117,7 +117,7 @@ def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
     An imported record may lack it.
     """
     reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
-    if not reference[record.sweep].any():
+    if not reference[record.first_sweep].any():
         raise EstimateError(
             f"{record.path}: the record has no reference that moves, which --frf iv needs; "
             "choose --frf h1."
@@ -147,7 +147,7 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
             f"nfft of {nfft} samples is shorter than a segment of {length}, which is padded and "
             "never cut; raise --nfft."
         )
-    samples = record.sweep_samples
+    samples = record.first_sweep_samples
     if segment_count(samples, length, overlap) == 0:
         raise EstimateError(
             f"{record.path}: the sweep has {samples} samples ({samples / record.rate_hz:g} s), "
@@ -179,7 +179,7 @@ def estimate_warnings(
     if is_welch and response.segments < PAPER_SEGMENTS:
         found.append(
             f"Only {response.segments} Welch segment(s) of {length} samples fit "
-            f"the sweep of {record.sweep_samples}{_remedy(record.sweep_samples)}"
+            f"the sweep of {record.first_sweep_samples}{_remedy(record.first_sweep_samples)}"
         )
     resolution_hz = record.rate_hz / length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)

@@ -188,12 +188,20 @@ def chirp(
     rest_s: Rest = 1.0,
     ring_down_s: RingDown = 15.0,
     taper_s: Taper = 0.0,
+    there_and_back: Annotated[
+        bool,
+        typer.Option(
+            "--there-and-back",
+            help="Sweep back as well, in as long again: tells a change in time from one over "
+            "frequency.",
+        ),
+    ] = False,
 ) -> "dict[str, Value]":
     """Sweep linearly through a band, by default as in the paper.
 
     Example: rigd run chirp --stop-hz 20 --repeat 5
     """
-    return locals()
+    return locals() | {"there_and_back": int(there_and_back)}
 
 
 @excitation_command

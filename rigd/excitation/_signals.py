@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
-from rigd.session import MAX_SAMPLES
+from rigd.session import MAX_SAMPLES, sweep_frequency_hz
 from rigd.units import is_usable_size
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ class Excitation:
     reference_rad
         Shape (n,), relative to the start angle; read-only.
     segments
-        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
+        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive); of a chirp there and
+        back also ``there`` and ``back``, the two sweeps in ``sweep``.
     stays
         The motor stays where the reference ends; else it returns to the start angle.
     approach
@@ -91,11 +92,10 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
     >>> present_frequency_hz(sweep, 51_000), present_frequency_hz(sweep, 0)
     (25.0, None)
     """
-    first, end = excitation.segments["sweep"]
-    if excitation.kind != "chirp" or not first <= tick < end:
+    if excitation.kind != "chirp":
         return None
     start_hz, stop_hz = (float(excitation.parameters[name]) for name in ("start_hz", "stop_hz"))
-    return start_hz + (stop_hz - start_hz) * (tick - first) / (end - first)
+    return sweep_frequency_hz(excitation.segments, (start_hz, stop_hz), tick)
 
 
 # Checks of options
@@ -228,10 +228,12 @@ def chirp(
     rest_s: float = 1.0,
     ring_down_s: float = 15.0,
     taper_s: float = 0.0,
+    there_and_back: int = 0,
 ) -> Excitation:
     """Linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from the sweep's first tick.
 
-    The defaults are the paper's experiment (Section 5).
+    The defaults are the paper's experiment (Section 5). There and back, the frequency returns to f0
+    in as long again, and angle and speed are continuous where it turns.
 
     Parameters
     ----------
@@ -242,11 +244,14 @@ def chirp(
     start_hz, stop_hz
         Frequencies f0 at the sweep's first tick and f1 at its end; f1 < f0 sweeps downwards.
     duration_s
-        Length T of the sweep.
+        Length T of the sweep; there and back, of each of the two.
     rest_s, ring_down_s
         Time before and after the sweep.
     taper_s
         Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
+    there_and_back
+        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change in
+        time shows as such; 0: one.
 
     Raises
     ------
@@ -264,10 +269,22 @@ def chirp(
     within_a_turn("amplitude_rad", amplitude_rad)
     frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
     frequency("stop_hz", stop_hz, rate_hz)
+    if there_and_back not in (0, 1):
+        raise ExcitationError(
+            f"there_and_back = {there_and_back} must be 0 (one sweep) or 1 (two sweeps)."
+        )
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    if there_and_back:
+        there_ticks = segments["sweep"]
+        segments = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
+        back_ticks = there_ticks[1], segments["sweep"][1]
+        segments |= {"there": there_ticks, "back": back_ticks}
     t = _sweep_time(segments, rate_hz)
-    phase = 2.0 * pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2.0 * duration_s))
-    sweep = amplitude_rad * np.sin(phase) * _taper(t, duration_s, taper_s)
+    # Time on the way there and on the way back, where the phase goes on from the turn.
+    there, back = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
+    phase = 2.0 * pi * (start_hz * there + (stop_hz - start_hz) * there**2 / (2.0 * duration_s))
+    phase += 2.0 * pi * (stop_hz * back - (stop_hz - start_hz) * back**2 / (2.0 * duration_s))
+    sweep = amplitude_rad * np.sin(phase) * _taper(t, (1 + there_and_back) * duration_s, taper_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -276,6 +293,7 @@ def chirp(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "taper_s": taper_s,
+        **({"there_and_back": 1} if there_and_back else {}),
     }
     return assemble("chirp", parameters, rate_hz, segments, sweep)
 

@@ -224,6 +224,7 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
         torque_delay_s=rig.sensor.delay_s,
         excitation=excitation.kind,
         sweep_hz=band_of(excitation.kind, excitation.parameters),
+        back=excitation.segments.get("back"),
         specimen=dict(order.notes).get("specimen", ""),
         limits=gauge_limits(order.profile),
         thermal_time_constant_s=rig.motor.thermal_time_constant_s,

@@ -431,7 +431,10 @@ def _sweep_in_words(excitation: Excitation) -> str:
         return ""
     start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
     down = " down" if stop_hz < start_hz else ""
-    return f"sweeps{down} from {start_hz:g} to {stop_hz:g} Hz"
+    back = ""
+    if excitation.parameters.get("there_and_back"):
+        back = f" and back, {float(excitation.parameters['duration_s']):g} s each way"
+    return f"sweeps{down} from {start_hz:g} to {stop_hz:g} Hz{back}"
 
 
 def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:

@@ -21,6 +21,7 @@ from ._format import pack_sample_into as pack_sample_into
 from ._format import pack_timing_into as pack_timing_into
 from ._format import pack_touch as pack_touch
 from ._format import segments_until as segments_until
+from ._format import sweep_frequency_hz as sweep_frequency_hz
 from ._info import SessionInfo as SessionInfo
 from ._info import describe as describe
 from ._info import readable_texts as readable_texts

@@ -125,7 +125,9 @@ def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str
         )
     what = f"**{plain(subject.excitation or 'session')}**"
     if subject.sweep_hz is not None:
-        what += " {:g} → {:g} Hz".format(*subject.sweep_hz)
+        start_hz, stop_hz = subject.sweep_hz
+        back = "" if subject.back is None else f" → {start_hz:g}"
+        what += f" {start_hz:g} → {stop_hz:g}{back} Hz"
     tick = round(1e-9 * t_ns * subject.rate_hz)
     if not state.over and (frequency_hz := subject.frequency_hz(tick)) is not None:
         what += f", now **{frequency_hz:.3g} Hz**"

@@ -90,6 +90,7 @@ def subject_of_session(
         torque_delay_s=session.number("torque_delay_s", 0.0),
         excitation=session.metadata.get("excitation", ""),
         sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
+        back=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
         limits=_stated_limits(attached[-1]),
         absent=_absent(session, timings),

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
+from rigd.session import sweep_frequency_hz
 from rigd.view._plots import TIMELINE
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Subject:
     ticks
         Ticks of the whole record, as scheduled.
     sweep
-        First tick of the excitation, and its end (exclusive).
+        First tick of the excitation, and its end (exclusive); of two sweeps, of the first.
     beam
         The specimen.
     damping
@@ -53,6 +54,8 @@ class Subject:
         What is run, in a few words; empty if that is not known.
     sweep_hz
         Frequencies at the two ends of a linear sweep; None: it is none.
+    back
+        First tick and end (exclusive) of a second sweep, back to the first frequency; None: none.
     specimen
         Name of the specimen as the operator gave it.
     limits
@@ -80,6 +83,7 @@ class Subject:
     torque_delay_s: float = 0.0
     excitation: str = ""
     sweep_hz: tuple[float, float] | None = None
+    back: tuple[int, int] | None = None
     specimen: str = ""
     limits: Mapping[str, float] = field(default_factory=dict)
     thermal_time_constant_s: float = 10.0
@@ -95,11 +99,10 @@ class Subject:
         tick
             Tick of the record.
         """
-        first, end = self.sweep
-        if self.sweep_hz is None or not first <= tick < end:
+        if self.sweep_hz is None:
             return None
-        start_hz, stop_hz = self.sweep_hz
-        return start_hz + (stop_hz - start_hz) * (tick - first) / (end - first)
+        segments = {"sweep": self.sweep} | ({} if self.back is None else {"back": self.back})
+        return sweep_frequency_hz(segments, self.sweep_hz, tick)
 
 
 def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
@@ -110,8 +113,9 @@ def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
     segments
         First tick and end (exclusive) of each, with ``sweep`` among them.
     """
-    # The pieces that a search runs after its scan are no sweep through the band.
-    return segments["scan" if "scan" in segments else "sweep"]
+    # The pieces that a search runs after its scan are no sweep through the band, and of two sweeps
+    # the first is the one that a chirp without a way back has.
+    return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
 
 
 def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:

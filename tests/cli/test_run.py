@@ -9,6 +9,7 @@ import subprocess
 import sys
 import termios
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,10 @@ from processes import child_running, eventually, has_ended, ignored, ignores
 from resting_beams import pressing_force_n
 
 from analysis import load, select
+from analysis.models import WelchSettings
+from analysis.paper import estimate
+from analysis.record import record_of
+from analysis.suited import against_welch, remarks, welch_settings
 from rigd.beam import modes
 from rigd.profile import load_profile
 from rigd.session import Status, read_controls, read_session
@@ -495,3 +500,43 @@ def test_no_process_of_a_session_imports_scipy(tmp_path, arguments):
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "scipy" not in done.stderr
+
+
+def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_estimate(
+    short_chirps, tmp_path
+):
+    """With the seed of the plain chirp: equal to the last bit up to the turn."""
+    command = [RIGD, "run", "chirp", "--there-and-back", "--duration", "20", "--rest", "0.5"]
+    command += ["--ring-down", "1", "--seed", "3", "--fast", "--no-look", "--output", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "sweeps from 0.05 to 50 Hz and back, 20 s each way, record of 41.5 s" in done.stdout
+    (path,) = tmp_path.glob("*.mcap")
+    both, plain = load(path), load(short_chirps[0])
+    assert both.outcome == "complete"
+    assert both.metadata["there_and_back"] == "1"
+    assert both.time_s.size == 41_500
+    assert (both.there, both.sweep) == (slice(500, 20_500), slice(500, 40_500))
+    assert (plain.there, plain.sweep) == (None, slice(500, 20_500))
+    np.testing.assert_array_equal(both.torque_nm[:20_500], plain.torque_nm[:20_500])
+    settings = welch_settings(both, WelchSettings())
+    responses = [estimate(record, settings)[0].response for record in (both, plain)]
+    np.testing.assert_array_equal(*responses)
+    assert any("use the way there alone" in remark for remark in remarks(both))
+    assert against_welch(both) is None
+    assert not remarks(plain)
+    # The reference passes the same angles, and the frequency at equal distances from the turn.
+    reference = both.reference_rad - both.reference_rad[0]
+    assert np.abs(np.diff(reference[20_400:20_600])).max() < 0.025 * 2 * np.pi * 50 / 1000
+
+
+def test_a_chirp_there_and_back_that_is_stopped_on_its_way_back_keeps_its_welch_estimate(
+    short_chirps,
+):
+    """Half of the way back: the plan is longer than the record, as of any stopped session."""
+    session = read_session(short_chirps[0])
+    planned = {"sweep": (500, 40_500), "there": (500, 15_500), "back": (15_500, 30_500)}
+    stated = {**session.metadata, "duration_s": "15.0", "there_and_back": "1"}
+    record = record_of(replace(session, segments=planned, metadata=stated))
+    assert (record.there, record.sweep) == (slice(500, 15_500), slice(500, 21_500))
+    assert against_welch(record) is None

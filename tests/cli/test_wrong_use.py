@@ -81,6 +81,13 @@ def test_an_absurd_option_is_refused(rigd_here, tmp_path, arguments, words):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken"]
 
 
+@pytest.mark.parametrize("percent", ["11", "-1", "nan"])
+def test_an_absurd_uniformity_of_a_search_is_refused(rigd_here, tmp_path, percent):
+    done = rigd_here("run", "until", "--fast", "--zeta", "5%", "--uniformity", percent)
+    assert_refused(done, 2, f"uniformity_percent = {percent} % must lie between 0 and 10 %")
+    assert not list(tmp_path.glob("sessions/*"))
+
+
 def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(
     rigd_here, tmp_path
 ):

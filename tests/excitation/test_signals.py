@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.excitation import ExcitationError, chirp, from_csv, hold, multisine, step, until
+from rigd.excitation import (
+    ExcitationError,
+    chirp,
+    from_csv,
+    hold,
+    multisine,
+    present_frequency_hz,
+    step,
+    until,
+)
 
 
 def test_the_papers_chirp_to_the_last_bit():
@@ -40,6 +49,47 @@ def test_chirp_has_the_frequencies_it_says():
     frequency_hz = 500.0 / np.diff(crossings)
     at_s = (crossings[1:] + crossings[:-1]) / 2000.0
     np.testing.assert_allclose(frequency_hz, 2.0 + 18.0 * at_s / 30.0, rtol=0.05)
+
+
+def test_there_and_back_is_the_chirp_and_its_frequencies_backwards():
+    options = {"rate_hz": 1000.0, "start_hz": 2.0, "stop_hz": 20.0, "duration_s": 30.0}
+    plain, both = chirp(**options), chirp(**options, there_and_back=1)
+    assert plain.parameters | {"there_and_back": 1} == both.parameters
+    assert both.segments == {
+        "rest": (0, 1000), "sweep": (1000, 61_000), "there": (1000, 31_000),
+        "back": (31_000, 61_000), "ring_down": (61_000, 76_000),
+    }  # fmt: skip
+    np.testing.assert_array_equal(both.reference_rad[:31_000], plain.reference_rad[:31_000])
+    sweep = both.reference_rad[1000:61_000]
+    crossings = np.flatnonzero(np.diff(np.signbit(sweep)))
+    at_s = (crossings[1:] + crossings[:-1]) / 2000.0
+    expected_hz = 20.0 - 18.0 * np.abs(at_s - 30.0) / 30.0
+    np.testing.assert_allclose(500.0 / np.diff(crossings), expected_hz, rtol=0.05)
+    for tick, frequency_hz in ((16_000, 11.0), (31_000, 20.0), (46_000, 11.0), (61_000, None)):
+        assert present_frequency_hz(both, tick) == frequency_hz
+
+
+@pytest.mark.parametrize("duration_s", [10.0, 9.9871, 3.33333])
+def test_angle_and_speed_are_continuous_where_the_sweep_turns(duration_s):
+    """Whatever the phase there: differences of ticks stay those of a sine of the stop frequency."""
+    excitation = chirp(rate_hz=1000.0, duration_s=duration_s, there_and_back=1)
+    turn = excitation.segments["back"][0]
+    around = excitation.reference_rad[turn - 100 : turn + 100]
+    most = 2 * math.sin(math.pi * 50.0 / 1000.0)
+    assert np.abs(np.diff(around)).max() <= 0.025 * most * (1 + 1e-9)
+    assert np.abs(np.diff(around, 2)).max() <= 0.025 * most**2 * (1 + 1e-3)
+    assert np.abs(np.diff(around, 3)).max() <= 0.025 * most**3 * 1.02
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"there_and_back": 2}, "there_and_back = 2 must be 0"),
+     ({"there_and_back": 1, "duration_s": 1200.0}, "2416 s; 2400 s is the most"),
+     ({"there_and_back": 1, "duration_s": 10.0, "taper_s": 11.0}, "duration_s = 20 s")],
+)  # fmt: skip
+def test_what_does_not_go_there_and_back_is_refused(options, words):
+    with pytest.raises(ExcitationError, match=words):
+        chirp(rate_hz=1000.0, **options)
 
 
 def test_taper_fades_both_ends_and_leaves_the_middle():

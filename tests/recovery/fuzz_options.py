@@ -362,6 +362,7 @@ def _specimen_cases(seed, every):
     keys = [f"beam.{key}" for key in beam]
     keys += [f"beam.damping.{key}" for key in ("alpha", "zeta", "lambda", "gamma")]
     keys += ["uncertainty.length_percent", "uncertainty.density_percent", "note", "unknown"]
+    keys += ["beam.tip_mass_kg", "uncertainty.tip_mass_percent", "uncertainty.uniformity_percent"]
     keys += ["sensor.tool_inertia_kg_m2"]
     for turn, key in enumerate(keys, seed):
         for value in TOML_NUMBERS if every else [TOML_NUMBERS[STEP * turn % len(TOML_NUMBERS)]]:

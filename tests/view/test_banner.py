@@ -18,7 +18,7 @@ from rigd.view._banner import (
 from rigd.view._gauges import Gauge
 from rigd.view._plots import GREEN, GREY, ORANGE, RED
 from rigd.view._scene import Scene
-from rigd.view._session_info import RECENT_EVENTS, Health, Note
+from rigd.view._session_info import RECENT_EVENTS, Health, Note, sweep_of
 
 FAULT = ended("fault", "The disk is full.")
 
@@ -80,6 +80,16 @@ def test_only_a_linear_sweep_has_a_frequency(subject, sweep):
     assert subject.frequency_hz(5000) is None
     down = replace(sweep, sweep_hz=(60.0, 50.0))
     assert down.frequency_hz(61_000) == pytest.approx(55.0)
+
+
+def test_a_sweep_there_and_back_has_a_frequency_on_both_ways(sweep):
+    both = replace(sweep, sweep_hz=(0.0, 50.0), back=(121_000, 241_000), ticks=256_000)
+    frequencies = [both.frequency_hz(tick) for tick in (61_000, 121_000, 181_000, 241_000)]
+    assert frequencies == [25.0, 50.0, 25.0, None]
+    said = banner(both, RUNNING, 181_000_000_000, Health())
+    assert "0 → 50 → 0 Hz, now **25 Hz**" in said
+    segments = {"sweep": (1000, 241_000), "there": (1000, 121_000), "back": (121_000, 241_000)}
+    assert sweep_of(segments) == (1000, 121_000)
 
 
 @pytest.mark.parametrize(
