@@ -254,7 +254,7 @@ def _promising(field: CandidateSet) -> bool:
     return False
 
 
-def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
     """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
     moved_rad = comparison.angle_rad + comparison.rest_rad
     response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
@@ -263,7 +263,7 @@ def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]
 
 def _first_amplitude(refit: Refit) -> tuple[float, float]:
     """Size of a small drag beside a fit without it, all else free, and the squares it saves."""
-    (column,), residual = refit.beside(_first_order(refit.objective.comparison, refit.plant))
+    (column,), residual = refit.beside(small_drag(refit.objective.comparison, refit.plant))
     square = float(np.vdot(column, column).real)
     if square <= 0:
         return 0.0, 0.0
@@ -273,7 +273,7 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
 
 def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
     """Fit with the first order of the drag; None if the air would have to push."""
-    column = _first_order(field.comparison, lead.fit.plant)
+    column = small_drag(field.comparison, lead.fit.plant)
     refit = replace(field, columns=column).refit(lead, _FEW)
     size = float(refit.amplitudes()[0][0])
     return _Point(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None

@@ -88,6 +88,9 @@ class ModalFit:
         As estimated from this residual; bins below the first mode do not count.
     whiteness : Whiteness
     input_relation : InputRelation
+    span : ndarray, shape (r, 2 K)
+        Orthonormal rows that all derivatives of the whitened residual span, its real and imaginary
+        parts side by side.
     """
 
     model: ModalModel
@@ -101,6 +104,22 @@ class ModalFit:
     noise: Noise
     whiteness: Whiteness
     input_relation: InputRelation
+    span: NDArray[np.float64]
+
+    def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Squares that each of some further columns would save, shape (c,).
+
+        Parameters
+        ----------
+        columns : ndarray of complex, shape (c, K)
+            Spectra in N·m, not whitened.
+        """
+        white = np.ascontiguousarray(columns * self.noise.weight).view(np.float64)
+        white -= (white @ self.span.T) @ self.span
+        along = white @ self.residual.view(np.float64)
+        squares = np.maximum(np.einsum("ij,ij->i", white, white), np.finfo(float).tiny)
+        saved: NDArray[np.float64] = along**2 / squares
+        return saved
 
     @property
     def explained(self) -> bool:
@@ -172,7 +191,7 @@ def fit_modes(
         tuple(number for number, _, _ in inside),
         np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
     )
-    return search.settled().with_further_resonances().without_idle_modes().fit()
+    return search.settled().with_further_resonances().fit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,17 +260,6 @@ class _Search:
             search = more
         return search
 
-    def without_idle_modes(self) -> _Search:
-        """Leave out modes that save nothing: there frequency and damping are undetermined."""
-        search = self
-        while search.numbers:
-            saved = search.evidence()
-            least = int(np.argmin(saved))
-            if saved[least] > _EVIDENCE:
-                break
-            search = search._without(least).descended()
-        return search
-
     def _without(self, place: int) -> _Search:
         numbers = self.numbers[:place] + self.numbers[place + 1 :]
         return replace(self, numbers=numbers, x=np.delete(self.x, [2 * place, 2 * place + 1]))
@@ -270,13 +278,20 @@ class _Search:
         return input_relation(residual[first:], angle[first:], self.comparison.frequency_hz[first:])
 
     def fit(self) -> ModalFit | None:
-        """Return the fit at this point."""
-        if not self.numbers:
-            return None
+        """Return the fit without modes that save nothing: they are undetermined."""
         order = np.argsort(self.x[::2])
-        x = self.x.reshape(-1, 2)[order].ravel()
-        numbers = tuple(self.numbers[i] for i in order)
-        search = replace(self, x=x, numbers=numbers)
+        search = replace(
+            self,
+            x=self.x.reshape(-1, 2)[order].ravel(),
+            numbers=tuple(self.numbers[i] for i in order),
+        )
+        saved = search.evidence()
+        while saved.size and saved.min() < _EVIDENCE:
+            search = search._without(int(np.argmin(saved))).descended()
+            saved = search.evidence()
+        if not saved.size:
+            return None
+        x, numbers = search.x, search.numbers
         problem = search.problem()
         model, _ = problem.model_and_residual(x)
         point = problem.at(x)
@@ -289,14 +304,25 @@ class _Search:
             numbers=numbers,
             constants=constants,
             covariance=covariance,
-            evidence=tuple(search.evidence().tolist()),
+            evidence=tuple(saved.tolist()),
             residual=residual,
             deviance=squares + 2 * float(np.sum(np.log(search.noise.power[counts]))),
             parameters=x.size + 2 * len(numbers) + BACKGROUND,
             noise=search.noise,
             whiteness=whiteness(residual[counts], search.comparison.frequency_hz[counts]),
             input_relation=search.relation(),
+            span=np.concatenate([point.span, _orthonormal(point.jacobian)]),
         )
+
+
+def _orthonormal(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal rows that span some rows, nearly independent or not."""
+    scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    scale[scale == 0] = 1.0  # a decay that is over at once
+    scaled = rows / scale[:, None]
+    gram = scaled @ scaled.T
+    gram[np.diag_indices_from(gram)] += 1e-13
+    return np.linalg.solve(np.linalg.cholesky(gram), scaled)
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,6 +332,7 @@ class _Point:
     residual: NDArray[np.float64]
     linear: NDArray[np.float64]
     columns: NDArray[np.float64]
+    span: NDArray[np.float64]
     full_jacobian: NDArray[np.float64]
     jacobian: NDArray[np.float64]
 
@@ -364,11 +391,11 @@ class _Problem:
                 slopes.append(row * ((eta * q + 2 * q * q) * over - power))
                 slopes.append(-row * q * over)
         count = len(rows)
-        spectra = self._spectra(np.array(rows + slopes))
+        spectra = self._spectra(np.array(rows + slopes).reshape(-1, self._s.size))
         nuisance = self._white(self._nuisance(x))
         columns = np.concatenate([spectra[:count], self._background, nuisance])
         scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
-        scale[scale == 0] = 1.0
+        scale[scale == 0] = 1.0  # a decay that is over at once
         scaled = columns / scale[:, None]
         gram = scaled @ scaled.T
         gram[np.diag_indices_from(gram)] += 1e-13
@@ -384,7 +411,7 @@ class _Problem:
             jacobian[2 * k] = a * four[0] + b * four[2]
             jacobian[2 * k + 1] = a * four[1] + b * four[3]
         projected = jacobian - (jacobian @ solved.T) @ solved
-        return _Point(residual, linear, columns, jacobian, projected)
+        return _Point(residual, linear, columns, solved, jacobian, projected)
 
     def model_and_residual(
         self, x: NDArray[np.float64]

@@ -11,20 +11,28 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
+import numpy as np
+
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._diagnostics import findings, of_settings, unexplained
-from analysis.identify._drag import damping_with_amplitude, with_air_drag, with_evident_drag
+from analysis.identify._drag import (
+    damping_with_amplitude,
+    small_drag,
+    with_air_drag,
+    with_evident_drag,
+)
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
 from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
-from analysis.identify._nonlinear import nonlinear_forces
+from analysis.identify._nonlinear import ModalForces, Term, nonlinear_forces
 from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
 from analysis.identify._residual_tests import (
+    SURE,
     InputRelation,
     Whiteness,
     harmonics,
@@ -33,7 +41,7 @@ from analysis.identify._residual_tests import (
 )
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
-from analysis.identify._time_varying import along_time, changing
+from analysis.identify._time_varying import along_time, changing, play
 from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
@@ -56,6 +64,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._nonlinear import Kind as ForceKind
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._profile_likelihood import Order
@@ -66,6 +75,9 @@ if TYPE_CHECKING:
 
 
 _MODES_TO_JUDGE: Final = 2
+_EFFECT: Final = SURE**2 + 2 * math.log(8)
+"""Deviance that an effect of the amplitude must save beside the modal model: eight are tried."""
+
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
 """Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
@@ -297,7 +309,10 @@ def _modal(field: CandidateSet) -> ModalFit | None:
         for mode in field.likeliest.modes
         if mode.frequency_hz > 0
     ]
-    return fit_modes(field.comparison, field.noise, starts, field.columns)
+    columns, drag = field.columns, field.comparison.drag
+    if drag is not None:  # its size is not known exactly
+        columns = np.concatenate([columns, drag.by_law])
+    return fit_modes(field.comparison, field.noise, starts, columns)
 
 
 def _visible(field: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
@@ -333,9 +348,22 @@ def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tu
 def _linear_and_constant(
     field: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
+    """Whether the modal model leaves nothing but noise: nothing else need be looked for.
+
+    Nor must what depends on the amplitude make it better: the residual of a small effect is white.
+    """
     _, _, multiples = _tests(field, modal, band_hz)
-    return modal.explained and not any(each.present for each in multiples)
+    if not modal.explained or any(each.present for each in multiples):
+        return False
+    comparison, plant = field.comparison, field.likeliest.plant
+    forces = ModalForces(comparison, plant)
+    stiffening: tuple[ForceKind, ...] = ("cubic stiffness", "quadratic stiffness")
+    columns = [
+        *(forces.column(Term(kind, mode)) for kind in stiffening for mode in modal.visible),
+        *small_drag(comparison, plant),
+        play(comparison, plant),
+    ]
+    return bool(modal.saved_by(np.array(columns)).max() < _EFFECT)
 
 
 def _with_effects(

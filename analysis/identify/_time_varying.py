@@ -231,6 +231,11 @@ def _column(
     return comparison.spectrum(change)
 
 
+def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Spectrum of the torque by a backlash of `_UNIT_PLAY_RAD`, shape (K,)."""
+    return _column(comparison, plant, _lag_of_play(comparison), "play", 0.0)
+
+
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
     """Hub's angle less the shaft's with a backlash of `_UNIT_PLAY_RAD`, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])

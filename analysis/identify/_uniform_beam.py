@@ -235,7 +235,8 @@ class ConstantsProblem:
         return np.stack(rows, axis=-1).reshape(len(x), -1)
 
     def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        off = self.constants(x) - self.measured
+        with np.errstate(all="ignore"):  # a mode without a pole gives NaN
+            off = self.constants(x) - self.measured
         phases = off[:, CONSTANTS.index("residue_phase_rad") :: len(CONSTANTS)]
         phases -= 2 * np.pi * np.round(phases / (2 * np.pi))
         return np.nan_to_num(off @ self._whitener.T, nan=1e6)

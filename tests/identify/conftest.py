@@ -64,6 +64,7 @@ class Session:
             angle_known=angle_known,
             torque_known=torque_known,
             rest_angle_rad=rest_angle_rad,
+            uniformity=0.0,  # these beams are as uniform as the equation has them
         )
 
     def cut(self, first: int, end: int | None = None) -> "Session":

@@ -22,6 +22,9 @@ RECORD = SimpleNamespace(
     torque_filter_s=(2e-3, 0.0),
     reference_rad=np.linspace(0.1, 0.2, 300),
     metadata={"excitation": "chirp"},
+    uniformity=2e-3,
+    tip_mass_kg=None,
+    axis_tilt_deg=None,
 )
 
 
@@ -30,6 +33,7 @@ def test_a_record_is_taken_over():
     assert measurement.name == "session.mcap"
     assert measurement.delay_s == pytest.approx(3e-4)  # by how much the torque is older
     assert measurement.tool_inertia_kg_m2 == 1e-5
+    assert measurement.uniformity == 2e-3
     assert measurement.nominal.filter_time_constant_s == 2e-3
     assert measurement.nominal.second_order_filter_time_constant_s == 0.0
     assert measurement.reference_rad is RECORD.reference_rad

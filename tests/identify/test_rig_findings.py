@@ -55,7 +55,9 @@ def record(factor=1.0, filter_hz=np.inf, clock=0.0, **ends):
         size = size * clock * np.arange(TICKS) / RATE_HZ / (power + 1)
     noise = np.random.default_rng(5).normal(scale=3e-3, size=TICKS)
     known = np.ones(TICKS, dtype=bool)
-    return Measurement("x", angle_rad, factor * (torque_nm + noise), RATE_HZ, LINK, known, known)
+    return Measurement(
+        "x", angle_rad, factor * (torque_nm + noise), RATE_HZ, LINK, known, known, uniformity=0.0
+    )
 
 
 def judged(measurement):
@@ -238,7 +240,7 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8):
     noise = np.random.default_rng(6).normal(scale=3e-3, size=t[::finer].size)
     known = np.ones(noise.size, dtype=bool)
     torque_nm = torque[::finer] + noise
-    return Measurement("x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known)
+    return Measurement("x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known, uniformity=0.0)
 
 
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted():
