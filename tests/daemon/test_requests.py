@@ -36,6 +36,13 @@ def test_a_start_has_the_parameters_of_its_excitation():
     assert request.parameters == {"path": Path("/data/reference.csv")}
 
 
+def test_a_chirp_there_and_back_is_asked_for_by_a_whole_number():
+    parameters = {"there_and_back": 1, "duration_s": 60.0}
+    assert parse(START | {"excitation": "chirp", "parameters": parameters}).parameters == parameters
+    with pytest.raises(RequestError, match=r"there_and_back = 1\.5 is not a whole number"):
+        parse(START | {"excitation": "chirp", "parameters": {"there_and_back": 1.5}})
+
+
 def test_a_precision_is_asked_for_in_words():
     parameters = {"targets": "damping 1%; alpha 0.01", "at_most_s": 60.0}
     assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
