@@ -179,6 +179,9 @@ class Measurement:
     axis_tilt_deg : float or None
         Inclination of the plane of motion along the beam at rest as the file states it, positive
         where the tip is lower than the motor's axis; None if it was not measured.
+    one_sweep : bool
+        Whether the motor passed each frequency once, in their order: then what changes with time
+        cannot be told from what changes with frequency.
     """
 
     name: str
@@ -198,6 +201,7 @@ class Measurement:
     uniformity: float = 1e-3
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
+    one_sweep: bool = True
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -230,6 +234,8 @@ class Measurement:
             uniformity=record.uniformity,
             tip_mass_kg=record.tip_mass_kg,
             axis_tilt_deg=record.axis_tilt_deg,
+            one_sweep=record.metadata.get("excitation", "chirp") == "chirp"
+            and record.there is None,
         )
 
     def check(self, highest_hz: float) -> None:

@@ -52,6 +52,7 @@ def with_modal_model(
     test: UniformBeamTest,
     tolerant: TolerantEstimate | None,
     doubt: str | None,
+    mode_doubt: str | None,
 ) -> Headline:
     """Put modes and tolerant parameters in front of those of an exactly uniform beam.
 
@@ -63,14 +64,14 @@ def with_modal_model(
     test : UniformBeamTest
     tolerant : TolerantEstimate or None
         None to keep the parameters: the beam is stated to be uniform, or too few modes show.
-    doubt : str or None
-        Why no number of the record is to be believed.
+    doubt, mode_doubt : str or None
+        Why no number of the record, or no mode, is to be believed.
     """
     refused = refused_reason(test)
     effective = None if refused is None else NOT_UNIFORM
     condition = exact if refused is None else exact.doubted(refused)
     exactly = exact.fit.modes if tolerant is None and refused is None else ()
-    modes = _modes(condition, modal, doubt, own=bool(exactly))
+    modes = _modes(condition, modal, mode_doubt, own=bool(exactly))
     told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
         return told

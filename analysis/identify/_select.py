@@ -41,7 +41,7 @@ from analysis.identify._residual_tests import (
 )
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
-from analysis.identify._time_varying import along_time, changing, play
+from analysis.identify._time_varying import along_time, changing, established, play
 from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
@@ -244,13 +244,14 @@ def _selected(
     found = findings(told, forces, multiples, visible)
     kinds = {finding.kind for finding in found}
     wrong = _wrong(kinds, explained=explained)
-    doubt = wrong or _doubt(changes, clipped="clipping" in kinds)
+    clipped = _CLIPPED if "clipping" in kinds else None
+    doubt = wrong or clipped or _doubt(changes, one_sweep=measurement.one_sweep)
     alpha, lambda_ = (order_verdict(field, each, visible, doubt=doubt) for each in profiles)
     orders, close = (alpha, lambda_), rivals(field, EVEN)
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
-    numbers = _with_modes(numbers, measurement, modal, test, doubt)
+    numbers = _with_modes(numbers, measurement, modal, test, doubt, wrong or clipped)
     if numbers.tolerant is not None:
         alpha, lambda_ = (
             tolerant_order(each.order, numbers.tolerant, each, doubt) for each in profiles
@@ -262,7 +263,7 @@ def _selected(
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
-        along = tuple(changing(changes))
+        along = tuple(changing(changes, one_sweep=measurement.one_sweep))
         found += _settings(told, numbers, kinds)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
@@ -328,14 +329,28 @@ def _with_modes(
     modal: ModalFit | None,
     test: UniformBeamTest | None,
     doubt: str | None,
+    mode_doubt: str | None,
 ) -> Headline:
-    """Put the modal model in front of a headline, and parameters with the stated tolerance."""
+    """Put the modal model in front of a headline, and parameters with the stated tolerance.
+
+    Parameters
+    ----------
+    exact : Headline
+        That of an exactly uniform beam.
+    measurement : Measurement
+    modal : ModalFit or None
+        None keeps `exact`.
+    test : UniformBeamTest or None
+        None with it.
+    doubt, mode_doubt : str or None
+        Why no number, or no mode, is to be believed.
+    """
     if modal is None or test is None:
         return exact
     tolerant = None
     if measurement.uniformity:
         tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
-    return with_modal_model(exact, modal, test, tolerant, doubt)
+    return with_modal_model(exact, modal, test, tolerant, doubt, mode_doubt)
 
 
 def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:
@@ -453,9 +468,9 @@ def _freest_alone(
         unexplained=wrong,
         both=None if misread else field.with_both_dampings(field.best),
     )
-    doubt = wrong or _doubt((), clipped="clipping" in kinds)
+    doubt = wrong or (_CLIPPED if "clipping" in kinds else None)
     test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
-    told = _with_modes(told, measurement, modal, test, doubt)
+    told = _with_modes(told, measurement, modal, test, doubt, doubt)
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
@@ -494,11 +509,12 @@ def _wrong(kinds: Collection[str], *, explained: bool) -> str | None:
     return UNEXPLAINED if "harmonics" in kinds or not explained else None
 
 
-def _doubt(changes: tuple[Change, ...], *, clipped: bool) -> str | None:
-    """Say why no number is to be believed though all of the record is explained; None: it may."""
-    if clipped:
-        return _CLIPPED
-    if len(changes) == 1 and changes[0].certain:
+def _doubt(changes: tuple[Change, ...], *, one_sweep: bool) -> str | None:
+    """Say why no parameter is to be believed though all of the record is explained, or None.
+
+    The modes are what each was when it was passed.
+    """
+    if established(changes, one_sweep=one_sweep):
         return None
     return next((f"{change.name} would explain the record as well" for change in changes), None)
 

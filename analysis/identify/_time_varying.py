@@ -347,20 +347,42 @@ _KINDS: Final[dict[What, Kind]] = {
 }
 
 
-def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:
-    """Put in words what changes along the record."""
-    alone = len(changes) == 1
+def established(changes: tuple[Change, ...], *, one_sweep: bool) -> bool:
+    """Whether one change, and nothing else, explains the record.
+
+    What changes with time never is from one sweep: it may change with frequency. Backlash may be.
+
+    Parameters
+    ----------
+    changes : tuple of Change
+    one_sweep : bool
+        As `Measurement` has it.
+    """
+    if len(changes) != 1 or not changes[0].certain:
+        return False
+    return changes[0].what == "play" or not one_sweep
+
+
+def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Finding]:
+    """Put in words what changes along the record.
+
+    Parameters
+    ----------
+    changes : tuple of Change
+    one_sweep : bool
+        As `Measurement` has it.
+    """
     for change in changes:
         finding = _finding(change)
-        if alone and change.certain:
+        if established(changes, one_sweep=one_sweep):
             yield finding
         else:
+            others = "the others named" if len(changes) > 1 else "any other model"
             yield replace(
                 finding,
                 sentence=(
-                    f"{_NAMES[change.what]} ({_size(change)}) would fit the record as well as "
-                    + ("any other model" if alone else "the others named")
-                    + ": in one sweep, time and frequency vary together."
+                    f"{_NAMES[change.what]} ({_size(change)}) would explain the record as well as "
+                    f"{others}: in one sweep, time and frequency vary together."
                 ),
                 value=None,
                 interval=None,
@@ -394,7 +416,7 @@ def _finding(change: Change) -> Finding:
         remedy=(
             "Remove the backlash in gear and clamp."
             if of_play
-            else "Repeat with the sweep from high to low frequency, which separates changes with "
-            "time from those with frequency."
+            else "Sweep up and down in one session (rigd run chirp --there-and-back): that "
+            "separates changes with time from those with frequency."
         ),
     )

@@ -192,12 +192,19 @@ def test_a_drifting_zero_is_no_hum():
     assert verdict.adequate
 
 
-def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8):
+def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
     """Chirp, of a beam that changes by so much from beginning to end: its modes step by step."""
     dt, modes = 1 / (finer * RATE_HZ), 6
     t = np.arange(round(seconds / dt)) * dt
-    phase, turn = 2 * np.pi * (0.5 * t + 49.5 * t**2 / (2 * seconds)), 99 * np.pi / seconds
-    speed = np.pi + turn * t
+    turn = 99 * np.pi / seconds * (2 if back else 1)
+    phase, speed = np.pi * t + turn * t**2 / 2, np.pi + turn * t
+    if back:  # up to 50 Hz in the first half, and down again
+        half, returning = seconds / 2, t > seconds / 2
+        since = t - half
+        down = np.pi * half + turn * half**2 / 2 + (np.pi + turn * half) * since
+        phase = np.where(returning, down - turn * since**2 / 2, phase)
+        speed = np.where(returning, np.pi + turn * (seconds - t), speed)
+        turn = np.where(returning, -turn, turn)
     window, rise = np.ones((3, t.size)) * [[1], [0], [0]], np.pi / 1.0
     for ends, sign in ((t < 1, 1), (t > seconds - 1, -1)):
         x = rise * (t[ends] if sign > 0 else seconds - t[ends])
@@ -240,7 +247,10 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8):
     noise = np.random.default_rng(6).normal(scale=3e-3, size=t[::finer].size)
     known = np.ones(noise.size, dtype=bool)
     torque_nm = torque[::finer] + noise
-    return Measurement("x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known, uniformity=0.0)
+    return Measurement(
+        "x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known, uniformity=0.0,
+        one_sweep=not back,
+    )  # fmt: skip
 
 
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted():
@@ -265,9 +275,20 @@ def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted():
         further("damping", 0.0),
     ],
 )
-def test_what_drifts_along_the_record_is_named_and_biases_nothing(what, change):
-    """A mode rings for seconds: it does not follow at once what its frequency and decay become."""
+def test_what_drifts_in_one_sweep_is_no_fact(what, change):
+    """Time and frequency vary together there: each mode is what it was when it was passed."""
     selection = select(changing(**{what: change}))
+    assert all(each.interval is None for each in selection.verdict.findings)
+    assert all(mode.frequency_hz.flag is None for mode in selection.headline.modes)
+    assert all(mode.source == "modal" or not change for mode in selection.headline.modes)
+
+
+@pytest.mark.parametrize(
+    ("what", "change"), [("stiffness", 0.01), further("damping", 0.3), further("damping", 0.0)]
+)
+def test_what_drifts_while_the_motor_sweeps_there_and_back_is_named(what, change):
+    """A mode rings for seconds: it does not follow at once what its frequency and decay become."""
+    selection = select(changing(**{what: change}, seconds=40.0, back=True))
     verdict, numbers = selection.verdict, selection.headline.parameters
     found = {finding.kind: finding for finding in verdict.findings}
     assert found.keys() == ({f"drifting {what}"} if change else set())

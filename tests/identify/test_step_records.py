@@ -1,11 +1,9 @@
 """Steps of the motor: what is named is there, and what one mode leaves open is said to be open."""
 
-from dataclasses import replace
-
 import pytest
 
+from analysis.identify import select
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._diagnostics import of_settings
 from analysis.identify._profile_likelihood import Profile
 from analysis.identify._sentences import order as order_sentence
 from analysis.identify._verdict import order_verdict
@@ -19,30 +17,15 @@ def without_delay(steps):
     return CandidateSet.of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8), (), BAND_HZ)
 
 
-def kinds(field):
-    return {found.kind for found in of_settings(field)}
-
-
 def test_a_step_without_a_delay_names_nothing(without_delay):
-    assert kinds(without_delay) == set()
+    assert select(without_delay.comparison.measurement).verdict.findings == ()
 
 
 def test_a_delay_that_is_there_is_named_in_a_step(steps):
-    field = CandidateSet.of(
-        steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5), (), BAND_HZ
-    )
-    (found,) = of_settings(field)
+    measured = steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5)
+    (found,) = select(measured).verdict.findings
     assert found.kind == "delay"
     assert found.value == pytest.approx(2e-3, abs=3e-4)
-
-
-def test_what_all_else_makes_up_for_is_not_doubted(without_delay):
-    """However sure a fit seems to be of a delay: one that is not there costs next to nothing."""
-    best = without_delay.best
-    sure = replace(best.fit, std={**best.fit.std, "delay_s": 1e-9})
-    field = replace(without_delay, candidates=(replace(best, fit=sure),))
-    assert abs(sure.parameters["delay_s"]) > 5e-9
-    assert kinds(field) == set()
 
 
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
