@@ -35,9 +35,10 @@ _FINER = 4
 _DECAY = 14.0
 """What wraps around the padded grid has decayed by exp(-14) = 1e-6; rounding has grown by 1e3."""
 _VISIBLE_HZ = (0.3, 48.0)
-_AIR_KG_M3, _DRAG_COEFFICIENT = 1.2, 1.2
+_AIR_KG_M3, DRAG_COEFFICIENT = 1.2, 1.2
 _MARCHED_MODES = 8
 _DRAG_ITERATIONS = 60
+_LOCAL_POINTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +202,10 @@ class Defect:
     damping : DampingLaw
     beam : FiniteElementBeam
     channel : TorqueChannel
-    exact : tuple of str
-        Parameters that the rig has with one true value.
+    alpha_range : tuple of float, optional
+        Slopes of the material's loss over frequency, where it has no single order.
+    effects : tuple of str
+        What the analyzer may state of this rig, in its words, whatever the size.
     constant_nm : float
         Constant load of gravity.
     step : tuple of (at_s, relative_change), optional
@@ -217,25 +220,54 @@ class Defect:
     damping: DampingLaw
     beam: FiniteElementBeam
     channel: TorqueChannel = TorqueChannel()
-    exact: tuple[str, ...] = ()
+    alpha_range: tuple[float, float] | None = None
+    effects: tuple[str, ...] = ()
     constant_nm: float = 0.0
     step: tuple[float, float] | None = None
     drag_m: float = 0.0
 
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the true values, lowest and highest, by the names that the analyzer gives them.
+
+        The two are equal where the rig has a single value. A property that varies along the beam,
+        or in time, has the range of its local values. What the rig does not have is left out.
+        """
+        law, channel = self.damping, self.channel
+        x = np.linspace(0.0, LENGTH_M, _LOCAL_POINTS + 1)[:-1] + LENGTH_M / (2 * _LOCAL_POINTS)
+        pivot = np.array([100j])
+        stiffness = self.beam.stiffness_n_m2(x)
+        for extra, factor in self.beam.patches:
+            stiffness = stiffness + extra(x) * factor(pivot)[0].real
+        over = self.beam.density_kg_per_m(x) / stiffness
+        stiffer = 1 + sum(strength for strength, _ in law.relaxations)
+        changed = (1.0, stiffer, 1.0 + (self.step[1] if self.step else 0.0))
+        gains = (1.0, 1.0 + channel.cubic)
+        low, high = stiffness.min() * min(changed), stiffness.max() * max(changed)
+        found = {
+            "gamma": (law.gamma * STIFFNESS_N_M2 / high, law.gamma * STIFFNESS_N_M2 / low),
+            "lambda": (law.lambda_, law.lambda_),
+            "density_over_stiffness": (over.min() / max(changed), over.max() / min(changed)),
+            "bending_stiffness_n_m2": (low * min(gains), high * max(gains)),
+            "tool_inertia_kg_m2": (channel.tool_inertia_kg_m2,) * 2,
+        }
+        if self.alpha_range is not None:
+            found["alpha"] = self.alpha_range
+        elif law.alpha is not None and law.zeta is not None:
+            found |= {"alpha": (law.alpha, law.alpha), "zeta": (law.zeta, law.zeta)}
+        if not channel.resonance_hz:
+            found["delay_s"] = (channel.delay_s, channel.delay_s)
+        tips = [mass.mass_kg for mass in self.beam.masses if mass.position_m == LENGTH_M]
+        found["tip_mass_kg"] = (sum(tips),) * 2
+        found["drag_m"] = (DRAG_COEFFICIENT * self.drag_m,) * 2
+        if self.beam.root_nm_per_rad is not None:
+            springs = self.beam.root_nm_per_rad(2j * np.pi * np.array([FIRST_HZ, LAST_HZ])).real
+            found["root_nm_per_rad"] = (springs.min(), springs.max())
+        return {name: (float(least), float(most)) for name, (least, most) in found.items()}
+
     @property
     def parameters(self) -> dict[str, float]:
-        """True values by the names that the analyzer gives them."""
-        every = {
-            "zeta": self.damping.zeta,
-            "alpha": self.damping.alpha,
-            "gamma": self.damping.gamma,
-            "lambda": self.damping.lambda_,
-            "density_over_stiffness": DENSITY_KG_PER_M / STIFFNESS_N_M2,
-            "bending_stiffness_n_m2": STIFFNESS_N_M2,
-            "delay_s": self.channel.delay_s,
-            "tool_inertia_kg_m2": self.channel.tool_inertia_kg_m2,
-        }
-        return {name: value for name in self.exact if (value := every[name]) is not None}
+        """True values of what has a single one."""
+        return {name: low for name, (low, high) in self.ranges().items() if low == high}
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,6 +301,8 @@ class DefectRecord:
             },
             "modes": [mode.document() for mode in self.modes],
             "parameters": self.defect.parameters,
+            "ranges": {name: list(pair) for name, pair in self.defect.ranges().items()},
+            "effects": list(self.defect.effects),
             "law": {
                 "zeta": law.zeta,
                 "alpha": law.alpha,
@@ -478,7 +512,7 @@ def _drag_torque(defect: Defect, motion: _Motion) -> Real:
     acts on the beam with that linear drag, until the speeds repeat themselves to 1e-5.
     """
     beam, law = defect.beam, defect.damping
-    per_speed = 0.5 * _AIR_KG_M3 * _DRAG_COEFFICIENT * defect.drag_m
+    per_speed = 0.5 * _AIR_KG_M3 * DRAG_COEFFICIENT * defect.drag_m
     frequencies, shares = beam.shares()
     omega, shares = frequencies[:_MARCHED_MODES, None], shares[:_MARCHED_MODES, None]
     position = (np.arange(24) + 0.5) / 24 * LENGTH_M
