@@ -7,7 +7,7 @@ and noise of 5 mN·m, white or coloured.
 
 Linear rigs are computed on a shifted line of the Laplace plane, on a grid four times as fine as
 the record's. A step in time conserves the state: the record after it is that of the changed beam
-plus the free decay of the difference of the two states. Drag is iterated over the whole record.
+plus the free decay of the difference of the two states. What drag changes is marched in time.
 Play, friction and the sensor's cubic gain act on signals.
 """
 
@@ -20,6 +20,7 @@ import numpy as np
 from finite_element_beam import Complex, FiniteElementBeam, LockedHubMode, Real, resonance
 from numpy.random import Generator
 from scipy.fft import next_fast_len
+from scipy.linalg import expm
 
 RATE_HZ = 1000.0
 REST_S, SWEEP_S, RECORD_S = 1.0, 120.0, 136.0
@@ -37,7 +38,7 @@ _DECAY = 14.0
 _VISIBLE_HZ = (0.3, 48.0)
 _AIR_KG_M3, DRAG_COEFFICIENT = 1.2, 1.2
 _MARCHED_MODES = 8
-_DRAG_ITERATIONS = 60
+_DRAG_POINTS = 16
 _LOCAL_POINTS = 2000
 
 
@@ -341,6 +342,21 @@ class _Motion:
         found: Real = signal * np.exp(self.sigma * t)
         return found
 
+    def smooth_at_record(self, spectrum: Complex) -> Real:
+        """Signal at `RATE_HZ` of a spectrum without content above half of that."""
+        points = 2 * (spectrum.size - 1) // _FINER
+        signal = np.fft.irfft(spectrum[: points // 2 + 1], points) / _FINER
+        found: Real = signal[: self.count // _FINER]
+        found *= np.exp(self.sigma * np.arange(found.size) / RATE_HZ)
+        return found
+
+    def at_instant(self, spectrum: Complex, time_s: float) -> float:
+        """Value of a spectrum's signal at one time."""
+        points = 2 * (spectrum.size - 1)
+        total = 2 * np.sum((spectrum * np.exp(self.s * time_s)).real) / points
+        ends = (spectrum[[0, -1]] * np.exp(self.s[[0, -1]] * time_s)).real.sum() / points
+        return float(total - ends)
+
     def spectrum(self, signal: Real) -> Complex:
         """Spectrum of a signal that is given on the fine grid."""
         rate_hz = _FINER * RATE_HZ
@@ -367,8 +383,7 @@ def _reference(amplitude_rad: float) -> Real:
 
 def _motion(reference_rad: Real) -> _Motion:
     rate_hz, count = _FINER * RATE_HZ, reference_rad.size
-    points = next_fast_len(2 * count)
-    points += points % 2
+    points = 2 * _FINER * next_fast_len(count // _FINER)
     sigma = _DECAY * rate_hz / points
     s = sigma + 2j * np.pi * np.fft.rfftfreq(points, 1 / rate_hz)
     decay = np.exp(-sigma * np.arange(count) / rate_hz)
@@ -427,7 +442,7 @@ def _true_modes(
         if mode.frequency_hz > 2 * LAST_HZ:
             continue
         channel = complex(defect.channel.response(np.array([mode.pole_rad_s]))[0])
-        part = motion.at_record(
+        part = motion.smooth_at_record(
             motion.angle * resonance(mode, motion.s) * defect.channel.response(motion.s)
         )
         peak = float(np.abs(part).max())
@@ -481,9 +496,11 @@ def _with_step(defect: Defect, motion: _Motion, before_nm: Real) -> Real:
     assert defect.step is not None
     (at_s, change), beam, law = defect.step, defect.beam, defect.damping
     assert law.zeta is not None
+    assert law.alpha == law.lambda_ == 1
     after = _stiffer(defect)
     torque = motion.at_record(motion.angle * after.fast_response(motion.s, after.modes()))
     s, first = motion.s, round(at_s * RATE_HZ)
+    at_s = first / RATE_HZ
     t = np.arange(torque.size - first) / RATE_HZ
     frequencies, shares = beam.shares()
     per_mass = law.gamma * STIFFNESS_N_M2 / DENSITY_KG_PER_M
@@ -493,7 +510,7 @@ def _with_step(defect: Defect, motion: _Motion, before_nm: Real) -> Real:
         for factor in (1.0, 1 + change):
             stiffness = factor * omega**2 * (1 + law.zeta * s)
             deflection = loads / (s**2 + per_mass * s + stiffness)
-            state.append([motion.at_record(deflection * s**k)[first] for k in (0, 1)])
+            state.append([motion.at_instant(deflection * s**k, at_s) for k in (0, 1)])
         deflection, speed = np.array(state[0]) - np.array(state[1])
         square = (1 + change) * omega**2
         damping = (per_mass + square * law.zeta) / 2
@@ -508,54 +525,45 @@ def _with_step(defect: Defect, motion: _Motion, before_nm: Real) -> Real:
 def _drag_torque(defect: Defect, motion: _Motion) -> Real:
     """Torque that the air's drag on a wire adds, ``rho C_D d v |v| / 2`` per length.
 
-    The force is iterated over the whole record: what a linear drag of the usual speed leaves of it
-    acts on the beam with that linear drag, until the speeds repeat themselves to 1e-5.
+    The damping orders are 1. What the drag changes in the modes' motion is marched at `RATE_HZ`,
+    each mode exactly under a force that is constant over a period; the force of the middle of a
+    period is extrapolated from the two ticks before.
     """
     beam, law = defect.beam, defect.damping
+    assert law.zeta is not None
+    assert law.alpha == law.lambda_ == 1
     per_speed = 0.5 * _AIR_KG_M3 * DRAG_COEFFICIENT * defect.drag_m
-    frequencies, shares = beam.shares()
-    omega, shares = frequencies[:_MARCHED_MODES, None], shares[:_MARCHED_MODES, None]
-    position = (np.arange(24) + 0.5) / 24 * LENGTH_M
-    width = LENGTH_M / position.size
+    frequencies, shares = (each[:_MARCHED_MODES] for each in beam.shares())
+    nodes, weights = np.polynomial.legendre.leggauss(_DRAG_POINTS)
+    position, width = 0.5 * LENGTH_M * (nodes + 1), 0.5 * LENGTH_M * weights
     shapes = beam.shapes_at(position)[:_MARCHED_MODES]
-    # A grid of its own, as fine as the record's: nothing is fast here.
-    count = round(RECORD_S * RATE_HZ)
-    points = next_fast_len(2 * count)
-    points += points % 2
-    sigma = _DECAY * RATE_HZ / points
-    s = sigma + 2j * np.pi * np.fft.rfftfreq(points, 1 / RATE_HZ)
-    decay = np.exp(-sigma * np.arange(count) / RATE_HZ)
-    angle = np.fft.rfft(motion.at_record(motion.angle) * decay, points)
-    elastic, medium = law.elastic(s), law.medium(s) / DENSITY_KG_PER_M
-    # Absolute deflection: rigid turn plus modes that follow it.
-    receptance = 1 / (s**2 + medium + omega**2 * elastic)
-    linear = -shares * receptance * (s**2 + medium) * angle
-
-    def speeds(modal: Complex) -> Real:
-        signals = np.fft.irfft(modal * s, points)[:, :count] / decay
-        rigid = np.fft.irfft(angle * s, points)[:count] / decay
-        found: Real = shapes.T @ signals + np.outer(position, rigid)
-        return found
-
-    speed = speeds(linear)
-    typical = per_speed * np.abs(speed[-1]).max()
-    damped = 1 / (s**2 + medium + typical / DENSITY_KG_PER_M * s + omega**2 * elastic)
-    rigid_part = shapes @ position * width * typical
-    modal = linear
-    for _ in range(_DRAG_ITERATIONS):
-        drag = per_speed * np.abs(speed) * speed
-        left = np.fft.rfft((drag - typical * speed) * decay, points)
-        loads = -shares * (s**2 + medium) * angle - (shapes @ left) * width
-        loads -= rigid_part[:, None] * s * angle
-        before, modal = modal, damped * loads
-        speed = speeds(modal)
-        change = np.abs(modal - before).max() / np.abs(modal).max()
-        if change < 1e-5:
-            break
-    else:
-        raise ArithmeticError("the drag of the air does not settle")
-    force = per_speed * np.abs(speed) * speed
-    # The hub feels the change of all inertial and medium forces' moment, and that of the drag.
-    moment = ((modal - linear) * (s**2 + medium) * shares).sum(axis=0)
-    added: Real = np.fft.irfft(moment, points)[:count] / decay + (position * width) @ force
+    s, per_mass = motion.s, law.gamma * STIFFNESS_N_M2 / DENSITY_KG_PER_M
+    stiffness, damping = frequencies**2, per_mass + law.zeta * frequencies**2
+    linear = np.multiply.outer(motion.smooth_at_record(motion.angle * s), position)
+    for i, share in enumerate(shares):
+        deflection = -share * (s**2 + per_mass * s) / (s**2 + damping[i] * s + stiffness[i])
+        speed = motion.smooth_at_record(motion.angle * deflection * s)
+        linear += np.multiply.outer(speed, shapes[i])
+    modes = frequencies.size
+    generator = np.zeros((3 * modes, 3 * modes))
+    place = np.arange(modes)
+    generator[place, modes + place] = 1.0
+    generator[modes + place, place] = -stiffness
+    generator[modes + place, modes + place] = -damping
+    generator[modes + place, 2 * modes + place] = 1.0
+    over_period = expm(generator / RATE_HZ)
+    free = over_period[: 2 * modes, : 2 * modes]
+    pushed = over_period[: 2 * modes, 2 * modes :] @ -(shapes * width)
+    states, forces = np.zeros((len(linear), 2 * modes)), np.zeros_like(linear)
+    state, before = np.zeros(2 * modes), np.zeros(position.size)
+    for i, speed in enumerate(linear):
+        states[i] = state
+        total = speed + state[modes:] @ shapes
+        forces[i] = force = per_speed * np.abs(total) * total
+        state = free @ state + pushed @ (1.5 * force - 0.5 * before)
+        before = force
+    # Moment about the hub: of the modes' inertia and medium, and of the drag itself.
+    deflections, speeds = states[:, :modes], states[:, modes:]
+    accelerations = -stiffness * deflections - damping * speeds - forces @ (shapes * width).T
+    added: Real = (accelerations + per_mass * speeds) @ shares + forces @ (position * width)
     return added

@@ -175,7 +175,11 @@ class FiniteElementBeam:
 
     def __post_init__(self) -> None:
         """Assemble the matrices."""
-        ends = np.unique([0.0, *(x for x in self.jumps_m if 0 < x < self.length_m), self.length_m])
+        jumps = [*self.jumps_m]
+        if self.gravity_m_s2:
+            # The tension jumps at a mass.
+            jumps += [mass.position_m for mass in self.masses]
+        ends = np.unique([0.0, *(x for x in jumps if 0 < x < self.length_m), self.length_m])
         pieces = []
         for start, end in pairwise(ends):
             count = max(2, round(self.elements * (end - start) / self.length_m))
@@ -254,15 +258,19 @@ class FiniteElementBeam:
         return value, slope, i
 
     def _outboard_kg(self, x: Real) -> Real:
-        """Mass between a position and the tip."""
-        total = np.zeros_like(x)
-        for i, at in enumerate(x):
-            inner = [at, *self._nodes[self._nodes > at]]
-            for start, end in pairwise(inner):
-                points = start + _XI * (end - start)
-                total[i] += (end - start) * float(_WEIGHTS @ self.density_kg_per_m(points))
-            total[i] += sum(point.mass_kg for point in self.masses if point.position_m > at)
-        return total
+        """Mass between positions within one element and the tip."""
+        end = self._nodes[np.searchsorted(self._nodes, x[-1])]
+        points = x[:, None] + np.multiply.outer(end - x, _XI)
+        inside = (end - x) * (self.density_kg_per_m(points) @ _WEIGHTS)
+        starts, ends = self._nodes[:-1], self._nodes[1:]
+        beyond = starts >= end - 1e-12
+        points = starts[beyond, None] + np.multiply.outer((ends - starts)[beyond], _XI)
+        distributed = (ends - starts)[beyond] @ (self.density_kg_per_m(points) @ _WEIGHTS)
+        return (
+            inside
+            + distributed
+            + sum(point.mass_kg for point in self.masses if point.position_m >= end - 1e-12)
+        )
 
     @property
     def mass_moment_kg_m(self) -> float:
