@@ -372,10 +372,10 @@ class _Motion:
         return found
 
 
-def _reference(amplitude_rad: float) -> Real:
+def _reference(amplitude_rad: float, seconds: float) -> Real:
     """Return the reference on the fine grid."""
     rate_hz = _FINER * RATE_HZ
-    t = np.arange(round(RECORD_S * rate_hz)) / rate_hz - REST_S
+    t = np.arange(round(seconds * rate_hz)) / rate_hz - REST_S
     slope = (LAST_HZ - FIRST_HZ) / (2 * SWEEP_S)
     chirp = amplitude_rad * np.sin(2 * np.pi * (FIRST_HZ + slope * t) * t)
     return np.where((t >= 0) & (t < SWEEP_S), chirp, 0.0)
@@ -393,11 +393,30 @@ def _motion(reference_rad: Real) -> _Motion:
 
 
 def simulate(
-    seed: int, defect: Defect, amplitude_rad: float, damping_level: float, noise: NoiseSpectrum
+    seed: int,
+    defect: Defect,
+    amplitude_rad: float,
+    damping_level: float,
+    noise: NoiseSpectrum,
+    seconds: float = RECORD_S,
 ) -> DefectRecord:
-    """Return the record of a rig, with the truth about its modes."""
+    """Return the record of a rig, with the truth about its modes.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the noise.
+    defect : Defect
+    amplitude_rad : float
+        Amplitude of the reference.
+    damping_level : float
+        Factor by which the damping was drawn.
+    noise : NoiseSpectrum
+    seconds : float
+        Length of the record; a shorter one ends within the sweep.
+    """
     generator = np.random.Generator(np.random.SFC64(seed))
-    reference = _reference(amplitude_rad)
+    reference = _reference(amplitude_rad, seconds)
     motion, channel = _motion(reference), defect.channel
     s, root = motion.s, motion.angle
     if channel.play_rad:

@@ -58,9 +58,9 @@ _XI = 0.5 * (_NODES + 1)
 _WEIGHTS = 0.5 * _WEIGHTS
 
 
-def _shapes(xi: Real, length: float) -> tuple[Real, Real, Real]:
-    """Hermite functions of an element, their slopes and curvatures, each of shape (n, 4)."""
-    h = length
+def _shapes(xi: Real, length: Real | float) -> tuple[Real, Real, Real]:
+    """Return an element's Hermite functions, slopes and curvatures, four along the last axis."""
+    xi, h = np.broadcast_arrays(xi, length)
     value = np.stack(
         [
             1 - 3 * xi**2 + 2 * xi**3,
@@ -233,12 +233,15 @@ class FiniteElementBeam:
 
     def _integrated(self, profile: Profile, order: int) -> Real:
         """Integral of a profile times a derivative of the shape functions squared."""
-        size = 2 * self._nodes.size
-        matrix = np.zeros((size, size))
-        for i, (start, end) in enumerate(zip(self._nodes[:-1], self._nodes[1:], strict=True)):
-            shape = _shapes(_XI, end - start)[order]
-            weight = _WEIGHTS * (end - start) * profile(start + _XI * (end - start))
-            matrix[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += (shape.T * weight) @ shape
+        starts, lengths = self._nodes[:-1, None], np.diff(self._nodes)[:, None]
+        shape = _shapes(_XI, lengths)[order]
+        weight = _WEIGHTS * lengths * profile(starts + lengths * _XI)
+        blocks = np.einsum("eqi,eq,eqj->eij", shape, weight, shape)
+        matrix = np.zeros((2 * self._nodes.size,) * 2)
+        first = 2 * np.arange(len(blocks))
+        for row, column in np.ndindex(4, 4):
+            # Elements overlap by a node, so that no entry of one row and column occurs twice.
+            matrix[first + row, first + column] += blocks[:, row, column]
         return matrix
 
     def _point(self, point: PointMass) -> Real:
@@ -258,19 +261,18 @@ class FiniteElementBeam:
         return value, slope, i
 
     def _outboard_kg(self, x: Real) -> Real:
-        """Mass between positions within one element and the tip."""
-        end = self._nodes[np.searchsorted(self._nodes, x[-1])]
-        points = x[:, None] + np.multiply.outer(end - x, _XI)
-        inside = (end - x) * (self.density_kg_per_m(points) @ _WEIGHTS)
+        """Mass between the tip and positions, of shape (elements, n) and each in its element."""
         starts, ends = self._nodes[:-1], self._nodes[1:]
-        beyond = starts >= end - 1e-12
-        points = starts[beyond, None] + np.multiply.outer((ends - starts)[beyond], _XI)
-        distributed = (ends - starts)[beyond] @ (self.density_kg_per_m(points) @ _WEIGHTS)
-        return (
-            inside
-            + distributed
-            + sum(point.mass_kg for point in self.masses if point.position_m >= end - 1e-12)
-        )
+        points = starts[:, None] + np.multiply.outer(ends - starts, _XI)
+        elements = (ends - starts) * (self.density_kg_per_m(points) @ _WEIGHTS)
+        beyond = np.append(np.cumsum(elements[::-1])[-2::-1], 0.0)
+        beyond += [
+            sum(point.mass_kg for point in self.masses if point.position_m >= end - 1e-12)
+            for end in ends
+        ]
+        left = ends[:, None] - x
+        inside = self.density_kg_per_m(x[..., None] + left[..., None] * _XI) @ _WEIGHTS
+        return beyond[:, None] + left * inside
 
     @property
     def mass_moment_kg_m(self) -> float:

@@ -96,7 +96,6 @@ def test_the_response_from_poles_is_that_of_the_elements():
 
 @pytest.mark.parametrize("ratio", [0.01, 0.2, 1.0])
 def test_a_tip_mass_lowers_the_frequencies_as_the_frequency_equation_has_it(ratio: float):
-    # D. J. Inman, Engineering Vibration, table 6.4: cantilever with a mass at its end.
     masses = (PointMass(LENGTH_M, ratio * MASS_KG),)
     for omega in undamped(masses=masses)[:4]:
         z = np.sqrt(omega)
