@@ -33,7 +33,6 @@ from defect_records import (
     DENSITY_KG_PER_M,
     LENGTH_M,
     RATE_HZ,
-    RECORD_S,
     REST_S,
     STIFFNESS_N_M2,
     SWEEP_S,
@@ -79,7 +78,9 @@ def write_record(made: DefectRecord, path: Path) -> None:
     path : Path
         New file.
     """
-    first, last, end = (round(t * RATE_HZ) for t in (REST_S, REST_S + SWEEP_S, RECORD_S))
+    end = made.torque_nm.size
+    first, last = (min(round(t * RATE_HZ), end) for t in (REST_S, REST_S + SWEEP_S))
+    segments = {"rest": (0, first), "sweep": (first, last), "ring_down": (last, end)}
     write_session(
         path,
         {
@@ -91,7 +92,7 @@ def write_record(made: DefectRecord, path: Path) -> None:
         rate_hz=RATE_HZ,
         start_utc_ns=0,
         metadata=_STATED,
-        segments={"rest": (0, first), "sweep": (first, last), "ring_down": (last, end)},
+        segments={name: ends for name, ends in segments.items() if ends[0] < ends[1]},
         warnings=(),
     )
 
