@@ -426,20 +426,16 @@ def _noise(generator: Generator) -> NoiseSpectrum:
     return NoiseSpectrum(corner_hz=corner_hz, bumps=bumps)
 
 
-def heavier_half(seed: int = 1) -> DefectRecord:
-    """Make the record of a beam whose outer half is 3 % heavier."""
-    law = DampingLaw(7.1e-5, 0.996, 0.055, 0.594)
-    middle = LENGTH_M / 2
+def heavier_half() -> Defect:
+    """Return the rig whose beam is 3 % heavier in its outer half."""
+    law, middle = DampingLaw(7.1e-5, 0.996, 0.055, 0.594), LENGTH_M / 2
     density = scaled_sections(DENSITY_KG_PER_M, np.array([middle]), np.array([1.0, 1.03]))
     beam = make_beam(law, density_kg_per_m=density, jumps_m=(middle,))
-    defect = Defect("mass, sections", {"outer_half": 1.03}, True, law, beam, effects=_UNEVEN)
-    return simulate(seed, defect, 0.025, 1.0, NoiseSpectrum())
+    return Defect("mass, sections", {"outer_half": 1.03}, True, law, beam, effects=_UNEVEN)
 
 
-def tilted_axis(seed: int = 1) -> DefectRecord:
-    """Make the record of a beam that hangs from an axis 2 degrees off the vertical."""
+def tilted_axis() -> Defect:
+    """Return the rig whose beam hangs from an axis 2 degrees off the vertical."""
     law = DampingLaw(7.1e-5, 0.92, 0.055, 0.55)
-    inclined = _GRAVITY_M_S2 * float(np.sin(np.radians(2)))
-    beam = make_beam(law, gravity_m_s2=inclined)
-    defect = Defect("tilt", {"degrees": 2.0}, True, law, beam, effects=(*_UNEVEN, "tilt"))
-    return simulate(seed, defect, 0.025, 1.0, NoiseSpectrum())
+    beam = make_beam(law, gravity_m_s2=_GRAVITY_M_S2 * float(np.sin(np.radians(2))))
+    return Defect("tilt", {"degrees": 2.0}, True, law, beam, effects=(*_UNEVEN, "tilt"))

@@ -18,7 +18,7 @@ from defect_records import (
     TorqueChannel,
     simulate,
 )
-from independent_records import Truth, exact
+from independent_records import LENGTH_M, Truth, characteristic, exact
 from numpy.typing import NDArray
 from random_defects import (
     AMPLITUDES_RAD,
@@ -28,7 +28,9 @@ from random_defects import (
     LINEAR,
     OTHER,
     draw_defect,
+    heavier_half,
     make_beam,
+    tilted_axis,
 )
 
 Real = NDArray[np.float64]
@@ -211,6 +213,28 @@ def test_truths_are_ranges_where_a_property_varies():
     relaxing, *_ = draw_defect(3, "relaxations")
     assert "zeta" not in relaxing.ranges()
     assert relaxing.ranges()["alpha"][0] <= relaxing.ranges()["alpha"][1] <= 1.0
+
+
+def shape(number: int, xi: Real) -> Real:
+    """Clamped-free eigenfunction."""
+    z = characteristic(number)
+    share = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
+    return np.cosh(z * xi) - np.cos(z * xi) - share * (np.sinh(z * xi) - np.sin(z * xi))
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_small_defects_shift_frequencies_as_rayleigh_has_it(number: int):
+    xi = np.linspace(0, 1, 20_001)
+    y = shape(number, xi)
+    plain = RIG.beam.undamped()[0][number - 1] ** 2
+    share = np.trapezoid(np.where(xi > 0.5, y**2, 0.0), xi) / np.trapezoid(y**2, xi)
+    heavier = heavier_half().beam.undamped()[0][number - 1] ** 2
+    assert heavier / plain == pytest.approx(1 / (1 + 0.03 * share), abs=3e-4)
+    slope = np.gradient(y, xi)
+    tension = 9.81 * np.sin(np.radians(2)) / LENGTH_M * (1 - xi)
+    stiffer = np.trapezoid(tension * slope**2, xi) / np.trapezoid(y**2, xi)
+    hanging = tilted_axis().beam.undamped()[0][number - 1] ** 2
+    assert hanging - plain == pytest.approx(stiffer, rel=0.01)
 
 
 def test_a_truth_is_a_json_document(plain: DefectRecord):
