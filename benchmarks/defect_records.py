@@ -14,6 +14,7 @@ Play, friction and the sensor's cubic gain act on signals.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -197,7 +198,7 @@ class Defect:
     Attributes
     ----------
     kind : str
-    size : dict
+    size : mapping
         What was drawn, for people.
     linear_constant : bool
     damping : DampingLaw
@@ -216,7 +217,7 @@ class Defect:
     """
 
     kind: str
-    size: dict[str, object]
+    size: Mapping[str, object]
     linear_constant: bool
     damping: DampingLaw
     beam: FiniteElementBeam
@@ -291,7 +292,7 @@ class DefectRecord:
         return {
             "seed": self.seed,
             "kind": self.defect.kind,
-            "size": self.defect.size,
+            "size": dict(self.defect.size),
             "linear_constant": self.defect.linear_constant,
             "amplitude_rad": self.amplitude_rad,
             "damping_level": self.damping_level,
@@ -326,7 +327,7 @@ class DefectRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class _Motion:
+class _ShaftMotion:
     """A shaft's motion on the shifted line."""
 
     s: Complex
@@ -381,7 +382,7 @@ def _reference(amplitude_rad: float, seconds: float) -> Real:
     return np.where((t >= 0) & (t < SWEEP_S), chirp, 0.0)
 
 
-def _motion(reference_rad: Real) -> _Motion:
+def _motion(reference_rad: Real) -> _ShaftMotion:
     rate_hz, count = _FINER * RATE_HZ, reference_rad.size
     points = 2 * _FINER * next_fast_len(count // _FINER)
     sigma = _DECAY * rate_hz / points
@@ -389,7 +390,7 @@ def _motion(reference_rad: Real) -> _Motion:
     decay = np.exp(-sigma * np.arange(count) / rate_hz)
     angle = np.fft.rfft(reference_rad * decay, points)
     angle /= 1 + 1.4 * s / _LOOP_RAD_S + (s / _LOOP_RAD_S) ** 2
-    return _Motion(s, float(sigma), count, angle)
+    return _ShaftMotion(s, float(sigma), count, angle)
 
 
 def simulate(
@@ -450,7 +451,7 @@ def simulate(
 
 
 def _true_modes(
-    defect: Defect, modes: list[LockedHubMode], motion: _Motion, noise: NoiseSpectrum
+    defect: Defect, modes: list[LockedHubMode], motion: _ShaftMotion, noise: NoiseSpectrum
 ) -> tuple[TrueMode, ...]:
     """Constants of the modes that the sweep comes near, and whether each is visible."""
     later: dict[int, LockedHubMode] = {}
@@ -505,7 +506,7 @@ def _stiffer(defect: Defect) -> FiniteElementBeam:
     )
 
 
-def _with_step(defect: Defect, motion: _Motion, before_nm: Real) -> Real:
+def _with_step(defect: Defect, motion: _ShaftMotion, before_nm: Real) -> Real:
     """Change the stiffness at an instant, with deflection and speed of each mode conserved.
 
     The damping orders are 1, so that these are the whole state. A mode of the uniform beam moves by
@@ -541,7 +542,7 @@ def _with_step(defect: Defect, motion: _Motion, before_nm: Real) -> Real:
     return np.concatenate([before_nm[:first], torque[first:]])
 
 
-def _drag_torque(defect: Defect, motion: _Motion) -> Real:
+def _drag_torque(defect: Defect, motion: _ShaftMotion) -> Real:
     """Torque that the air's drag on a wire adds, ``rho C_D d v |v| / 2`` per length.
 
     The damping orders are 1. What the drag changes in the modes' motion is marched at `RATE_HZ`,
