@@ -1,0 +1,524 @@
+"""Scores of the analyzer's document against the truth about a rig with a defect.
+
+The truth is the document of `DefectRecord.truth`, the judged document is an object of `headlines`
+as ``analyze --json`` prints it. Nothing else of the analyzer is used. A number is compared with the
+range of true values (`Defect.ranges`): inside of it the error is 0, outside it is the distance to
+the nearer end over the standard deviation that the 95 % interval implies on that side.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from statistics import median
+from typing import Any, Literal
+
+Range = tuple[float, float]
+Document = dict[str, Any]
+
+FAR = 4.0
+"""Standard deviations from which a number without a flag counts as wrong."""
+DECIDED_ORDERS = ("compatible", "fractional")
+"""Statuses of an order that state its interval as a fact."""
+MATCHED = 0.1
+"""Relative difference of frequency within which a mode is taken for a true one."""
+LONGEST_S = 10.0
+"""Most processor time of a judgement."""
+
+_NORMAL_95 = 1.959963984540054
+_STATED_OVER = 4.7e-3 / 0.090275
+_STATED_STIFFNESS = 0.090275
+_OF_EFFECT = {
+    "delay": "delay_s",
+    "tool inertia": "tool_inertia_kg_m2",
+    "tip mass": "tip_mass_kg",
+    "elastic clamp": "root_nm_per_rad",
+    "air drag": "drag_m",
+}
+"""True value that a named effect's size is compared with."""
+
+Group = Literal["mode", "parameter", "size", "exact geometry"]
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredNumber:
+    """A number of the document, and the range of true values.
+
+    Attributes
+    ----------
+    name : str
+    group : str
+    truth : tuple of float
+    value : float
+    interval : tuple of float or None
+        95 %.
+    flag : str or None
+    """
+
+    name: str
+    group: Group
+    truth: Range
+    value: float
+    interval: Range | None
+    flag: str | None
+
+    @property
+    def single(self) -> bool:
+        """Whether there is one true value."""
+        return self.truth[0] == self.truth[1]
+
+    @property
+    def inside(self) -> bool:
+        """Whether the interval holds a true value."""
+        return (
+            self.interval is not None
+            and self.interval[0] <= self.truth[1]
+            and self.truth[0] <= self.interval[1]
+        )
+
+    @property
+    def deviation(self) -> float:
+        """Distance to the true values in standard deviations; 0 without an interval."""
+        return _deviation(self.value, self.interval, self.truth)
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredDefect:
+    """Everything that one record's document stated, compared with the truth.
+
+    Attributes
+    ----------
+    seed : int
+    kind : str
+    linear_constant : bool
+    coloured : bool
+        Whether the noise is.
+    cpu_s : float
+        Processor time of the judgement.
+    type : str
+        Structure that the headline is of.
+    numbers : tuple of ScoredNumber
+    not_given : tuple of int
+        Visible modes without an entry that has no flag.
+    visible : int
+        Count of visible modes.
+    false_facts : tuple of str
+    gate : str or None
+        Status of the test whether a uniform beam predicts the modes; None if there is none.
+    gate_p : float or None
+    shift : float or None
+        By how many standard deviations the defect shifts what a uniform beam would give.
+    error : str or None
+        Why there is no document.
+    """
+
+    seed: int
+    kind: str
+    linear_constant: bool
+    coloured: bool
+    cpu_s: float
+    type: str = ""
+    numbers: tuple[ScoredNumber, ...] = ()
+    not_given: tuple[int, ...] = ()
+    visible: int = 0
+    false_facts: tuple[str, ...] = ()
+    gate: str | None = None
+    gate_p: float | None = None
+    shift: float | None = None
+    error: str | None = None
+
+    @classmethod
+    def from_line(cls, line: str) -> ScoredDefect:
+        """Read what `line` wrote."""
+        fields = json.loads(line)
+        numbers = tuple(
+            ScoredNumber(
+                **{
+                    **each,
+                    "truth": tuple(each["truth"]),
+                    "interval": each["interval"] and tuple(each["interval"]),
+                }
+            )
+            for each in fields.pop("numbers")
+        )
+        lists = {name: tuple(fields.pop(name)) for name in ("not_given", "false_facts")}
+        return cls(**fields, **lists, numbers=numbers)
+
+    def line(self) -> str:
+        """Write as one line of JSON."""
+        return json.dumps(asdict(self))
+
+    @property
+    def wrong(self) -> tuple[ScoredNumber, ...]:
+        """Numbers without a flag that are far from the truth."""
+        return tuple(
+            each
+            for each in self.numbers
+            if each.flag is None and each.group != "exact geometry" and each.deviation > FAR
+        )
+
+    @property
+    def moved(self) -> bool:
+        """Whether the defect moves what a uniform beam would give by more than its deviation.
+
+        Without a shift (rigs that are not linear and constant): a number for exact geometry is
+        three standard deviations off, which noise alone seldom does.
+        """
+        if self.shift is not None:
+            return self.shift > 1
+        narrow = [each for each in self.numbers if each.group == "exact geometry"]
+        return any(each.deviation > 3 for each in narrow)
+
+    @property
+    def modes(self) -> tuple[ScoredNumber, ...]:
+        """Frequencies and damping ratios without a flag."""
+        return tuple(each for each in self.numbers if each.group == "mode" and each.flag is None)
+
+
+def score_document(truth: Document, headline: Document, cpu_s: float) -> ScoredDefect:
+    """Compare a headline with the truth.
+
+    Parameters
+    ----------
+    truth : dict
+    headline : dict
+    cpu_s : float
+    """
+    ranges = {name: (low, high) for name, (low, high) in truth["ranges"].items()}
+    modes, not_given = _scored_modes(truth, headline)
+    validity = headline.get("validity", {}).get("uniform_beam") or {}
+    exact = headline.get("exact_geometry") or {}
+    narrow, _ = _scored_modes(truth, exact)
+    return ScoredDefect(
+        seed=truth["seed"],
+        kind=truth["kind"],
+        linear_constant=truth["linear_constant"],
+        coloured=bool(truth["noise"]["corner_hz"] or truth["noise"]["bumps"]),
+        cpu_s=round(cpu_s, 3),
+        type=headline["type"],
+        numbers=(
+            *modes,
+            *_scored_parameters("parameter", headline["parameters"], ranges),
+            *_scored_sizes(headline["sizes"], truth),
+            *_scored_parameters("exact geometry", exact.get("parameters", {}), ranges),
+            *(replace(each, group="exact geometry") for each in narrow),
+        ),
+        not_given=not_given,
+        visible=sum(mode["visible"] for mode in truth["modes"]),
+        false_facts=(
+            *_false_orders(headline["orders"], truth, ranges),
+            *_false_effects(headline["named"], truth, ranges),
+            *_false_exclusions(headline, truth),
+        ),
+        gate=validity.get("status"),
+        gate_p=validity.get("p_value"),
+    )
+
+
+def _scored(name: str, group: Group, entry: Document, truth: Range) -> ScoredNumber:
+    ends = entry.get("interval_95")
+    known = None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
+    value = entry["value"]
+    if value is None:
+        return ScoredNumber(name, group, truth, math.nan, None, entry.get("flag") or "no value")
+    return ScoredNumber(name, group, truth, float(value), known, entry.get("flag"))
+
+
+def _scored_modes(
+    truth: Document, headline: Document
+) -> tuple[list[ScoredNumber], tuple[int, ...]]:
+    """Match modes by frequency; a mode is given if neither of its numbers has a flag."""
+    numbers, given = [], set()
+    for entry in headline.get("modes", ()):
+        frequency = entry["frequency_hz"]
+        if frequency["value"] is None:
+            continue
+        matched = _nearest(truth["modes"], entry["mode"], frequency["value"])
+        if matched is None:
+            continue
+        pair = []
+        for key, short in (("frequency_hz", "f"), ("damping_ratio", "xi")):
+            before, after = matched[key], matched[f"later_{key}"]
+            if before is None:
+                continue
+            ends = (before, before if after is None else after)
+            name = f"{short}{matched['mode']}"
+            pair.append(_scored(name, "mode", entry[key], (min(ends), max(ends))))
+        numbers += pair
+        flags = [entry[key].get("flag") for key in ("frequency_hz", "damping_ratio")]
+        if not any(flags) and all(each.interval is not None for each in pair):
+            given.add(matched["mode"])
+    visible = (mode["mode"] for mode in truth["modes"] if mode["visible"])
+    return numbers, tuple(number for number in visible if number not in given)
+
+
+def _nearest(modes: Iterable[Document], number: int, frequency_hz: float) -> Document | None:
+    """Find the true mode of nearest frequency; by number where the rig has no frequency."""
+    best, distance = None, MATCHED
+    for mode in modes:
+        if mode["frequency_hz"] is None:
+            if mode["mode"] == number:
+                return mode
+            continue
+        off = abs(frequency_hz / mode["frequency_hz"] - 1)
+        if off < distance:
+            best, distance = mode, off
+    return best
+
+
+def _scored_parameters(
+    group: Group, entries: Document, ranges: dict[str, Range]
+) -> list[ScoredNumber]:
+    return [
+        _scored(name, group, entry, ranges[name])
+        for name, entry in entries.items()
+        if name in ranges
+    ]
+
+
+def _scored_sizes(entries: Iterable[Document], truth: Document) -> list[ScoredNumber]:
+    """Compare losses at their pivots with those of laws that have a single coefficient."""
+    law, ranges = truth["law"], truth["ranges"]
+    numbers = []
+    for entry in entries:
+        omega = entry["omega_rad_s"]
+        internal = entry["damping"] == "internal"
+        names = ("zeta", "alpha") if internal else ("gamma", "lambda", "density_over_stiffness")
+        if omega is None or any(
+            name not in ranges or ranges[name][0] != ranges[name][1] for name in names
+        ):
+            continue
+        coefficient, order = law[names[0]], law[names[1]]
+        lost = coefficient * omega**order * math.sin(order * math.pi / 2)
+        if not internal:
+            lost /= _STATED_OVER * omega**2
+        numbers.append(_scored(f"{entry['damping']} size", "size", entry, (lost, lost)))
+    return numbers
+
+
+def _deviation(value: float, interval: Range | None, truth: Range) -> float:
+    if interval is None or truth[0] <= value <= truth[1]:
+        return 0.0
+    distance, half = (
+        (truth[0] - value, interval[1] - value)
+        if value < truth[0]
+        else (value - truth[1], value - interval[0])
+    )
+    return distance * _NORMAL_95 / half if half > 0 else math.inf
+
+
+def _false_orders(entries: Document, truth: Document, ranges: dict[str, Range]) -> list[str]:
+    """List orders stated as facts that are not so."""
+    found = []
+    for order, entry in entries.items():
+        status, interval = entry["status"], entry["interval_95"]
+        if status not in DECIDED_ORDERS or interval is None or None in interval:
+            continue
+        low, high = interval
+        true = ranges.get(order)
+        relaxing = order == "alpha" and bool(truth["law"]["relaxations"])
+        if status == "fractional" and (relaxing or (true and true[0] <= 1 <= true[1])):
+            found.append(f"{order} fractional ({low:.3f} to {high:.3f})")
+        elif true and _deviation((low + high) / 2, (low, high), true) > FAR:
+            found.append(f"{order} {low:.3f} to {high:.3f}, true {true[0]:.3f} to {true[1]:.3f}")
+    return found
+
+
+def _false_effects(
+    entries: Iterable[Document], truth: Document, ranges: dict[str, Range]
+) -> list[str]:
+    """List effects stated with an interval that the rig does not have, or not of that size."""
+    found = []
+    for entry in entries:
+        what, value, interval = entry["what"], entry["value"], entry["interval_95"]
+        if interval is None or value is None or None in interval:
+            continue
+        true = _true_size(entry, ranges)
+        if true is not None:
+            if what in truth["effects"] and what != "tip mass":
+                # Its size is an idealisation: that it is there is what counts.
+                continue
+            if _deviation(value, (interval[0], interval[1]), true) > FAR:
+                found.append(f"{what} {value:.4g}, true {true[0]:.4g} to {true[1]:.4g}")
+        elif what not in truth["effects"]:
+            found.append(f"{what} {value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})")
+    return found
+
+
+def _true_size(entry: Document, ranges: dict[str, Range]) -> Range | None:
+    if entry["what"] != "beam data":
+        return ranges.get(_OF_EFFECT.get(entry["what"], ""))
+    over = "rho/EI" in entry["sentence"]
+    name = "density_over_stiffness" if over else "bending_stiffness_n_m2"
+    stated = _STATED_OVER if over else _STATED_STIFFNESS
+    low, high = ranges[name]
+    return low / stated - 1, high / stated - 1
+
+
+def _false_exclusions(headline: Document, truth: Document) -> list[str]:
+    """List structures said to be excluded though a uniform beam is a case of them."""
+    if truth["kind"] != "none":
+        return []
+    law = truth["law"]
+    contains = ["VI"]
+    if law["alpha"] == 1:
+        contains.append("VII")
+        if law["lambda"] == 1:
+            contains.append("III")
+    status = {each["type"]: each["status"] for each in headline.get("structures", ())}
+    return [f"type {name} excluded" for name in contains if status.get(name) == "excluded"]
+
+
+# -------------------------------------------------------------------------------- totals
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """Counts over records.
+
+    Attributes
+    ----------
+    records : int
+    wrong : int
+        Records with a number without a flag beyond `FAR` standard deviations.
+    false : int
+        Records with a false fact.
+    linear : int
+        Linear, constant rigs.
+    not_given : int
+        Of these, those of which a visible mode is missing or has a flag.
+    inside, intervals : int
+        Intervals of their modes that hold the truth, of how many.
+    wrong_modes : int
+        Numbers of their modes beyond `FAR`.
+    refused, passed, tested : int
+        Records by the gate's status.
+    median_s, most_s : float
+    """
+
+    records: int
+    wrong: int
+    false: int
+    linear: int
+    not_given: int
+    inside: int
+    intervals: int
+    wrong_modes: int
+    refused: int
+    passed: int
+    tested: int
+    median_s: float
+    most_s: float
+
+
+def totals(records: Sequence[ScoredDefect]) -> Totals:
+    """Count over records; those without a document count as records whose modes are missing."""
+    linear = [each for each in records if each.linear_constant]
+    modes = [number for each in linear for number in each.modes if number.single]
+    times = [each.cpu_s for each in records if each.error is None] or [0.0]
+    return Totals(
+        records=len(records),
+        wrong=sum(bool(each.wrong) for each in records),
+        false=sum(bool(each.false_facts) for each in records),
+        linear=len(linear),
+        not_given=sum(bool(each.not_given) or each.error is not None for each in linear),
+        inside=sum(number.inside for number in modes),
+        intervals=len(modes),
+        wrong_modes=sum(number.deviation > FAR for number in modes),
+        refused=sum(each.gate == "refused" for each in records),
+        passed=sum(each.gate == "passed" for each in records),
+        tested=sum(each.gate in ("refused", "passed") for each in records),
+        median_s=median(times),
+        most_s=max(times),
+    )
+
+
+def table(records: Sequence[ScoredDefect]) -> str:
+    """Write a table in Markdown: a row a kind, and a total."""
+    heads = (
+        "kind", "records", "beyond 4 std", "false fact", "a mode not given",
+        "modes inside 95 %", "modes beyond 4 std", "gate refused", "median s", "most s",
+    )  # fmt: skip
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    kinds = dict.fromkeys(each.kind for each in records)
+    groups: list[tuple[str, Sequence[ScoredDefect]]] = [
+        (kind, [each for each in records if each.kind == kind]) for kind in sorted(kinds)
+    ]
+    for name, group in (*groups, ("**all**", records)):
+        its = totals(group)
+        cells = (
+            name,
+            its.records,
+            its.wrong,
+            its.false,
+            f"{its.not_given} of {its.linear}" if its.linear else "–",
+            f"{its.inside} of {its.intervals}" if its.intervals else "–",
+            its.wrong_modes if its.linear else "–",
+            f"{its.refused} of {its.tested}" if its.tested else "–",
+            f"{its.median_s:.2f}",
+            f"{its.most_s:.2f}",
+        )
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def coverage(records: Sequence[ScoredDefect]) -> str:
+    """Write how many 95 % intervals of each quantity hold the truth, on linear constant rigs."""
+    lines = []
+    for title, chosen in (
+        ("controls", [each for each in records if each.kind == "none"]),
+        ("linear, constant defects", [
+            each for each in records if each.linear_constant and each.kind != "none"
+        ]),
+    ):  # fmt: skip
+        numbers = [number for each in chosen for number in each.numbers if number.single]
+        for group, name in dict.fromkeys((number.group, number.name) for number in numbers):
+            its = [
+                each for each in numbers
+                if (each.group, each.name) == (group, name) and each.interval is not None
+            ]  # fmt: skip
+            facts = [each for each in its if each.flag is None]
+            flagged = [each for each in its if each.flag is not None]
+            lines.append(
+                f"    {title}, {group} {name}: {sum(each.inside for each in facts)} of "
+                f"{len(facts)}, worst {max((e.deviation for e in facts), default=0.0):.1f} std; "
+                f"flagged {sum(each.inside for each in flagged)} of {len(flagged)}"
+            )
+    return "\n".join(lines)
+
+
+def complaints(records: Sequence[ScoredDefect]) -> list[str]:
+    """List the limits that records exceed; of a few records one may be beyond each."""
+    its = totals(records)
+    controls = totals([each for each in records if each.kind == "none"])
+    moving = [
+        each for each in records
+        if each.kind != "none" and each.gate in ("refused", "passed")
+        and each.moved
+    ]  # fmt: skip
+    passed = sum(each.gate == "passed" for each in moving)
+    limits = (
+        ("records with a number beyond 4 std and no flag", its.wrong, 0.05 * its.records),
+        ("records with a false fact", its.false, 0.02 * its.records),
+        ("uniform beams refused by the gate", controls.refused, controls.tested / 30),
+        ("defects that move a headline by 1 std and pass the gate", passed, 0.05 * len(moving)),
+    )
+    found = [
+        f"{what}: {count}, at most {limit:.3g}"
+        for what, count, limit in limits
+        if count > math.ceil(limit)
+    ]
+    if its.not_given:
+        found.append(f"linear rigs of which a visible mode is not given: {its.not_given}, none")
+    if its.wrong_modes:
+        found.append(f"modes of linear rigs beyond 4 std: {its.wrong_modes}, none")
+    if its.inside < math.floor(0.93 * its.intervals):
+        found.append(f"modes of linear rigs inside: {its.inside} of {its.intervals}, 93 %")
+    if its.most_s > LONGEST_S:
+        found.append(f"longest judgement: {its.most_s:.1f} s of processor, {LONGEST_S:g} s")
+    errors = [each.seed for each in records if each.error is not None]
+    if errors:
+        found.append(f"records without a result: seeds {errors}")
+    return found

@@ -1,0 +1,94 @@
+"""The benchmark of random defects goes on where it ended, and judges what the program prints."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import bench_random_defects
+import pytest
+from bench_random_defects import DefectTask, judge, judged_text, main, write_record
+from defect_scores import ScoredDefect, score_document
+from random_defects import draw
+
+RIGHT = ScoredDefect(1, "none", True, False, 1.0, type="VI", gate="passed", gate_p=0.5)
+
+
+@pytest.fixture
+def judged(monkeypatch: pytest.MonkeyPatch) -> list[DefectTask]:
+    """Judge nothing, but collect the tasks."""
+    tasks = []
+
+    def instead(task: DefectTask) -> ScoredDefect:
+        tasks.append(task)
+        error = "ValueError: no record" if task.seed == 13 else None
+        return replace(RIGHT, seed=task.seed, kind=task.kind or "none", error=error)
+
+    monkeypatch.setattr(bench_random_defects, "judge", instead)
+    return tasks
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["bench_random_defects.py", *map(str, options)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return int(end.value.code or 0)
+
+
+def test_it_goes_on_where_it_ended(
+    judged: list[DefectTask],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    file = tmp_path / "scores.jsonl"
+    assert run(monkeypatch, "--records", 2, "--first-seed", 5, "--file", file) == 0
+    assert run(monkeypatch, "--records", 4, "--first-seed", 5, "--file", file) == 0
+    assert [task.seed for task in judged] == [5, 6, 7, 8]
+    assert [json.loads(line)["seed"] for line in file.read_text().splitlines()] == [5, 6, 7, 8]
+    assert "| **all** | 4 |" in capsys.readouterr().out
+
+
+def test_kinds_are_drawn_in_turn(judged: list[DefectTask], monkeypatch: pytest.MonkeyPatch):
+    run(monkeypatch, "--records", 5, "--kinds", "tilt", "mass, ")
+    kinds = ["mass, sections", "mass, smooth", "tilt"]
+    assert [task.kind for task in judged] == [*kinds, *kinds[:2]]
+    run(monkeypatch, "--records", 1)
+    assert judged[-1].kind is None
+    assert judged[-1].seed == 100_000
+
+
+def test_a_record_without_a_result_counts_and_ends_nothing(
+    judged: list[DefectTask],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    assert run(monkeypatch, "--records", 2, "--first-seed", 13) == 1
+    assert len(judged) == 2
+    said = capsys.readouterr().out
+    assert "records without a result: seeds [13]" in said
+    assert "ValueError: no record" in said
+
+
+def test_a_record_is_judged_from_the_document(tmp_path: Path):
+    found = judge(DefectTask(0, "none", command_line=False, documents=tmp_path))
+    assert found.error is None
+    assert (found.kind, found.visible) == ("none", 3)
+    assert found.cpu_s > 0
+    assert {"f1", "xi1", "f3", "alpha"} <= {number.name for number in found.numbers}
+    assert not found.wrong
+    assert not found.false_facts
+    assert found.shift == pytest.approx(0, abs=0.2)
+    (headline,) = json.loads((tmp_path / "0-none.json").read_text())["headlines"]
+    truth = json.loads((tmp_path / "0-none.truth.json").read_text())
+    assert score_document(truth, headline, found.cpu_s).numbers == found.numbers
+
+
+@pytest.mark.further  # as `make bench`
+def test_the_program_prints_the_same_document(tmp_path: Path):
+    write_record(draw(0, "none"), tmp_path / "record.mcap")
+    here, there = (
+        json.loads(judged_text(tmp_path / "record.mcap", command_line=command_line)[0])
+        for command_line in (False, True)
+    )
+    assert here == there
