@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import Pole
+from analysis.identify._free_decay import Pole, mode_poles
 from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
 from analysis.identify._noise import smooth_power
 from analysis.identify._residual_tests import input_relation, whiteness
@@ -206,7 +206,7 @@ class _Search:
 
     def problem(self) -> _Problem:
         """Residual of these modes under this noise."""
-        return _Problem(self.comparison, self.noise.weight, self.further)
+        return _Problem(self.comparison, self.noise.weight, self.further, self.numbers)
 
     def descended(self) -> _Search:
         """Descend under this noise."""
@@ -342,6 +342,11 @@ def _unit_pole(eta: float) -> complex:
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
+def _unit_pole_slope(eta: float) -> complex:
+    """Differentiate `_unit_pole` by eta."""
+    return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
+
+
 class _Problem:
     """Whitened residual of a number of modes over their frequencies and damping."""
 
@@ -350,7 +355,9 @@ class _Problem:
         comparison: Comparison,
         weight: NDArray[np.float64],
         further: NDArray[np.complex128],
+        numbers: tuple[int, ...],
     ) -> None:
+        self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
         self._further = further
@@ -367,13 +374,35 @@ class _Problem:
         comparison = self._comparison
         return self._white(comparison.spectrum(comparison.prediction.in_time(responses)))
 
-    def _nuisance(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        none = np.zeros(0, dtype=np.complex128)
-        poles = [
-            Pole(number, math.exp(log_omega) * _unit_pole(eta), none)
-            for number, (log_omega, eta) in enumerate(x.reshape(-1, 2), start=1)
-        ]
+    def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
+        """Poles at a point, differentiated by it."""
+        poles = []
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            omega, q = math.exp(log_omega), _unit_pole(eta)
+            derivative = np.zeros(x.size, dtype=np.complex128)
+            derivative[2 * k] = omega * q
+            derivative[2 * k + 1] = omega * _unit_pole_slope(eta)
+            poles.append(Pole(self._numbers[k], omega * q, derivative))
+        return poles
+
+    def _nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         return np.concatenate([self._comparison.nuisance(poles), self._further])
+
+    def _drag(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Change of the torque by drag with the poles, and its derivatives, shape (1 + k, K)."""
+        total = np.zeros((1 + 2 * len(poles), self._weight.size), dtype=np.complex128)
+        drag = self._comparison.drag
+        if drag is None:
+            return total
+        own = {pole.mode: pole.at_rad_s for pole in mode_poles(drag.plant, len(drag.by_pole), ())}
+        for pole in poles:
+            if pole.mode in drag.by_pole and pole.mode in own:
+                by_real, by_imaginary = drag.by_pole[pole.mode]
+                apart = pole.at_rad_s - own[pole.mode]
+                total[0] += apart.real * by_real + apart.imag * by_imaginary
+                total[1:] += np.outer(pole.derivative.real, by_real)
+                total[1:] += np.outer(pole.derivative.imag, by_imaginary)
+        return total
 
     def at(self, x: NDArray[np.float64]) -> _Point:
         """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``."""
@@ -392,7 +421,9 @@ class _Problem:
                 slopes.append(-row * q * over)
         count = len(rows)
         spectra = self._spectra(np.array(rows + slopes).reshape(-1, self._s.size))
-        nuisance = self._white(self._nuisance(x))
+        poles = self._poles(x)
+        nuisance = self._white(self._nuisance(poles))
+        drag, *by_drag = self._white(self._drag(poles))
         columns = np.concatenate([spectra[:count], self._background, nuisance])
         scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
         scale[scale == 0] = 1.0  # a decay that is over at once
@@ -401,15 +432,19 @@ class _Problem:
         gram[np.diag_indices_from(gram)] += 1e-13
         factor = np.linalg.cholesky(gram)
         solved = np.linalg.solve(factor, scaled)  # orthonormal rows
-        along = solved @ self._measured
-        residual = along @ solved - self._measured
+        measured = self._measured - drag
+        along = solved @ measured
+        residual = along @ solved - measured
         linear = np.linalg.solve(factor.T, along) / scale
-        jacobian = np.empty((x.size, residual.size))
+        decays = linear[count + BACKGROUND :]
+        jacobian = np.array(by_drag).reshape(x.size, -1)
+        if poles:
+            jacobian += self._white(self._comparison.decay_gradient(poles, decays))
         for k in range(len(modes)):
             a, b = linear[2 * k : 2 * k + 2]
             four = spectra[count + 4 * k : count + 4 * k + 4]
-            jacobian[2 * k] = a * four[0] + b * four[2]
-            jacobian[2 * k + 1] = a * four[1] + b * four[3]
+            jacobian[2 * k] += a * four[0] + b * four[2]
+            jacobian[2 * k + 1] += a * four[1] + b * four[3]
         projected = jacobian - (jacobian @ solved.T) @ solved
         return _Point(residual, linear, columns, solved, jacobian, projected)
 
@@ -431,11 +466,12 @@ class _Problem:
             background[0] += a - b * eta
             background[1] += b / omega
         model = ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
-        columns = self._nuisance(x)
+        here = self._poles(x)
+        columns = self._nuisance(here)
         comparison = self._comparison
         torque = comparison.prediction.torque(model)[0]
         bare = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
-        return model, bare + linear[first + BACKGROUND :] @ columns
+        return model, bare + linear[first + BACKGROUND :] @ columns + self._drag(here)[0]
 
     def constants(
         self, point: _Point, x: NDArray[np.float64]
@@ -457,7 +493,7 @@ class _Problem:
             over = a + b * q
             # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
             log_residue = np.log(-over * q * q / (2 * q.imag)) + log_omega
-            by_eta_q = complex(-0.5, -eta / (4 * q.imag))
+            by_eta_q = _unit_pole_slope(eta)
             by_eta = (b / over + 2 / q) * by_eta_q - by_eta_q.imag / q.imag
             by_a, by_b = 1 / over, q / over
             constants[4 * k : 4 * k + 4] = (

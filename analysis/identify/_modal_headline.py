@@ -70,8 +70,9 @@ def with_modal_model(
     refused = refused_reason(test)
     effective = None if refused is None else NOT_UNIFORM
     condition = exact if refused is None else exact.doubted(refused)
-    exactly = exact.fit.modes if tolerant is None and refused is None else ()
-    modes = _modes(condition, modal, mode_doubt, own=bool(exactly))
+    # What drag does depends on how a mode decays, which the beam takes into account.
+    of_beam = refused is None and (tolerant is None or "drag" in exact.parameters)
+    modes = _modes(condition, modal, mode_doubt, own=of_beam)
     told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
         return told

@@ -251,7 +251,9 @@ def _selected(
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
-    numbers = _with_modes(numbers, measurement, modal, test, doubt, wrong or clipped)
+    # A change that was fitted too moved the modes to the middle of the record.
+    mode_doubt = doubt if changes and changes[0].certain else wrong or clipped
+    numbers = _with_modes(numbers, measurement, modal, test, doubt, mode_doubt)
     if numbers.tolerant is not None:
         alpha, lambda_ = (
             tolerant_order(each.order, numbers.tolerant, each, doubt) for each in profiles
@@ -348,7 +350,7 @@ def _with_modes(
     if modal is None or test is None:
         return exact
     tolerant = None
-    if measurement.uniformity:
+    if measurement.uniformity or test.status == "refused":
         tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
     return with_modal_model(exact, modal, test, tolerant, doubt, mode_doubt)
 

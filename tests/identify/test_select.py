@@ -117,12 +117,10 @@ def test_the_headline_is_json(nearly_one):
     assert back["conditional"]["on"] == {"alpha": 1.0}
 
 
-def test_the_table_ranks_nine_candidates(type_iii):
+def test_the_table_ranks_the_structures(type_iii):
     verdict = type_iii.verdict
     rows = [(row.structure, row.uniform) for row in verdict.table]
-    assert sorted(rows) == sorted(
-        [(name, True) for name in STRUCTURES] + [("III", False), ("VII", False)]
-    )
+    assert sorted(rows) == sorted((name, True) for name in STRUCTURES)
     bic = [row.delta_bic for row in verdict.table]
     assert bic[0] == 0
     assert bic == sorted(bic)
@@ -216,7 +214,7 @@ def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
     assert told.parameters["zeta"].flag == told.parameters["alpha"].flag == ANOTHER_DAMPING
     assert all(each.size.flag for each in told.sizes)
     assert all(mode.damping_ratio.flag is None for mode in told.modes)
-    assert verdict.sentences[0].startswith("Internal damping alone would do.")
+    assert any(said.startswith("Internal damping alone would do.") for said in verdict.sentences)
     three = select(sessions("IV").measured(noise_nm=NOISE_NM, seed=44)).verdict
     assert three.alpha.status == "fractional"
     assert three.lambda_.status == "absent"
@@ -270,13 +268,14 @@ def test_a_beam_that_is_not_uniform_is_no_fractional_order(field):
 @pytest.mark.further  # each by itself is above
 def test_a_fractional_order_on_a_beam_that_is_not_uniform(sessions):
     made = sessions("IV", offsets=(0.006, -0.013))
-    verdict = select(made.measured(noise_nm=NOISE_NM, seed=47)).verdict
-    assert (verdict.structure, verdict.uniform, verdict.adequate) == ("IV", False, True)
-    assert kinds(verdict) == {"not uniform"}
-    assert verdict.alpha.status == "fractional"
+    selection = select(made.measured(noise_nm=NOISE_NM, seed=47))
+    verdict = selection.verdict
+    assert verdict.adequate
+    assert selection.headline.uniform_beam.status == "refused"
+    assert kinds(verdict) <= {"rival explanations"}
     low, high = verdict.alpha.interval
     assert abs(verdict.alpha.value - 0.8) < 4 * (high - low) / (2 * 1.96)
-    assert verdict.lambda_.status == "absent"
+    assert verdict.lambda_.status == "not identifiable"
 
 
 def test_unknowns_of_a_plant_lead_back_to_it(field):
