@@ -14,7 +14,6 @@ from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._residual_tests import SURE
 from analysis.identify._rig_findings import of_rig
-from analysis.identify._verdict import STRONG, rivals
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
 
@@ -110,8 +109,7 @@ def of_settings(field: CandidateSet, told: Headline) -> Iterator[Finding]:
     """
     yield from _of_instruments(field, told)
     yield from _of_beam(field, told)
-    if _rings(field):
-        yield from _of_start(field)
+    yield from _of_start(field, told)
 
 
 def _difference(
@@ -212,9 +210,16 @@ def _or_else(field: CandidateSet, name: Setting) -> str:
     return f", or the beam carries {mass_g:.2g} g at its tip"
 
 
-def _of_start(field: CandidateSet) -> Iterator[Finding]:
-    """Say that the beam rang when the record began."""
-    loudest = max(field.best.fit.ringing.amplitude_nm)
+def _of_start(field: CandidateSet, told: Headline) -> Iterator[Finding]:
+    """Say that the beam rang when the record began, where the modal model shows it."""
+    ringing = None if told.modal is None else told.modal.ringing
+    if ringing is None or not ringing.degrees_of_freedom:
+        return
+    loudest = max(ringing.amplitude_nm)
+    # A hum begins and ends with the record, which looks a little like a decay.
+    hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
+    if loudest <= hum or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SURE:
+        return
     yield Finding(
         kind="ringing start",
         sentence=(
@@ -224,18 +229,6 @@ def _of_start(field: CandidateSet) -> Iterator[Finding]:
         value=loudest,
         unit="N·m",
         remedy="Wait longer at rest before the sweep.",
-    )
-
-
-def _rings(field: CandidateSet) -> bool:
-    """Whether the beam rang at the start, whatever structure it has."""
-    loudest = max(field.best.fit.ringing.amplitude_nm, default=0.0)
-    # A hum begins and ends with the record, which looks a little like a decay.
-    hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
-    return loudest > hum and all(
-        chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) > SURE
-        for ringing in (c.fit.ringing for c in (field.best, *rivals(field, STRONG)))
-        if ringing.degrees_of_freedom
     )
 
 

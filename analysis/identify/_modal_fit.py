@@ -26,6 +26,7 @@ from analysis.identify._free_decay import Pole, mode_poles
 from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
 from analysis.identify._noise import smooth_power
 from analysis.identify._residual_tests import input_relation, whiteness
+from analysis.identify._result import Ringing
 from analysis.optimizer import Box, NormalEquations, descend
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ class ModalFit:
         As estimated from this residual; bins below the first mode do not count.
     whiteness : Whiteness
     input_relation : InputRelation
+    ringing : Ringing
+        Free decay with which the record begins.
     span : ndarray, shape (r, 2 K)
         Orthonormal rows that all derivatives of the whitened residual span, its real and imaginary
         parts side by side.
@@ -104,6 +107,7 @@ class ModalFit:
     noise: Noise
     whiteness: Whiteness
     input_relation: InputRelation
+    ringing: Ringing
     span: NDArray[np.float64]
 
     def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -295,7 +299,8 @@ class _Search:
         problem = search.problem()
         model, _ = problem.model_and_residual(x)
         point = problem.at(x)
-        constants, covariance = problem.constants(point, x)
+        every = problem.covariance(point)
+        constants, covariance = problem.constants(point, x, every)
         residual = point.residual.view(np.complex128)
         counts = search.noise.counts
         squares = float(point.residual @ point.residual)
@@ -311,6 +316,7 @@ class _Search:
             noise=search.noise,
             whiteness=whiteness(residual[counts], search.comparison.frequency_hz[counts]),
             input_relation=search.relation(),
+            ringing=problem.ringing(point, every),
             span=np.concatenate([point.span, _orthonormal(point.jacobian)]),
         )
 
@@ -473,17 +479,33 @@ class _Problem:
         bare = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
         return model, bare + linear[first + BACKGROUND :] @ columns + self._drag(here)[0]
 
-    def constants(
-        self, point: _Point, x: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`CONSTANTS` of all modes and their covariance."""
-        count = x.size // 2
+    def covariance(self, point: _Point) -> NDArray[np.float64]:
+        """Covariance of the unknowns and the linear parameters."""
         total = np.concatenate([point.full_jacobian, point.columns])
         scale = np.sqrt(np.einsum("ij,ij->i", total, total))
         scale[scale == 0] = 1.0
         gram = (total / scale[:, None]) @ (total / scale[:, None]).T
         gram[np.diag_indices_from(gram)] += 1e-14
-        covariance = np.linalg.inv(gram) / np.outer(scale, scale)
+        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
+        return covariance
+
+    def ringing(self, point: _Point, covariance: NDArray[np.float64]) -> Ringing:
+        """Free decay at the beginning, two amplitudes a mode, and its chi-square."""
+        count = len(self._numbers)
+        first = 2 * count + BACKGROUND
+        decays = point.linear[first : first + 2 * count]
+        places = slice(2 * count + first, 2 * count + first + 2 * count)
+        return Ringing(
+            amplitude_nm=tuple(np.hypot(decays[::2], decays[1::2]).tolist()),
+            chi_square=float(decays @ np.linalg.solve(covariance[places, places], decays)),
+            degrees_of_freedom=decays.size,
+        )
+
+    def constants(
+        self, point: _Point, x: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`CONSTANTS` of all modes and their covariance."""
+        count = x.size // 2
         constants = np.empty(4 * count)
         chain = np.zeros((4 * count, x.size + 2 * count))
         for k in range(count):
