@@ -443,7 +443,7 @@ class _Problem:
         residual = along @ solved - measured
         linear = np.linalg.solve(factor.T, along) / scale
         decays = linear[count + BACKGROUND :]
-        jacobian = np.array(by_drag).reshape(x.size, -1)
+        jacobian = np.array(by_drag).reshape(x.size, residual.size)
         if poles:
             jacobian += self._white(self._comparison.decay_gradient(poles, decays))
         for k in range(len(modes)):
