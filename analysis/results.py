@@ -170,6 +170,18 @@ class WholeRecord:
                 name: value for name, value in self.record.uncertainty.items() if name in SCALES
             },
             "combined": {name: each.as_json() for name, each in self.combined.items()},
+            "covariance": self._covariance_json(),
+        }
+
+    def _covariance_json(self) -> dict[str, Any]:
+        """Covariance of the free parameters, those counted as logarithms named ``ln_…``."""
+        from analysis.identify import LOGARITHMIC
+
+        return {
+            "names": [
+                f"ln_{each}" if each in LOGARITHMIC else each for each in self.fit.determined
+            ],
+            "matrix": self.fit.covariance.tolist(),
         }
 
     @property
