@@ -325,8 +325,6 @@ def export_model_command(
             )
         for line in _model_lines(model, source, target):
             typer.echo(line)
-        for note in model.notes:
-            typer.echo(f"Warning: {note}.", err=True)
 
     raise typer.Exit(_explained(run))
 
@@ -362,7 +360,7 @@ def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
             f"{accuracy.std_median:.1e}, {band}"
         )
     lines.append(f"Samples: {len(model.posterior.systems)} of the posterior, with the same states")
-    return lines
+    return [*lines, *(f"Note: {note}" for note in model.notes)]
 
 
 def _count(text: str) -> int | None:

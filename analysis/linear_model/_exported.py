@@ -148,10 +148,9 @@ class LinearModel:
         """What a user should know of the model."""
         if self.kind == "modal":
             return self.identified.modal_notes
-        notes = self.identified.beam_notes
-        if self.identified.gate[0] != PASSED:
-            return ("the test that a uniform beam predicts the modes was not passed", *notes)
-        return notes
+        status, _ = self.identified.gate
+        doubt = "" if status == PASSED else f"whether a uniform beam predicts the modes: {status}"
+        return (*filter(None, [doubt]), *self.identified.beam_notes)
 
     def variables(self) -> dict[str, Any]:
         """Return the content of a file: strings, numbers, lists of strings and arrays by name."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -10,7 +12,7 @@ from analysis.linear_model._dynamics import LinearModelError
 from analysis.linear_model._pole_fit import Structure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -47,7 +49,8 @@ def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[Structure, 
     if order is not None:
         fixed = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
         most = fixed + 2 * len(dynamics.pairs) + _MOST_REAL
-        best = _best(fit, order - fixed, given, range(len(dynamics.pairs) + 1), np.inf)
+        every = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
+        best = _best(fit, order - fixed, given, every, np.inf)
         if best is not None:
             return best
         raise LinearModelError(
@@ -55,17 +58,15 @@ def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[Structure, 
             f"{most} states, 2 for each of the {dynamics.in_band} modes in its band; state another "
             "number, or --order auto."
         )
-    sufficient = [
-        pairs
+    least = {
+        pairs: bisect_left(range(_MOST_REAL + 1), True, key=partial(_suffice, fit, pairs))
         for pairs in range(dynamics.in_band, len(dynamics.pairs) + 1)
-        if any(
-            fit.solve(structure)[1] <= MAX_RELATIVE_ERROR
-            for structure in _ladders(pairs, _MOST_REAL, _MOST_INTEGRATORS)
-        )
-    ]
-    last = 2 * max(sufficient, default=-1) + _MOST_REAL + _MOST_INTEGRATORS
-    for states in range(2 * min(sufficient, default=0), last + 1):
-        best = _best(fit, states, given, sufficient, MAX_RELATIVE_ERROR)
+    }
+    least = {pairs: real for pairs, real in least.items() if real <= _MOST_REAL}
+    first = min((2 * pairs + real for pairs, real in least.items()), default=0)
+    last = max((2 * pairs for pairs in least), default=-1) + _MOST_REAL + _MOST_INTEGRATORS
+    for states in range(first, last + 1):
+        best = _best(fit, states, given, least, MAX_RELATIVE_ERROR)
         if best is not None:
             return best
     raise LinearModelError(
@@ -73,6 +74,12 @@ def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[Structure, 
         f"{dynamics.band_hz[0]:g} to {dynamics.band_hz[1]:g} Hz; state a number of states "
         "with --order N, whose error is then reported."
     )
+
+
+def _suffice(fit: PoleFit, pairs: int, real: int) -> bool:
+    """Whether a number of real poles suffices, with both integrators."""
+    ladders = _ladders(pairs, real, _MOST_INTEGRATORS)
+    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in ladders)
 
 
 def _structures(pairs: int, states: int, given: Input) -> Iterator[Structure]:
@@ -93,11 +100,19 @@ def _ladders(pairs: int, real: int, integrators: int) -> Iterator[Structure]:
 
 
 def _best(
-    fit: PoleFit, states: int, given: Input, pairs: range | list[int], tolerance: float
+    fit: PoleFit, states: int, given: Input, least: Mapping[int, int], tolerance: float
 ) -> tuple[Structure, StateSpace] | None:
-    """Return the most accurate stable realisation within a tolerance, None if there is none."""
+    """Return the most accurate stable realisation within a tolerance, None if there is none.
+
+    With the numbers of pairs and at least as many real poles as are given.
+    """
     found: list[tuple[float, int, Structure, NDArray[np.float64]]] = []
-    for structure in (each for number in pairs for each in _structures(number, states, given)):
+    for structure in (
+        each
+        for pairs, real in least.items()
+        for each in _structures(pairs, states, given)
+        if len(each.ladder_rad_s) >= real
+    ):
         coefficients, error = fit.solve(structure)
         if error <= tolerance:
             found.append((error, len(found), structure, coefficients))
