@@ -19,7 +19,7 @@ from rigd.beam import LoadedBeam, clamped_free_eigenvalues
 from rigd.errors import UserError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from analysis.identify import ModalModel, Plant
 
@@ -106,7 +106,7 @@ class Uncertain:
     at : callable
         From parameters, by the names below, to dynamics.
     names : tuple of str
-        Of the uncertain parameters; one that begins with ``ln_`` is a natural logarithm.
+        Names of the uncertain parameters; one with ``ln_`` is a natural logarithm.
     values : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
     allowed : callable
@@ -215,7 +215,9 @@ def _beam_poles(
 # Modal model
 
 
-def modal_dynamics(modal: ModalModel, band_hz: tuple[float, float]) -> Dynamics:
+def modal_dynamics(
+    modal: ModalModel, band_hz: tuple[float, float], numbers: Sequence[int]
+) -> Dynamics:
     """Describe a modal model within the band of its record.
 
     The background is a polynomial in s and thus no state space: the two powers beyond the
@@ -225,6 +227,8 @@ def modal_dynamics(modal: ModalModel, band_hz: tuple[float, float]) -> Dynamics:
     ----------
     modal : ModalModel
     band_hz : tuple of float
+    numbers : sequence of int
+        Number of each mode; 0 for a resonance of something else.
     """
     modes = np.array(modal.poles_rad_s, dtype=np.complex128)
     angle = complex(-_RESIDUAL_DAMPING, math.sqrt(1 - _RESIDUAL_DAMPING**2))
@@ -233,7 +237,10 @@ def modal_dynamics(modal: ModalModel, band_hz: tuple[float, float]) -> Dynamics:
         response=modal.response,
         pairs=np.concatenate([modes, residual]),
         names=(
-            *(f"mode_{number}" for number in range(1, modes.size + 1)),
+            *(
+                f"mode_{number}" if number else f"resonance_{place}"
+                for place, number in enumerate(numbers, start=1)
+            ),
             *(f"residual_{number}" for number in range(1, residual.size + 1)),
         ),
         in_band=modes.size,

@@ -209,6 +209,7 @@ class IdentifiedModel:
                 f"{self.where} has no modal_model, as of an older version; {_ANALYZE_AGAIN}, or "
                 "export the beam's model with --beam."
             )
+        count = len(modal.poles_rad_s)
         names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))
         values = [constant_value(modal, name) for name in names]
         known = [value for value in values if value is not None]
@@ -217,12 +218,15 @@ class IdentifiedModel:
                 "modal_model.names", f"{names[values.index(None)]!r} has no such constant"
             )
         nominal = dict(zip(names, known, strict=True))
+        listed = self.headline["modal_model"].get("modes")
+        stated = isinstance(listed, list) and len(listed) == count
+        numbers = listed if stated else list(range(1, count + 1))
 
         def at(parameters: Mapping[str, float]) -> ModalModel:
             return changed(modal, {name: parameters[name] - nominal[name] for name in parameters})
 
         return Uncertain(
-            lambda parameters: modal_dynamics(at(parameters), band_hz),
+            lambda parameters: modal_dynamics(at(parameters), band_hz, numbers),
             names,
             np.array(known),
             covariance,

@@ -35,15 +35,9 @@ def _with_ratio(pole: complex, ratio: float) -> complex:
 
 
 _CONSTANTS: Final[Mapping[str, _Constant]] = {
-    "ln_omega": _Constant(
-        lambda pole, _: math.log(abs(pole)), lambda p, r, by: (p * math.exp(by), r)
-    ),
     "ln_frequency": _Constant(
         lambda pole, _: math.log(pole.imag / (2 * math.pi)),
         lambda p, r, by: (p * math.exp(by), r),
-    ),
-    "damping_ratio": _Constant(
-        lambda pole, _: _ratio(pole), lambda p, r, by: (_with_ratio(p, _ratio(p) + by), r)
     ),
     "ln_damping_ratio": _Constant(
         lambda pole, _: math.log(_ratio(pole)),
@@ -53,7 +47,7 @@ _CONSTANTS: Final[Mapping[str, _Constant]] = {
         lambda _, residue: math.log(abs(residue)), lambda p, r, by: (p, r * math.exp(by))
     ),
     "residue_phase_rad": _Constant(
-        lambda _, residue: cmath.phase(residue), lambda p, r, by: (p, r * cmath.rect(1.0, by))
+        lambda _, residue: cmath.phase(residue / 1j), lambda p, r, by: (p, r * cmath.rect(1.0, by))
     ),
 }
 """Names end in the number of the mode, from 1 on."""
@@ -69,7 +63,7 @@ def constant_value(modal: ModalModel, name: str) -> float | None:
     ----------
     modal : ModalModel
     name : str
-        Such as ``ln_omega_1`` or ``background_0``.
+        Such as ``ln_frequency_1`` or ``background_0``.
     """
     kind, number = _split(name)
     if kind == _BACKGROUND and 0 <= number < len(modal.background):

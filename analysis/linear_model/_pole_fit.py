@@ -79,7 +79,7 @@ class PoleFit:
     ----------
     dynamics : Dynamics
     near : PoleFit, optional
-        Of dynamics that differ little, whose zeros lie near.
+        Fit of dynamics that differ little, whose zeros lie near.
     """
 
     def __init__(self, dynamics: Dynamics, near: PoleFit | None = None) -> None:

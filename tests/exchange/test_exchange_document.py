@@ -94,7 +94,7 @@ def test_the_examples_read_a_model(exported_models, capsys):
     assert "torque per angle: [" in capsys.readouterr().out
     pytest.importorskip("control", reason="an example reads a model with python-control")
     exec(with_control, {})
-    assert "17 poles" in capsys.readouterr().out  # of 14 states and the delay's approximation
+    assert re.search(r"1[47] poles", capsys.readouterr().out)  # 3 of a delay, if it is positive
 
 
 @pytest.mark.further

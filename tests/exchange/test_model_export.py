@@ -1,5 +1,6 @@
 """Models of an analysis as matrices: accuracy, formats, other programs, refusals."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 from analysis.identify import ModalModel
+from analysis.linear_model import ModelOptions, identified_in_session, linear_model
 from rigd.beam import Beam, Damping, LoadedBeam
 
 BAND_HZ = (0.05, 100.0)
@@ -31,9 +33,14 @@ MODAL = ModalModel(
     (complex(0.05, -1.9), complex(1.0, -12.0), complex(4.0, -33.0)),
     (0.01, 1e-3, 1.6e-4, 1e-7, 2e-9),
 )
-MODAL_NAMES = [
-    f"{name}_{mode}" for mode in (1, 2, 3) for name in ("ln_omega", "damping_ratio")
-]  # fmt: skip
+MODAL_STD = {"ln_frequency": 1e-4, "ln_damping_ratio": 2e-2, "ln_residue": 3e-3} | {
+    "residue_phase_rad": 2e-3
+}
+MODAL_NAMES = [f"{name}_{mode}" for mode in (1, 2, 3) for name in MODAL_STD]
+MODAL_NAMES += [f"background_{power}" for power in range(5)]
+MODAL_VARIANCE = (
+    np.array([*list(MODAL_STD.values()) * 3, *(0.01 * np.array(MODAL.background))]) ** 2
+)
 
 
 def random_beam(seed):
@@ -89,7 +96,8 @@ def document(values=NOMINAL, *, gate="passed", covariance=True, modal=True, **mo
         headline["modal_model"] = {
             **MODAL.as_json(),
             "names": MODAL_NAMES,
-            "covariance": np.diag([1e-4**2, 1e-5**2] * 3).tolist(),
+            "modes": [1, 2, 3],
+            "covariance": np.diag(MODAL_VARIANCE).tolist(),
         }
     return {
         "files": [{"file": "a.mcap", "beam_length_m": LENGTH_M}],
@@ -133,6 +141,12 @@ def exported(export, tmp_path):
             return dict(file)
 
     return run
+
+
+def sampled(model, k, frequency_hz):
+    """Response of one sample of the posterior."""
+    one = {name: model[f"{name}_samples"][k] for name in "ABCD"}
+    return response(one | {"delay_s": model["delay_samples_s"][k]}, frequency_hz)
 
 
 def response(model, frequency_hz):
@@ -225,21 +239,13 @@ def test_samples_are_of_the_posterior_and_have_the_same_states(nominal):
             each: np.exp(drawn[f"ln_{each}"]) if f"ln_{each}" in drawn else drawn.get(each, value)
             for each, value in NOMINAL.items()
         }
-        one = {name: model[f"{name}_samples"][k] for name in "ABCD"}
-        one["delay_s"] = model["delay_samples_s"][k]
         np.testing.assert_allclose(
-            response(one, frequency_hz), exact(values, 2j * np.pi * frequency_hz), rtol=3e-3
+            sampled(model, k, frequency_hz), exact(values, 2j * np.pi * frequency_hz), rtol=3e-3
         )
-    spread = np.log(np.abs([
-        response(
-            {name: model[f"{name}_samples"][k] for name in "ABCD"}
-            | {"delay_s": model["delay_samples_s"][k]},
-            model["frequency_hz"],
-        )
-        for k in range(50)
-    ])).std(axis=0)  # fmt: skip
-    # Of the logarithm of the magnitude alone, which has not all of the deviation.
-    assert np.median(spread / model["std"]) == pytest.approx(0.85, abs=0.25)
+    frequency_hz = model["frequency_hz"]
+    spread = np.std([sampled(model, k, frequency_hz) for k in range(50)], axis=0)
+    ratio = spread / np.abs(model["response_nm_per_rad"]) / model["std"]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.2)
     assert model["std_max"] == model["std"].max() > 3 * model["std_median"]
 
 
@@ -279,7 +285,13 @@ def test_the_modal_model_is_exported_where_the_beam_was_refused(exported, given)
         assert np.linalg.eigvals(block).imag.max() == pytest.approx(pole.imag)
     drawn = np.log(model["A_samples"][:, 0, 1])
     assert drawn.std() == pytest.approx(1e-4, rel=0.3)
+    damping = -model["A_samples"][:, 2, 2] / 101.0
+    assert np.log(damping).std() == pytest.approx(2e-2, rel=0.3)
     assert model["parameter_names"].tolist() == MODAL_NAMES
+    frequency_hz = model["frequency_hz"]
+    std = np.std([sampled(model, k, frequency_hz) for k in range(50)], axis=0)
+    ratio = std / np.abs(MODAL.response(2j * np.pi * frequency_hz)) / model["std"]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.2)
 
 
 def test_the_beam_is_exported_on_request_with_what_is_doubtful(export, exported):
@@ -397,7 +409,7 @@ def test_unusual_beams_are_accurate_too(exported, values):
 
 
 def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
-    result = analyze("export", "model", simulated, tmp_path / "a.npz", "--beam", "--samples", 2)
+    result = analyze("export", "model", simulated, tmp_path / "a.npz", "--samples", 2)
     assert result.exit_code == 0, result.output
     assert f"exact beam of {simulated}" in result.stdout
     with np.load(tmp_path / "a.npz") as file:
@@ -407,6 +419,27 @@ def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
     assert first.imag / (2 * np.pi) == pytest.approx(2.554, abs=0.03)  # of the paper's antenna
     assert 0 < model["std_median"] < 0.1
     assert model["source"] == simulated.name
+
+
+def test_beam_and_modal_model_of_a_session_agree_within_what_the_record_knows(simulated):
+    found = identified_in_session(simulated)
+    assert found.gate[0] == "passed"
+    beam = linear_model(found, ModelOptions(order=20, samples=0))
+    refused = found.headline | {"validity": {"uniform_beam": {"status": "refused"}}}
+    modal = linear_model(
+        dataclasses.replace(found, headline=refused), ModelOptions(order=14, samples=0)
+    )
+    assert (beam.kind, modal.kind) == ("beam", "modal")
+    assert modal.system.states.names[0] == "mode_1_a"
+    by_modal, by_beam = modal.accuracy, beam.accuracy
+    inner = (by_modal.frequency_hz > 1.0) & (by_modal.frequency_hz < 45.0)
+    frequency_hz = by_modal.frequency_hz[inner]
+    difference = response(beam.variables(), frequency_hz) / by_modal.response[inner] - 1
+    assert np.sqrt(np.mean(np.abs(difference / by_modal.std[inner]) ** 2)) < 2.5
+    # The modal model assumes less, so it knows less.
+    assert np.median(by_modal.std[inner]) > 1.5 * by_beam.std_median
+    at_mode = np.argmin(np.abs(frequency_hz - 16.0))
+    assert by_modal.std[inner][at_mode] < 0.1
 
 
 @pytest.mark.further
