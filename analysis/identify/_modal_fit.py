@@ -76,7 +76,7 @@ class ModalFit:
     constants : ndarray, shape (4 n,)
         `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
     joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
-        Of the constants and the coefficients of the background.
+        Covariance of the constants and the coefficients of the background.
     evidence : tuple of float
         Deviance that each mode saves.
     residual : ndarray of complex, shape (K,)
