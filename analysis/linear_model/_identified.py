@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify import ModalModel, Plant
+from analysis.identify import BACKGROUND, ModalModel, Plant
 from analysis.linear_model._dynamics import (
     LinearModelError,
     Uncertain,
@@ -24,7 +24,7 @@ from rigd.identified_beam import (
     read_document,
     select_headline,
 )
-from rigd.units import finite_number
+from rigd.units import finite_number, is_usable_size
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +35,7 @@ _ANALYZE_AGAIN: Final = "analyze the session again"
 _LOGARITHM: Final = "ln_"
 _OFFSET: Final = "stiffness_offset_"
 _LAST_OFFSET: Final = 50
+_MOST_MODES: Final = 40
 _NOT_LINEAR: Final = {
     "drag": "the drag of the air grows with the amplitude",
     "clock_rate_difference": "it is a property of the instruments",
@@ -89,12 +90,18 @@ class IdentifiedModel:
             return None
         try:
             modal = ModalModel.from_json(content)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise self._error("modal_model", "is not a modal model") from error
         numbers = [*modal.poles_rad_s, *modal.residues, *modal.background]
         stable = all(pole.real < 0 < pole.imag for pole in modal.poles_rad_s)
-        if len(modal.poles_rad_s) != len(modal.residues) or len(modal.background) != 5:
-            raise self._error("modal_model", "must have a residue for each pole and 5 background")
+        if len(modal.background) != BACKGROUND or not (
+            len(modal.poles_rad_s) == len(modal.residues) <= _MOST_MODES
+        ):
+            raise self._error(
+                "modal_model",
+                f"must have up to {_MOST_MODES} poles, a residue for each of them, and "
+                f"{BACKGROUND} coefficients of the background",
+            )
         if not stable or not all(map(_is_finite, numbers)):
             raise self._error(
                 "modal_model", "must have poles with negative real and positive imaginary parts"
@@ -113,12 +120,12 @@ class IdentifiedModel:
     def beam_notes(self) -> tuple[str, ...]:
         """What is doubtful about the parameters of the beam, or is not in a linear model."""
         parameters = self._beam_block["parameters"]
-        flagged = [name for name, each in parameters.items() if (each or {}).get("flag")]
+        flagged = [name for name, each in parameters.items() if _flag(each)]
         notes = [f"flagged by the analysis: {', '.join(flagged)}"] if flagged else []
         notes += [
             f"{name} is not part of the model: {why}"
             for name, why in _NOT_LINEAR.items()
-            if (parameters.get(name) or {}).get("value")
+            if name in parameters and parameters[name]["value"]
         ]
         named = self.headline.get("named")
         notes += [
@@ -130,11 +137,13 @@ class IdentifiedModel:
     @property
     def modal_notes(self) -> tuple[str, ...]:
         """Which modes of the modal model are doubtful."""
+        listed = self.headline.get("modes")
         flagged = [
             str(each.get("mode"))
-            for each in self.headline.get("modes", ())
-            if each.get("source") == "modal"
-            and any((each.get(key) or {}).get("flag") for key in ("frequency_hz", "damping_ratio"))
+            for each in (listed if isinstance(listed, list) else [])
+            if isinstance(each, dict)
+            and each.get("source") == "modal"
+            and any(_flag(each.get(key)) for key in ("frequency_hz", "damping_ratio"))
         ]
         return (f"flagged by the analysis: mode {', '.join(flagged)}",) if flagged else ()
 
@@ -146,8 +155,9 @@ class IdentifiedModel:
         tolerance of the geometry do not place the resonances as exactly as they were measured.
         """
         exact = self.headline.get("exact_geometry")
-        complete = isinstance(exact, dict) and {"parameters", "covariance"} <= exact.keys()
-        return exact if complete and isinstance(exact, dict) else self.headline
+        if isinstance(exact, dict) and isinstance(exact.get("parameters"), dict):
+            return exact if "covariance" in exact else self.headline
+        return self.headline
 
     def beam(self) -> Uncertain:
         """Return the beam with its ends and channels.
@@ -206,8 +216,8 @@ class IdentifiedModel:
         modal, band_hz = self.modal, self.band_hz
         if modal is None:
             raise LinearModelError(
-                f"{self.where} has no modal_model, as of an older version; {_ANALYZE_AGAIN}, or "
-                "export the beam's model with --beam."
+                f"{self.where} has no modal_model, as of an older version or of a campaign; "
+                f"{_ANALYZE_AGAIN}, or export the beam's model with --beam."
             )
         count = len(modal.poles_rad_s)
         names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))
@@ -244,8 +254,10 @@ class IdentifiedModel:
             return None
         try:
             covariance = np.array(matrix, dtype=np.float64).reshape(len(names), len(names))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise self._error(f"{key}.{matrix_key}", "must be a square matrix") from error
+        if len(set(map(str, names))) < len(names):
+            raise self._error(f"{key}.names", "must be different from each other")
         scale = np.sqrt(np.abs(np.diag(covariance)))
         scaled = covariance / np.outer(scale + (scale == 0), scale + (scale == 0))
         if not np.isfinite(covariance).all() or (
@@ -296,7 +308,7 @@ def identified_in_document(path: Path) -> IdentifiedModel:
         path.name,
         where,
         headline,
-        length_m if length_m and length_m > 0 else None,
+        length_m if length_m and length_m > 0 and is_usable_size(length_m) else None,
         _band_hz(bands[0] if bands else None),
     )
 
@@ -324,6 +336,11 @@ def identified_in_session(path: Path) -> IdentifiedModel:
     return IdentifiedModel(
         path.name, str(path), headline, record.beam.length_m, _band_hz(list(whole.band_hz))
     )
+
+
+def _flag(quantity: object) -> object:
+    """Return why a quantity is doubtful; nothing if it is not."""
+    return quantity.get("flag") if isinstance(quantity, dict) else None
 
 
 def _band_hz(stated: object) -> tuple[float, float]:

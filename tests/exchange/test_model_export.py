@@ -184,14 +184,14 @@ def test_the_order_chosen_is_accurate_to_a_thousandth(exported, seed, given):
 
 def test_inputs_outputs_and_states_have_names_and_units(nominal, exported):
     model = nominal
-    assert model["input_names"].tolist() == ["motor_acceleration"]
+    assert model["inputs"].tolist() == ["motor_acceleration"]
     assert model["input_units"].tolist() == ["rad/s^2"]
-    assert model["output_names"].tolist() == ["coupling_torque"]
+    assert model["outputs"].tolist() == ["coupling_torque"]
     assert model["output_units"].tolist() == ["N.m"]
-    assert len(model["state_names"]) == len(model["state_units"]) == model["order"]
-    assert model["state_names"][:2].tolist() == ["mode_1_a", "mode_1_b"]
+    assert len(model["states"]) == len(model["state_units"]) == model["order"]
+    assert model["states"][:2].tolist() == ["mode_1_a", "mode_1_b"]
     angle = exported(document(), "--samples", 0, "--input", "angle", "--order", 12)
-    assert angle["input_names"].tolist() == ["motor_angle", "motor_velocity", "motor_acceleration"]
+    assert angle["inputs"].tolist() == ["motor_angle", "motor_velocity", "motor_acceleration"]
     assert angle["B"].shape == (angle["order"], 3)
 
 
@@ -244,9 +244,9 @@ def test_samples_are_of_the_posterior_and_have_the_same_states(nominal):
         )
     frequency_hz = model["frequency_hz"]
     spread = np.std([sampled(model, k, frequency_hz) for k in range(50)], axis=0)
-    ratio = spread / np.abs(model["response_nm_per_rad"]) / model["std"]
+    ratio = spread / np.abs(model["response_nm_per_rad"]) / model["uncertainty"]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.2)
-    assert model["std_max"] == model["std"].max() > 3 * model["std_median"]
+    assert model["uncertainty_max"] == model["uncertainty"].max() > 3 * model["uncertainty_median"]
 
 
 def test_every_format_has_the_same_variables(exported, export, tmp_path):
@@ -290,7 +290,7 @@ def test_the_modal_model_is_exported_where_the_beam_was_refused(exported, given)
     assert model["parameter_names"].tolist() == MODAL_NAMES
     frequency_hz = model["frequency_hz"]
     std = np.std([sampled(model, k, frequency_hz) for k in range(50)], axis=0)
-    ratio = std / np.abs(MODAL.response(2j * np.pi * frequency_hz)) / model["std"]
+    ratio = std / np.abs(MODAL.response(2j * np.pi * frequency_hz)) / model["uncertainty"]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.2)
 
 
@@ -417,7 +417,7 @@ def test_a_session_is_analysed_on_the_spot(simulated, analyze, tmp_path):
     poles = np.linalg.eigvals(model["A"])
     first = poles[np.argmin(np.abs(poles - 16.05j))]
     assert first.imag / (2 * np.pi) == pytest.approx(2.554, abs=0.03)  # of the paper's antenna
-    assert 0 < model["std_median"] < 0.1
+    assert 0 < model["uncertainty_median"] < 0.1
     assert model["source"] == simulated.name
 
 
@@ -455,7 +455,7 @@ def test_a_session_and_its_document_give_the_same_model(simulated, analyze, tmp_
         )
         assert result.exit_code == 0, result.output
     with np.load(tmp_path / "a.npz") as one, np.load(tmp_path / "b.npz") as other:
-        for matrix in ("A", "B", "C", "D", "A_samples", "delay_s", "std"):
+        for matrix in ("A", "B", "C", "D", "A_samples", "delay_s", "uncertainty"):
             np.testing.assert_array_equal(one[matrix], other[matrix])
 
 
@@ -485,7 +485,7 @@ pkg load control
 s = load("model.mat");
 system = ss(s.A, s.B, s.C, s.D);
 [y, t] = step(system, (0:2000)' * 1e-3);
-names = strjoin(s.state_names', ",");
+names = strjoin(s.states', ",");
 count = [size(s.A_samples), numel(s.poles_rad_s)];
 save("-v7", "out.mat", "y", "names", "count");
 """
@@ -508,6 +508,6 @@ def test_octave_reads_it(exported, export, tmp_path):
     read = loadmat(tmp_path / "out.mat", squeeze_me=True)
     expected = scipy_step(model)
     assert np.abs(read["y"] - expected).max() < 1e-9 * np.abs(expected).max()
-    assert str(read["names"]).split(",") == model["state_names"].tolist()
+    assert str(read["names"]).split(",") == model["states"].tolist()
     n = int(model["order"])
     assert read["count"].tolist() == [2, n, n, 3]
