@@ -164,12 +164,26 @@ class WholeRecord:
         from analysis.record_checks import SCALES
 
         file, findings = str(self.record.path), self.verdict.findings
+        content = headline_json(file, self.headline, self.orders, findings, self.validity)
+        exact = content["exact_geometry"]  # None: the parameters are those of an exact geometry
+        (content if exact is None else exact)["covariance"] = self._covariance_json()
         return {
-            **headline_json(file, self.headline, self.orders, findings, self.validity),
+            **content,
             "scale_uncertainty": {
                 name: value for name, value in self.record.uncertainty.items() if name in SCALES
             },
             "combined": {name: each.as_json() for name, each in self.combined.items()},
+        }
+
+    def _covariance_json(self) -> dict[str, Any]:
+        """Return the covariance of the fit, with ``ln_`` before the names of logarithms."""
+        from analysis.identify import LOGARITHMIC
+
+        return {
+            "names": [
+                f"ln_{each}" if each in LOGARITHMIC else each for each in self.fit.determined
+            ],
+            "matrix": self.fit.covariance.tolist(),
         }
 
     @property

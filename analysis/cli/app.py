@@ -103,6 +103,7 @@ _COMMANDS: Final = {
     "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
     "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
     "export frf": "Write the frequency response of a session (.csv, .mat, .uff).",
+    "export model": "Write a linear model of the antenna (.json, .npz, .mat).",
 }
 """The other commands, each with a --help of its own."""
 

@@ -17,6 +17,7 @@ from analysis.cli.welch_options import (
     Overlap,
     Segment,
     band_hz,
+    choice,
     welch_settings,
 )
 
@@ -24,9 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from analysis.exchange import ChannelChoice
+    from analysis.linear_model import LinearModel
 
 export_app = typer.Typer(
-    help="Write a session's record or frequency response for another program: .csv, .mat, .uff.",
+    help="Write a session's record, frequency response or model for another program.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -38,6 +40,11 @@ Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "
 Exit code: 0 done, 1 the file cannot be imported, 2 usage error, 130 stopped by Ctrl-C."""
 
 _EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."
+
+_MODEL_EPILOG = """\
+Example: analyze export model session.mcap beam.mat --rate 1000
+
+Exit code: 0 done, 1 it cannot be exported, 2 usage error, 130 stopped by Ctrl-C."""
 
 _Session = Annotated[
     Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")
@@ -249,12 +256,155 @@ def export_frf_command(
     raise typer.Exit(_explained(run))
 
 
+@export_app.command("model", epilog=_MODEL_EPILOG)
+def export_model_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SESSION|MODEL.json",
+            readable=False,
+            help="Session file (.mcap), which is analysed, or JSON of analyze.",
+        ),
+    ],
+    target: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", readable=False, help="New file: .json, .npz, .mat."),
+    ],
+    beam: Annotated[
+        bool,
+        typer.Option("--beam", help="The beam's model, even where its test was not passed."),
+    ] = False,
+    given: Annotated[
+        str,
+        typer.Option(
+            "--input",
+            metavar="acceleration|angle",
+            help="angle: three inputs, angle, velocity and acceleration of the motor.",
+        ),
+    ] = "acceleration",
+    order: Annotated[
+        str,
+        typer.Option(metavar="N|auto", help="Number of states; auto: fewest for an error of 1e-3."),
+    ] = "auto",
+    rate: Annotated[
+        str,
+        typer.Option(metavar="HZ|continuous", help="Sample with the input held (zero-order hold)."),
+    ] = "continuous",
+    samples: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, max=1000, help="Samples of the posterior.  [default: 50]"),
+    ] = None,
+) -> None:
+    """Write a linear model from the motor's motion to the coupling torque.
+
+    Writes the modal model (poles, residues, background), and matrices A, B, C, D: those of the beam
+    where a uniform beam predicts the modes or with --beam, else those of the modal model. The delay
+    is a number of its own, and not in the matrices. Error and standard deviation of the response
+    are stated over the band.
+    """
+    from analysis.exchange import export_model
+    from analysis.linear_model import INPUTS, SAMPLES, ModelOptions
+    from rigd.printable import progress_bar
+
+    options = ModelOptions(
+        beam,
+        choice(given, INPUTS, "--input"),
+        _count(order),
+        _rate_hz(rate),
+        SAMPLES if samples is None else samples,
+    )
+
+    def run() -> None:
+        with progress_bar() as progress:
+            task = progress.add_task("", total=None)
+            model = export_model(
+                source,
+                target,
+                options,
+                lambda step: progress.update(task, description=f"{source.name}: {step}"),
+            )
+        for line in _model_lines(model, source, target):
+            typer.echo(line)
+
+    raise typer.Exit(_explained(run))
+
+
+def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
+    """Return the summary of an exported model, a line for each statement."""
+    system, accuracy = model.system, model.accuracy
+    status, p_value = model.identified.gate
+    gate = status if p_value is None else f"{status}, p = {p_value:.2g}"
+    name = "exact beam" if model.kind == "beam" else "modal model"
+    relaxations = sum(name.startswith("relaxation") for name in system.states.names)
+    when = "continuous time"
+    if system.period_s:
+        when = f"{1 / system.period_s:g} Hz, input held between samples"
+    low_hz, high_hz = accuracy.band_hz
+    band = f"{low_hz:g} to {high_hz:g} Hz"
+    inputs = ", ".join(map("{} ({})".format, system.inputs.names, system.inputs.units))
+    lines = [
+        f"Model: {name} of {source} (uniform beam: {gate}): {target}",
+        f"Order: {system.order} states ({model.structure.pairs} pairs of poles, {relaxations} real "
+        f"poles); {when}",
+        f"Input: {inputs}",
+        f"Output: coupling_torque (N.m), delayed by {1e3 * system.delay_s:.4g} ms; the delay is "
+        "not in the matrices",
+        f"Error: at most {accuracy.error_max:.1e} of the response, median "
+        f"{accuracy.error_median:.1e}, {band}",
+    ]
+    if math.isnan(accuracy.std_max):
+        lines.append("Data: the standard deviation is not known without a covariance")
+    else:
+        lines.append(
+            f"Data: standard deviation at most {accuracy.std_max:.1e} of the response, median "
+            f"{accuracy.std_median:.1e}, {band}"
+        )
+    lines.append(f"Samples: {len(model.posterior.systems)} of the posterior, with the same states")
+    return [*lines, *(f"Note: {note}" for note in model.notes)]
+
+
+def _count(text: str) -> int | None:
+    if text == "auto":
+        return None
+    if not (text.isascii() and text.isdecimal() and 1 <= int(text[:6]) <= _MOST_STATES):
+        raise typer.BadParameter(
+            f"'{text}' is neither auto nor a number of states from 1 to {_MOST_STATES}.",
+            param_hint="--order",
+        )
+    return int(text)
+
+
+def _rate_hz(text: str) -> float | None:
+    if text == "continuous":
+        return None
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
+        raise typer.BadParameter(
+            f"'{text}' is neither continuous nor a rate from {_RATES_HZ[0]:g} to "
+            f"{_RATES_HZ[1]:g} Hz.",
+            param_hint="--rate",
+        )
+    return rate_hz
+
+
+_MOST_STATES: Final = 200
+_RATES_HZ: Final = (1.0, 1e6)
+
+
 def _explained(run: Callable[[], None]) -> int:
     """Run a command and return its exit code; what went wrong is said in a sentence or two."""
+    from numpy.linalg import LinAlgError
+
     from analysis.exchange import ExchangeError, TargetError
+    from analysis.identify import MeasurementError
+    from analysis.linear_model import LinearModelError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report import OutputError, OutputExistsError
+    from rigd.identified_beam import IdentifiedBeamError
     from rigd.session import SessionError, SessionExistsError
 
     try:
@@ -262,8 +412,14 @@ def _explained(run: Callable[[], None]) -> int:
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
         complain(str(error))
         return 2
-    except (ExchangeError, SessionError, RecordError, EstimateError, OutputError) as error:
+    except (
+        ExchangeError, SessionError, RecordError, EstimateError, MeasurementError, OutputError,
+        IdentifiedBeamError, LinearModelError,
+    ) as error:  # fmt: skip
         complain(str(error))
+        return 1
+    except LinAlgError as error:
+        complain(f"The estimate failed ({error}); is this a record of the rig?")
         return 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)

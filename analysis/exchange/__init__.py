@@ -1,8 +1,9 @@
-"""Import of records of other programs, export of records and frequency responses.
+"""Import of records of other programs, export of records, frequency responses and models.
 
-`import_record` makes a session file of a measurement by an `ImportPlan`; `export_record` and
-`export_frf` write files that other programs read. Each format is a module behind one table
-(`_source`), and knows names and numbers only. Responses are estimated by `analysis.paper`.
+`import_record` makes a session file of a measurement by an `ImportPlan`; `export_record`,
+`export_frf` and `export_model` write files that other programs read. Each format is a module behind
+one table (`_source`), and knows names and numbers only. Responses are estimated by
+`analysis.paper`, models by `analysis.linear_model`.
 """
 
 import lazy_loader as lazy

@@ -2,10 +2,12 @@ from ._channels import QUANTITIES as QUANTITIES
 from ._channels import ChannelChoice as ChannelChoice
 from ._channels import parse_choice as parse_choice
 from ._export import export_frf as export_frf
+from ._export import export_model as export_model
 from ._export import export_record as export_record
 from ._import_record import ImportPlan as ImportPlan
 from ._import_record import import_record as import_record
 from ._import_record import write_session as write_session
+from ._model_files import MODEL_FORMATS as MODEL_FORMATS
 from ._source import ExchangeError as ExchangeError
 from ._source import TargetError as TargetError
 from ._specimen import read_specimen as read_specimen

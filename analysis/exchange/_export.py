@@ -1,4 +1,4 @@
-"""A session's record or its frequency response into a new file for another program."""
+"""A session's record, its frequency response or its model into a new file for another program."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
+import rigd
+from analysis.exchange._model_files import MODEL_FORMATS
 from analysis.exchange._source import TargetError
 from analysis.exchange._table import frf_table, record_table
 from analysis.report import OutputError, check_new_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Collection, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
     from analysis.exchange._table import Table
+    from analysis.linear_model import LinearModel, ModelOptions
     from analysis.models import WelchSettings
 
 _UNIVERSAL: Final = (".uff", ".unv", ".uf58")
@@ -91,18 +94,72 @@ def export_frf(
     return table
 
 
+def export_model(
+    source: Path,
+    target: Path,
+    options: ModelOptions,
+    on_step: Callable[[str], None] = lambda _step: None,
+) -> LinearModel:
+    """Write a linear model of the antenna: the modal model, and a state space.
+
+    Parameters
+    ----------
+    source : Path
+        A session, which is analysed, or the document of ``analyze --json``.
+    target : Path
+        A new file; its ending, one of `MODEL_FORMATS`, is its format.
+    options : ModelOptions
+        Which model, which input, how many states.
+    on_step : callable, optional
+        Called with a few words before each step.
+
+    Returns
+    -------
+    LinearModel
+        What was written.
+
+    Raises
+    ------
+    TargetError
+        If the ending is unknown.
+    analysis.report._folder.OutputExistsError, analysis.report._folder.OutputError
+        If the file exists or cannot be written.
+    analysis.linear_model.LinearModelError, rigd.identified_beam.IdentifiedBeamError
+        If there is no such model, or it cannot be realised.
+    rigd.session.SessionError, analysis.record.RecordError, analysis.identify.MeasurementError
+        If the session cannot be read or analysed.
+    """
+    from analysis.linear_model import identified_in_document, identified_in_session, linear_model
+
+    _check_ending(target, MODEL_FORMATS)
+    check_new_file(target, "The file")
+    is_session = source.suffix.lower() == ".mcap"
+    on_step("analysis" if is_session else "document")
+    found = identified_in_session(source) if is_session else identified_in_document(source)
+    model = linear_model(found, options, on_step)
+    on_step("file")
+    variables = {**model.variables(), "exported_by": f"rigd {rigd.__version__}"}
+    with _new_file(target) as stream:
+        MODEL_FORMATS[target.suffix.lower()](variables, stream)
+    return model
+
+
 def check_target(target: Path, *, binary: bool) -> None:
     """Refuse what cannot be written, before anything is computed."""
+    _check_ending(target, SUFFIXES)
     suffix = target.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise TargetError(
-            f"{target}: the ending selects the format; choose one of {', '.join(SUFFIXES)}."
-        )
     if binary and suffix not in _UNIVERSAL:
         raise TargetError(
             f"{target}: --binary is for universal files ({', '.join(_UNIVERSAL)}); leave it out."
         )
     check_new_file(target, "The file")
+
+
+def _check_ending(target: Path, endings: Collection[str]) -> None:
+    if target.suffix.lower() not in endings:
+        raise TargetError(
+            f"{target}: the ending selects the format; choose one of {', '.join(endings)}."
+        )
 
 
 def _write(table: Table, target: Path, *, binary: bool) -> None:

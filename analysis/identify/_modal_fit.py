@@ -76,8 +76,8 @@ class ModalFit:
         something else.
     constants : ndarray, shape (4 n,)
         `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
-    covariance : ndarray, shape (4 n, 4 n)
-        Of the constants.
+    joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
+        Covariance of the constants and the coefficients of the background.
     evidence : tuple of float
         Deviance that each mode saves.
     residual : ndarray of complex, shape (K,)
@@ -99,7 +99,7 @@ class ModalFit:
     model: ModalModel
     numbers: tuple[int, ...]
     constants: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    joint_covariance: NDArray[np.float64]
     evidence: tuple[float, ...]
     residual: NDArray[np.complex128]
     deviance: float
@@ -126,6 +126,11 @@ class ModalFit:
         return saved
 
     @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of the constants, shape (4 n, 4 n)."""
+        return self.joint_covariance[: self.constants.size, : self.constants.size]
+
+    @property
     def explained(self) -> bool:
         """Whether nothing but noise remains."""
         return self.whiteness.white and not self.input_relation.related
@@ -139,12 +144,13 @@ class ModalFit:
     def as_json(self) -> dict[str, Any]:
         """Modal model with the covariance of its constants, as `json.dumps` takes it."""
         names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
+        names += [f"background_{power}" for power in range(BACKGROUND)]
         return {
             **self.model.as_json(),
             "modes": list(self.numbers),
             "constants": self.constants.tolist(),
             "names": names,
-            "covariance": self.covariance.tolist(),
+            "covariance": self.joint_covariance.tolist(),
         }
 
     def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
@@ -308,7 +314,7 @@ class _Search:
             model=model,
             numbers=numbers,
             constants=constants,
-            covariance=covariance,
+            joint_covariance=covariance,
             evidence=tuple(saved.tolist()),
             residual=residual,
             deviance=squares + 2 * float(np.sum(np.log(search.noise.power[counts]))),
@@ -504,10 +510,13 @@ class _Problem:
     def constants(
         self, point: _Point, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`CONSTANTS` of all modes and their covariance."""
+        """`CONSTANTS` of all modes, and their covariance with that of the background."""
         count = x.size // 2
         constants = np.empty(4 * count)
-        chain = np.zeros((4 * count, x.size + 2 * count))
+        linear = x.size + 2 * count  # place of the first coefficient of the background
+        chain = np.zeros((4 * count + BACKGROUND, linear + BACKGROUND))
+        background = chain[4 * count :]
+        background[:, linear:] = np.diag(self.scale_rad_s ** -np.arange(float(BACKGROUND)))
         for k in range(count):
             log_omega, eta = x[2 * k : 2 * k + 2]
             a, b = point.linear[2 * k : 2 * k + 2]
@@ -530,6 +539,9 @@ class _Problem:
             rows[1, eta_at] = 1 / eta
             rows[2, [omega_at, eta_at, a_at, b_at]] = 1.0, by_eta.real, by_a.real, by_b.real
             rows[3, [eta_at, a_at, b_at]] = by_eta.imag, by_a.imag, by_b.imag
+            # What the numerator leaves beyond the poles, as in `model_and_residual`.
+            background[0, [a_at, b_at, eta_at]] = 1.0, -eta, -b
+            background[1, [b_at, omega_at]] = np.array([1.0, -b]) / math.exp(log_omega)
         own = covariance[: chain.shape[1], : chain.shape[1]]
         return constants, chain @ own @ chain.T
 

@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +56,7 @@ def foreign_files(simulated, tmp_path):
 @pytest.mark.further  # parsed in tests/docs
 def test_every_example_runs_as_written(analyze, foreign_files, tmp_path, monkeypatch, capsys):
     angle, torque = foreign_files
-    (profile,), shells, (python,) = blocks("toml"), blocks("sh"), blocks("python")
+    (profile,), shells, (python, _, _) = blocks("toml"), blocks("sh"), blocks("python")
     (tmp_path / "beam.toml").write_text(profile)
     monkeypatch.chdir(tmp_path)
     for line in "".join(shells).splitlines():
@@ -73,6 +75,40 @@ def test_every_example_runs_as_written(analyze, foreign_files, tmp_path, monkeyp
     frequency_hz, decibels = re.findall(r"[\d.]+", capsys.readouterr().out)
     assert float(frequency_hz) == pytest.approx(16.1, abs=0.3)  # second mode of the paper's antenna
     assert 25 < float(decibels) < 40
+
+
+@pytest.fixture
+def exported_models(simulated, analyze, tmp_path, monkeypatch):
+    """Models as the document's examples read them, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    options = ("--beam", "--samples", 2, "--order", 14)
+    for name in ("antenna.npz", "antenna.mat"):
+        result = analyze("export", "model", simulated, name, *options)
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.further  # what is read is tested in test_model_export.py
+def test_the_examples_read_a_model(exported_models, capsys):
+    _, with_scipy, with_control = blocks("python")
+    exec(with_scipy, {})
+    assert "torque per angle: [" in capsys.readouterr().out
+    pytest.importorskip("control", reason="an example reads a model with python-control")
+    exec(with_control, {})
+    assert re.search(r"1[47] poles", capsys.readouterr().out)  # 3 of a delay, if it is positive
+
+
+@pytest.mark.further
+def test_the_example_for_octave_reads_a_model(exported_models):
+    octave = shutil.which("octave-cli")
+    if octave is None:
+        pytest.skip("Octave is not installed")
+    (example,) = blocks("octave")
+    done = subprocess.run(
+        [octave, "--norc", "--eval", f"pkg load control\n{example}"],
+        check=False, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "beam: 14 states, 2 samples" in done.stdout
 
 
 def test_the_document_has_every_unit_and_the_limits(tmp_path):

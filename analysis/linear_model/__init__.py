@@ -1,0 +1,9 @@
+"""Linear models of an identified antenna, for the design of controllers and for simulations.
+
+`identified_in_session` and `identified_in_document` hold what an analysis found; `linear_model`
+makes a state space of it with its error, its uncertainty and samples of the posterior.
+"""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,347 @@
+"""An identified model as matrices for other programs, with its error and its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from analysis.linear_model._dynamics import LinearModelError
+from analysis.linear_model._identified import PASSED
+from analysis.linear_model._order import realised
+from analysis.linear_model._pole_fit import PoleFit, angle_response, imaginary_axis
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from analysis.linear_model._dynamics import Dynamics, Uncertain
+    from analysis.linear_model._identified import IdentifiedModel
+    from analysis.linear_model._pole_fit import Input, Structure
+    from analysis.linear_model._state_space import StateSpace
+
+SAMPLES: Final = 50
+"""Samples of the posterior by default."""
+
+_SEED: Final = 0
+_TRIES_PER_SAMPLE: Final = 10
+_TABLE_POINTS: Final = 400
+_STEP_STD: Final = 1e-3
+"""Step of the derivatives, in standard deviations."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelOptions:
+    """How a model is exported.
+
+    Attributes
+    ----------
+    beam : bool
+        Export the beam's model even if a uniform beam does not predict the modes.
+    given : str
+        Input: "acceleration", or "angle" for angle, velocity and acceleration.
+    order : int or None
+        Number of states; None: as few as the accuracy needs.
+    rate_hz : float or None
+        Rate at which the input is held; None: continuous time.
+    samples : int
+        Number of samples of the posterior.
+    """
+
+    beam: bool = False
+    given: Input = "acceleration"
+    order: int | None = None
+    rate_hz: float | None = None
+    samples: int = SAMPLES
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Samples of the parameters, and the state space of each with the same states.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (samples, k)
+    systems : tuple of StateSpace
+    """
+
+    parameters: NDArray[np.float64]
+    systems: tuple[StateSpace, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """Error of a realisation and standard deviation of the response over a band.
+
+    Both are relative to the exact response, and of continuous time.
+
+    Attributes
+    ----------
+    band_hz : tuple of float
+        Band for which the model is made.
+    frequency_hz : ndarray, shape (m,)
+        Evenly spaced in the logarithm, with the poles and zeros of the response.
+    response : ndarray of complex, shape (m,)
+        Exact response with filters and delay, coupling torque over motor angle in N·m/rad.
+    error : ndarray, shape (m,)
+    std : ndarray, shape (m,)
+        NaN if no covariance is stated.
+    error_max : float
+        Largest on a grid that is several times denser than `frequency_hz`.
+    """
+
+    band_hz: tuple[float, float]
+    frequency_hz: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    error: NDArray[np.float64]
+    std: NDArray[np.float64]
+    error_max: float
+
+    @property
+    def error_median(self) -> float:
+        """Median of the error."""
+        return float(np.median(self.error))
+
+    @property
+    def std_max(self) -> float:
+        """Largest standard deviation, NaN if it is not known."""
+        return float(self.std.max())
+
+    @property
+    def std_median(self) -> float:
+        """Median of the standard deviation, NaN if it is not known."""
+        return float(np.median(self.std))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearModel:
+    """A model that was exported.
+
+    Attributes
+    ----------
+    identified : IdentifiedModel
+    kind : str
+        Which of its models was realised: "beam" or "modal".
+    uncertain : Uncertain
+        Its parameters.
+    options : ModelOptions
+    system : StateSpace
+    structure : Structure
+        Its states.
+    accuracy : Accuracy
+    posterior : Posterior
+    """
+
+    identified: IdentifiedModel
+    kind: Literal["beam", "modal"]
+    uncertain: Uncertain
+    options: ModelOptions
+    system: StateSpace
+    structure: Structure
+    accuracy: Accuracy
+    posterior: Posterior
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the model."""
+        if self.kind == "modal":
+            return self.identified.modal_notes
+        status, _ = self.identified.gate
+        doubt = "" if status == PASSED else f"whether a uniform beam predicts the modes: {status}"
+        return (*filter(None, [doubt]), *self.identified.beam_notes)
+
+    def variables(self) -> dict[str, Any]:
+        """Return the content of a file: strings, numbers, lists of strings and arrays by name."""
+        system, accuracy, posterior = self.system, self.accuracy, self.posterior
+        modal = self.identified.modal
+        of_modal = self.identified.modal_covariance()
+        modal_names, modal_covariance = of_modal or ((), np.zeros((0, 0)))
+        status, p_value = self.identified.gate
+        n, (p, m) = system.order, system.d.shape
+        stacked = {
+            name: np.array([getattr(each, name.lower()) for each in posterior.systems]).reshape(
+                -1, *shape
+            )
+            for name, shape in (("A", (n, n)), ("B", (n, m)), ("C", (p, n)), ("D", (p, m)))
+        }
+        return {
+            "format": "rigd linear model",
+            "format_version": 1,
+            "source": self.identified.source,
+            "model": self.kind,
+            "uniform_beam_status": status,
+            "uniform_beam_p_value": np.nan if p_value is None else p_value,
+            "notes": list(self.notes),
+            "order": n,
+            "A": system.a,
+            "B": system.b,
+            "C": system.c,
+            "D": system.d,
+            "Ts": system.period_s,
+            "delay_s": system.delay_s,
+            "inputs": list(system.inputs.names),
+            "input_units": list(system.inputs.units),
+            "outputs": list(system.outputs.names),
+            "output_units": list(system.outputs.units),
+            "states": list(system.states.names),
+            "state_units": list(system.states.units),
+            "band_hz": np.array(accuracy.band_hz),
+            "frequency_hz": accuracy.frequency_hz,
+            "response_nm_per_rad": accuracy.response,
+            "error": accuracy.error,
+            "error_max": accuracy.error_max,
+            "error_median": accuracy.error_median,
+            "uncertainty": accuracy.std,
+            "uncertainty_max": accuracy.std_max,
+            "uncertainty_median": accuracy.std_median,
+            "parameter_names": list(self.uncertain.names),
+            "parameter_values": self.uncertain.values,
+            "parameter_covariance": self.uncertain.covariance,
+            "parameter_samples": posterior.parameters,
+            **{f"{name}_samples": values for name, values in stacked.items()},
+            "delay_samples_s": np.array([each.delay_s for each in posterior.systems]),
+            "poles_rad_s": np.array([] if modal is None else modal.poles_rad_s, complex),
+            "residues_nm_per_s": np.array([] if modal is None else modal.residues, complex),
+            "background": np.array([] if modal is None else modal.background),
+            "modal_names": list(modal_names),
+            "modal_covariance": modal_covariance,
+        }
+
+
+def linear_model(
+    identified: IdentifiedModel,
+    options: ModelOptions,
+    on_step: Callable[[str], None] = lambda _step: None,
+) -> LinearModel:
+    """Realise the beam where it predicts the modes or is requested, else the modal model.
+
+    Parameters
+    ----------
+    identified : IdentifiedModel
+    options : ModelOptions
+    on_step : callable, optional
+        Called with a few words before each step.
+
+    Raises
+    ------
+    LinearModelError, rigd.identified_beam.IdentifiedBeamError
+        If the model cannot be realised, or samples are requested of one without covariance.
+    """
+    as_beam = options.beam or identified.gate[0] == PASSED
+    uncertain = identified.beam() if as_beam else identified.modes()
+    if options.samples and not uncertain.names:
+        key = "covariance" if as_beam else "modal_model.covariance"
+        raise LinearModelError(
+            f"{identified.where} has no {key}, as of an older version or of a campaign, so no "
+            "samples can be drawn; analyze a session again, or add --samples 0."
+        )
+    on_step("order")
+    nominal = uncertain.nominal
+    fit = PoleFit(nominal)
+    structure, system = realised(fit, options.order, options.given)
+    on_step("accuracy")
+    accuracy = _accuracy(uncertain, fit, system)
+    on_step("samples")
+    posterior = _posterior(uncertain, fit, structure, options)
+    if options.rate_hz is not None:
+        rate_hz = options.rate_hz
+        system = system.held(rate_hz)
+        held = tuple(each.held(rate_hz) for each in posterior.systems)
+        posterior = replace(posterior, systems=held)
+    return LinearModel(
+        identified,
+        "beam" if as_beam else "modal",
+        uncertain,
+        options,
+        system,
+        structure,
+        accuracy,
+        posterior,
+    )
+
+
+def _accuracy(uncertain: Uncertain, fit: PoleFit, system: StateSpace) -> Accuracy:
+    low, high = fit.dynamics.band_hz
+    marks = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
+    inner = marks[(marks > low) & (marks < high)]
+    frequency_hz = np.sort(np.concatenate([np.geomspace(low, high, _TABLE_POINTS), inner]))
+    s = imaginary_axis(frequency_hz)
+    exact = fit.dynamics.filtered(s)
+    return Accuracy(
+        fit.dynamics.band_hz,
+        frequency_hz,
+        exact * np.exp(-fit.dynamics.delay_s * s),
+        np.abs(angle_response(system, s) / exact - 1),
+        _relative_std(uncertain, s),
+        float(fit.error(system).max()),
+    )
+
+
+def _relative_std(uncertain: Uncertain, s: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return the relative standard deviation of the response with its delay (delta method)."""
+    if not uncertain.names:
+        return np.full(s.size, np.nan)
+
+    def response(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        dynamics = uncertain.at(uncertain.named(values))
+        return dynamics.filtered(s) * np.exp(-dynamics.delay_s * s)
+
+    variances, directions = np.linalg.eigh(uncertain.covariance)
+    total = np.zeros(s.size)
+    for variance, direction in zip(variances, directions.T, strict=True):
+        if variance > 0:
+            change = np.sqrt(variance) * _STEP_STD * direction
+            above, below = response(uncertain.values + change), response(uncertain.values - change)
+            total += np.abs((above - below) / (2 * _STEP_STD)) ** 2
+    std: NDArray[np.float64] = np.sqrt(total) / np.abs(response(uncertain.values))
+    return std
+
+
+def _posterior(
+    uncertain: Uncertain, fit: PoleFit, structure: Structure, options: ModelOptions
+) -> Posterior:
+    """Draw parameters from a normal distribution, and realise each with the same states."""
+    count = options.samples
+    drawn: list[NDArray[np.float64]] = []
+    systems: list[StateSpace] = []
+    generator = np.random.default_rng(_SEED)
+    for _ in range(count * _TRIES_PER_SAMPLE):
+        if len(drawn) == count:
+            break
+        values = generator.multivariate_normal(
+            uncertain.values, uncertain.covariance, method="eigh", check_valid="ignore"
+        )
+        dynamics = _sampled(uncertain, values, fit.dynamics, structure)
+        if dynamics is None:
+            continue
+        sampled = PoleFit(dynamics, near=fit)
+        coefficients, _ = sampled.solve(structure)
+        if sampled.stable_on_motor(structure, coefficients):
+            drawn.append(values)
+            systems.append(sampled.system(structure, coefficients, options.given))
+    if len(drawn) < count:
+        raise LinearModelError(
+            f"Only {len(drawn)} of {count} samples of the posterior have the states of the model: "
+            "its parameters are too uncertain; record more, or add --samples 0."
+        )
+    return Posterior(np.array(drawn).reshape(count, uncertain.values.size), tuple(systems))
+
+
+def _sampled(
+    uncertain: Uncertain, values: NDArray[np.float64], nominal: Dynamics, structure: Structure
+) -> Dynamics | None:
+    """Return the dynamics of a sample; None if it is impossible or has not the same states."""
+    parameters = uncertain.named(values)
+    if not uncertain.allowed(parameters):
+        return None
+    try:
+        dynamics = uncertain.at(parameters)
+    except LinearModelError:
+        return None
+    same_modes = dynamics.names[: structure.pairs] == nominal.names[: structure.pairs] and len(
+        dynamics.real_poles
+    ) == len(nominal.real_poles)
+    same_filters = [each[1] for each in dynamics.filters] == [each[1] for each in nominal.filters]
+    return dynamics if same_modes and same_filters else None

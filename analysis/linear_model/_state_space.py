@@ -1,0 +1,131 @@
+"""Linear state space with named inputs, outputs and states, and a delay of its outputs.
+
+In continuous time ``x' = A x + B u``, ``y(t) = C x(t - delay) + D u(t - delay)``; at a rate
+``x[k+1] = A x[k] + B u[k]``, the same with the input held between the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+_BLOCK: Final = 256
+"""Frequencies that are solved for together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """Names and units of the components of a vector, in ASCII."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateSpace:
+    """Matrices of a linear system, without its delay.
+
+    Attributes
+    ----------
+    a, b, c, d : ndarray, shapes (n, n), (n, m), (p, n), (p, m)
+    inputs, outputs, states : Signals
+    delay_s : float
+        By how much the outputs come later than the matrices say; negative: the inputs are older
+        than the outputs.
+    period_s : float
+        Time between the samples; 0 in continuous time.
+    """
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    c: NDArray[np.float64]
+    d: NDArray[np.float64]
+    inputs: Signals
+    outputs: Signals
+    states: Signals
+    delay_s: float = 0.0
+    period_s: float = 0.0
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the response in continuous time without the delay, shape (len(s), p, m).
+
+        Parameters
+        ----------
+        s : ndarray of complex
+            In rad/s, none of them a pole.
+        """
+        found = np.empty((s.size, *self.d.shape), dtype=np.complex128)
+        for first in range(0, s.size, _BLOCK):
+            block = s[first : first + _BLOCK, None, None]
+            resolvent = np.linalg.solve(block * np.eye(self.order) - self.a, self.b[None] + 0j)
+            found[first : first + _BLOCK] = self.c @ resolvent + self.d
+        return found
+
+    def held(self, rate_hz: float) -> StateSpace:
+        """Return the system at a rate, exact for inputs that are constant between the samples.
+
+        Parameters
+        ----------
+        rate_hz : float
+        """
+        from scipy.signal import cont2discrete
+
+        a, b, c, d, period_s = cont2discrete(
+            (self.a, self.b, self.c, self.d), 1.0 / rate_hz, method="zoh"
+        )
+        return replace(self, a=a, b=b, c=c, d=d, period_s=float(period_s))
+
+
+def with_filter(system: StateSpace, time_constant_s: float, order: int) -> StateSpace:
+    """Let the only output through a low-pass filter of order 1 or 2 (Butterworth).
+
+    Parameters
+    ----------
+    system : StateSpace
+        In continuous time.
+    time_constant_s : float
+        Reciprocal corner frequency, s/rad.
+    order : int
+    """
+    n, m = system.b.shape
+    omega = 1.0 / time_constant_s
+    a = np.zeros((n + order, n + order))
+    b = np.zeros((n + order, m))
+    a[:n, :n], b[:n] = system.a, system.b
+    first, last = n, n + order - 1
+    # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
+    a[last, :n], b[last] = omega * system.c[0], omega * system.d[0]
+    a[last, first] = -omega
+    if order == 2:
+        a[first, last] = omega
+        a[last, last] = -np.sqrt(2) * omega
+    unit = system.outputs.units[0]
+    names = ("filter_output", "filter_slope")[:order]
+    return replace(
+        system,
+        a=a,
+        b=b,
+        c=np.eye(1, n + order, n),
+        d=np.zeros_like(system.d),
+        states=joined((system.states, Signals(names, (unit,) * order))),
+    )
+
+
+def joined(parts: Sequence[Signals]) -> Signals:
+    """Return the components of several vectors one after the other."""
+    return Signals(
+        tuple(name for each in parts for name in each.names),
+        tuple(unit for each in parts for unit in each.units),
+    )
