@@ -30,6 +30,7 @@ Kind = Literal[
     "drifting gain",
     "clipping",
     "play",
+    "nonlinear gain",
     "knock",
     "stop",
     "implausible",

@@ -24,7 +24,7 @@ import numpy as np
 
 from analysis.identify._free_decay import Pole, mode_poles
 from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
-from analysis.identify._noise import smooth_power
+from analysis.identify._noise import smooth_power, with_peaks
 from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.identify._result import Ringing
 from analysis.optimizer import Box, NormalEquations, descend
@@ -49,6 +49,11 @@ _NEAR: Final = 0.15
 _LOWEST: Final = 0.12
 """Lowest frequency compared, relative to the first mode: below are drift and 1/f noise, and nothing
 that determines a mode."""
+
+_HALF_WIDTHS: Final = 3.0
+_NEAREST: Final = 0.02
+"""Range about a mode in which the noise has no narrow peak: in half-widths, and at least relative
+to the frequency."""
 
 _NOISE_PASSES: Final = 3
 _SETTLED: Final = 0.02
@@ -238,7 +243,9 @@ class _Search:
             search = search.descended()
             model, residual = search.problem().model_and_residual(search.x)
             comparison = search.comparison.renewed(model, search.noise).filled(model)
-            power = smooth_power(residual, finely=True) / comparison.measurement.torque_share
+            power = smooth_power(residual, finely=True)
+            power = with_peaks(residual, power, ~search.near_modes())
+            power /= comparison.measurement.torque_share
             counts = search.noise.counts
             change = np.abs(np.log(power / search.noise.power)[counts]).mean()
             search = replace(
@@ -247,6 +254,14 @@ class _Search:
             if change < _SETTLED and comparison.measurement.torque_known.all():
                 break
         return search.descended()
+
+    def near_modes(self) -> NDArray[np.bool_]:
+        """Bins in which what remains may be a mode's, not the noise's, shape (K,)."""
+        hz = self.comparison.frequency_hz[:, None]
+        frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
+        reach = np.maximum(_HALF_WIDTHS * eta / 2, _NEAREST) * frequencies
+        near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach, axis=1)
+        return near
 
     def cost(self) -> float:
         """Sum of whitened squares at this point."""

@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 _BLOCKS: Final = 24
 _FEWEST_BINS: Final = 40
 _FINE_BINS: Final = 60
+_PEAK_BINS: Final = 12
+_PEAK: Final = 2.4
+"""Mean power over so many bins, relative to the smooth one, that chance exceeds in one record of a
+hundred."""
+
 _MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
 
 _LINE: Final = 20.0
@@ -133,6 +138,26 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
     middles = (edges[:-1] + edges[1:] - 1) / 2
     smooth: NDArray[np.float64] = np.exp(np.interp(np.arange(power.size), middles, logs))
     return smooth
+
+
+def with_peaks(
+    residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Power of the noise with peaks that are narrower than the blocks of `smooth_power`, (K,).
+
+    Parameters
+    ----------
+    residual : ndarray of complex, shape (K,)
+    power : ndarray, shape (K,)
+        Smooth.
+    where : ndarray of bool, shape (K,)
+        Where a peak may be.
+    """
+    ratio = (residual.real**2 + residual.imag**2) / power
+    local = np.convolve(ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
+    # Around each place that stands out, as far as the mean over so many bins sees it.
+    out = np.convolve(local > _PEAK, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
+    return np.where(out & where, power * np.maximum(local, 1.0), power)
 
 
 def _edges(bins: int) -> NDArray[np.intp]:

@@ -19,7 +19,6 @@ from analysis.identify._comparison import Comparison
 from analysis.identify._diagnostics import findings, of_settings, unexplained
 from analysis.identify._drag import (
     damping_with_amplitude,
-    small_drag,
     with_air_drag,
     with_evident_drag,
 )
@@ -29,10 +28,9 @@ from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline
 from analysis.identify._knock import MOST_KNOCKS, knocks_in, of_knocks, with_knock
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modal_headline import tolerant_order, with_modal_model
-from analysis.identify._nonlinear import ModalForces, Term, nonlinear_forces
+from analysis.identify._nonlinear import nonlinear_forces
 from analysis.identify._profile_likelihood import WIDEST_SHARE, profiled
 from analysis.identify._residual_tests import (
-    SURE,
     InputRelation,
     Whiteness,
     harmonics,
@@ -41,7 +39,8 @@ from analysis.identify._residual_tests import (
 )
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
-from analysis.identify._time_varying import along_time, changing, established, play
+from analysis.identify._small_effects import small_effect
+from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
@@ -60,11 +59,12 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
 
+    from numpy.typing import NDArray
+
     from analysis.identify._candidate import Candidate, Kind
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
-    from analysis.identify._nonlinear import Kind as ForceKind
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._profile_likelihood import Order
@@ -75,9 +75,6 @@ if TYPE_CHECKING:
 
 
 _MODES_TO_JUDGE: Final = 2
-_EFFECT: Final = SURE**2 + 2 * math.log(8)
-"""Deviance that an effect of the amplitude must save beside the modal model: eight are tried."""
-
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
 """Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
@@ -224,12 +221,17 @@ def _selected(
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
     linear = again or CandidateSet.of_uniform(measurement, fixed, band_hz)
     modal = _modal(linear)
-    field = linear
+    field, small = linear, None
     forces: tuple[NonlinearForce, ...] = ()
     changes: tuple[Change, ...] = ()
-    if modal is None or not _linear_and_constant(linear, modal, band_hz):
+    plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
+    if modal is not None and plain:
+        small = small_effect(linear.comparison, modal, linear.likeliest.plant)
+    if not plain or (small is not None and small.large):
         field, forces, changes = _with_effects(linear, fixed, band_hz, again=bool(again))
-        modal = _modal(field)
+        modal, small = _modal(field), None
+    elif small is not None:
+        modal = _modal(linear, small.column[None])
     field = field.with_orders_free()
     visible = _visible(field, modal)
     test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
@@ -267,6 +269,7 @@ def _selected(
     else:
         along = tuple(changing(changes, one_sweep=measurement.one_sweep))
         found += _settings(told, numbers, kinds)
+        found += () if small is None else (small.finding(),)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
@@ -303,8 +306,15 @@ def _selected(
     return _Told(selection, told, explained, kinds)
 
 
-def _modal(field: CandidateSet) -> ModalFit | None:
-    """Fit the modal model to what a set of candidates was fitted to; None if no mode shows."""
+def _modal(field: CandidateSet, further: NDArray[np.complex128] | None = None) -> ModalFit | None:
+    """Fit the modal model to what a set of candidates was fitted to; None if no mode shows.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    further : ndarray of complex, shape (c, K), optional
+        Spectra of unknown size beside the candidates' own.
+    """
     if field.misread:
         return None
     starts = [
@@ -313,6 +323,8 @@ def _modal(field: CandidateSet) -> ModalFit | None:
         if mode.frequency_hz > 0
     ]
     columns, drag = field.columns, field.comparison.drag
+    if further is not None:
+        columns = np.concatenate([columns, further])
     if drag is not None:  # its size is not known exactly
         columns = np.concatenate([columns, drag.by_law])
     return fit_modes(field.comparison, field.noise, starts, columns)
@@ -365,22 +377,9 @@ def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tu
 def _linear_and_constant(
     field: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Whether the modal model leaves nothing but noise: nothing else need be looked for.
-
-    Nor must what depends on the amplitude make it better: the residual of a small effect is white.
-    """
+    """Whether the modal model leaves nothing but noise: nothing else need be looked for."""
     _, _, multiples = _tests(field, modal, band_hz)
-    if not modal.explained or any(each.present for each in multiples):
-        return False
-    comparison, plant = field.comparison, field.likeliest.plant
-    forces = ModalForces(comparison, plant)
-    stiffening: tuple[ForceKind, ...] = ("cubic stiffness", "quadratic stiffness")
-    columns = [
-        *(forces.column(Term(kind, mode)) for kind in stiffening for mode in modal.visible),
-        *small_drag(comparison, plant),
-        play(comparison, plant),
-    ]
-    return bool(modal.saved_by(np.array(columns)).max() < _EFFECT)
+    return modal.explained and not any(each.present for each in multiples)
 
 
 def _with_effects(

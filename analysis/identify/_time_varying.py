@@ -61,7 +61,7 @@ _IN_SIGHT: Final = 0.75
 """Share of a rival's lower BIC that a column has to promise. The first order foretells it to a
 tenth."""
 
-_UNIT_PLAY_RAD: Final = 1e-4
+UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 8
 _SETTLED: Final = 0.01
 
@@ -128,7 +128,7 @@ def along_time(
     found = []
     for what, (bic, refit) in tried.items():
         sizes, std = refit.amplitudes()
-        unit = _UNIT_PLAY_RAD if what == "play" else 1.0
+        unit = UNIT_PLAY_RAD if what == "play" else 1.0
         change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
         if change.behind < STRONG and _possible(change):
             found.append((change, refit))
@@ -232,14 +232,14 @@ def _column(
 
 
 def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Spectrum of the torque by a backlash of `_UNIT_PLAY_RAD`, shape (K,)."""
+    """Spectrum of the torque by a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
     return _column(comparison, plant, _lag_of_play(comparison), "play", 0.0)
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
-    """Hub's angle less the shaft's with a backlash of `_UNIT_PLAY_RAD`, at the decimated rate."""
+    """Hub's angle less the shaft's with a backlash of `UNIT_PLAY_RAD`, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    half, here, hub = _UNIT_PLAY_RAD / 2, 0.0, []
+    half, here, hub = UNIT_PLAY_RAD / 2, 0.0, []
     shaft = comparison.measurement.angle_from_rest(highest_hz)
     for angle in shaft.tolist():
         # A comparison each: min and max take three times as long, at every tick of the record.
