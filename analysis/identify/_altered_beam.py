@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rigd.beam import clamped_free_eigenvalues, mode_shape
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from analysis.identify._plant import Plant
     from rigd.beam import Beam
@@ -43,7 +43,7 @@ _ITERATIONS: Final = 2
 _APART: Final = 1e-7
 """Relative distance of the shift of inverse iterations from the eigenvalue."""
 
-Terms = NDArray[np.float64] | NDArray[np.complex128]
+Terms = NDArray[np.inexact[Any]]
 Profile = Literal["taper", "outer half", "wave"]
 """Deviation along the beam: from -1/2 to 1/2; 0 and 1; a cosine of one period."""
 
@@ -164,7 +164,9 @@ class _Basis:
     arms_of_tension: NDArray[np.float64]
     tension: NDArray[np.float64]
 
-    def weighted(self, rows: NDArray[np.float64], profile: Any) -> NDArray[np.float64]:
+    def weighted(
+        self, rows: NDArray[np.float64], profile: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Integrals of products of rows, weighted by a profile, shape (N, N)."""
         found: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
         return found
@@ -177,9 +179,9 @@ class _Basis:
         return total
 
 
-_PROFILES: Final = {
+_PROFILES: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = {
     "taper": lambda x: x - 0.5,
-    "outer half": lambda x: np.where(x > 0.5, 1.0, 0.0),  # noqa: PLR2004 - the middle
+    "outer half": lambda x: np.where(x > 0.5, 1.0, 0.0),
     "wave": lambda x: np.cos(2 * np.pi * x),
 }
 
@@ -262,17 +264,17 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: Sequence[int]) -> Mode
     softer = 1 / (1 + basis.deviation(alteration.stiffness))
     bends = padded(basis.weighted(moments, softer), _NEXT**-4.0)
     at_root = padded(2 * (-1.0) ** np.arange(_BASIS) / basis.z**2)
-    turns = alteration.clamp_compliance * np.outer(at_root, at_root)
-    elastic = np.linalg.inv(bends + turns)
+    turns: Terms = alteration.clamp_compliance * np.outer(at_root, at_root)
+    elastic: Terms = np.linalg.inv(bends + turns)
     pull = alteration.gravity_m_s2 * beam.density_over_stiffness * length**3
     # Largest 1 / omega²: the lowest modes are the most exact
     lower = np.linalg.inv(np.linalg.cholesky(elastic + pull * tension))
     inverse, vectors = np.linalg.eigh(lower @ (mass + lump) @ lower.T)
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     every = lower.T @ vectors / np.sqrt(inverse)  # of modal mass 1
-    shapes = every[:, places]
-    turns = turns / (1 + 1j * alteration.clamp_loss) if alteration.clamp_loss else turns
+    shapes: Terms = every[:, places]
     if alteration.clamp_loss:
+        turns = turns / (1 + 1j * alteration.clamp_loss)
         elastic = np.linalg.inv(bends + turns)
         shapes = _complex_shapes(elastic + pull * tension, mass + lump, shapes)
     loads = elastic @ shapes
@@ -308,7 +310,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: Sequence[int]) -> Mode
 
 
 def _complex_shapes(
-    elastic: NDArray[np.complex128], mass: NDArray[np.float64], shapes: NDArray[np.float64]
+    elastic: Terms, mass: NDArray[np.float64], shapes: Terms
 ) -> NDArray[np.complex128]:
     """Shapes with a lossy clamp, (N, n), by inverse iteration from those without the loss."""
     found = shapes.astype(np.complex128)

@@ -12,28 +12,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._altered_beam import GRAVITY_M_S2, Alteration, mode_terms
+from analysis.identify._altered_beam import Alteration, mode_terms
+from analysis.identify._causes import CAUSES, RELAXATION
 from analysis.identify._finding import Finding
 from analysis.identify._uniform_beam import REFUSED_BELOW, ConstantsProblem
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.identify._altered_beam import ModeTerms, Profile
+    from analysis.identify._altered_beam import ModeTerms
+    from analysis.identify._causes import Cause
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._plant import Plant
     from analysis.identify._step_in_time import Step
     from analysis.identify._uniform_beam import UniformBeamTest
-    from rigd.beam import Beam
 
-_TOLERANCES: Final = (0.03, 3e-3, 3e-4, 0.0)
+_TOLERANCES: Final = (0.03, 1e-3, 0.0)
 """Of all constants, one after the other: frequencies are known so well that without any the way to
 a minimum would be long and narrow."""
 
-_HOPELESS: Final = 20.0
+_HOPELESS: Final = 6.0
 """Chi-square a degree of freedom, with a tolerance, from which a cause is given up."""
 
 _STEP: Final = 1e-6
@@ -41,10 +42,14 @@ _STEP: Final = 1e-6
 
 _MANY: Final = 12
 _LONGEST: Final = 1.0
+"""Step in any unknown, relative to its scale."""
+
 _RISE: Final = 10.0
+"""Factor by which chi-square may rise in a step."""
+
 _HALVINGS: Final = 3
-_CLOSE: Final = 1e-3
-"""Share of chi-square below which no step is taken."""
+_CLOSE: Final = 0.02
+"""Share of chi-square, or of 1, that a step must promise."""
 
 _RELUCTANCE: Final = 1e-3
 """Keeps an unknown without effect where it is; one determined is moved all the same."""
@@ -54,9 +59,7 @@ _NEAR: Final = 6.0
 
 _GOOD: Final = 0.05
 _MOST_NAMED: Final = 5
-_BUTTERWORTH: Final = 2**0.5
-RELAXATION: Final = "relaxation"
-"""It may be all of the internal damping."""
+_SMALLEST: Final = 1e-99
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,37 +100,6 @@ class Explanation:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class _Cause:
-    """A kind of cause, with one or two unknowns of its own.
-
-    Attributes
-    ----------
-    name : str
-    starts : sequence of tuple of float
-        Unknowns from which searches begin.
-    lower, upper : tuple of float
-        What is plausible; nothing that rests on an outer bound counts.
-    altered : callable
-        Alteration by unknowns, from what is stated and the beam.
-    told : callable
-        Size, unit and words, from unknowns and the beam found.
-    plant : callable, optional
-        Rig with it, from unknowns and the rig with the beam found.
-    special : tuple of str
-        Names of causes that are special cases of this one.
-    """
-
-    name: str
-    starts: Sequence[tuple[float, ...]]
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
-    altered: Callable[[Alteration, Sequence[float], Beam], Alteration]
-    told: Callable[[Sequence[float], Beam], tuple[float, str, str]]
-    plant: Callable[[Sequence[float], Plant], Plant] | None = None
-    special: tuple[str, ...] = ()
-
-
 def explanations(
     fit: ModalFit, nominal: Plant, tilt_deg: float | None = None
 ) -> tuple[Explanation, ...]:
@@ -149,7 +121,7 @@ def explanations(
     straight = problem.starts()[len(problem.starts()) // 2]
     without = np.where(np.arange(found.size) == 0, problem.lower, straight)
     explained_by: dict[str, Explanation] = {}
-    for cause in _CAUSES:
+    for cause in CAUSES:
         bases = (found, straight, without) if cause.name == RELAXATION else (found, straight)
         explained = _explained(problem, cause, bases)
         if explained is None:
@@ -172,16 +144,14 @@ def explanations(
 
 
 def _explained(
-    problem: ConstantsProblem, cause: _Cause, bases: Sequence[NDArray[np.float64]]
+    problem: ConstantsProblem, cause: Cause, bases: Sequence[NDArray[np.float64]]
 ) -> Explanation | None:
     """Fit one cause; None if it is not to be tested, explains nothing or is not plausible."""
     count = problem.lower.size
     freedom = problem.compared - count - len(cause.lower)
     if freedom <= 0:
         return None
-    begun = []
-    for x in bases:
-        begun.append((*_Search(problem, cause, x).begun(), x))
+    begun = [(*_Search(problem, cause, x).begun(), x) for x in bases]
     for _, start, x in sorted(begun, key=lambda each: each[0]):
         cost, y = _fitted(problem, cause, x, start, freedom)
         p_value = float(chi_square_p_value(cost, freedom))
@@ -195,7 +165,7 @@ def _explained(
     if rests.any():
         return None
     plant = problem.plant(y[:count])
-    size, unit, words = cause.told(own.tolist(), plant.beam)
+    size, unit, words = cause.described(own.tolist(), plant.beam)
     return Explanation(
         name=cause.name,
         words=words,
@@ -209,7 +179,7 @@ def _explained(
 
 def _fitted(
     problem: ConstantsProblem,
-    cause: _Cause,
+    cause: Cause,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     freedom: int,
@@ -229,7 +199,7 @@ class _Search:
     Parameters
     ----------
     problem : ConstantsProblem
-    cause : _Cause
+    cause : Cause
     x : ndarray, shape (7,)
         Unknowns of the beam without it. A damping that is none in them stays so.
     tolerance : float
@@ -239,7 +209,7 @@ class _Search:
     def __init__(
         self,
         problem: ConstantsProblem,
-        cause: _Cause,
+        cause: Cause,
         x: NDArray[np.float64],
         tolerance: float = _TOLERANCES[0],
     ) -> None:
@@ -310,10 +280,12 @@ class _Search:
     def _whitened(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:
         """Deviations of beams, (m, 7), with one cause: (m, 4 n)."""
         off = self._problem.differences(x, terms)
-        return np.nan_to_num(off @ self._whitener.T, nan=1e6)
+        found: NDArray[np.float64] = np.nan_to_num(off @ self._whitener.T, nan=1e6)
+        return found
 
     def _deviations(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self._whitened(y[None, : self._x.size], self._terms(y))[0]
+        found: NDArray[np.float64] = self._whitened(y[None, : self._x.size], self._terms(y))[0]
+        return found
 
     def _slopes(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Deviations, and their derivatives by the beam's unknowns."""
@@ -326,9 +298,7 @@ class _Search:
         """Deviations, and their derivatives by all unknowns."""
         deviation, rows = self._slopes(y)
         steps = _STEP * np.diag(self._scale)[self._x.size :]
-        own_rows = [
-            (self._deviations(y + step) - deviation) / step.sum() for step in steps
-        ]
+        own_rows = [(self._deviations(y + step) - deviation) / step.sum() for step in steps]
         return deviation, np.concatenate([rows, own_rows])
 
 
@@ -359,170 +329,6 @@ def _step(
     return step, float(left @ left)
 
 
-# Causes
-
-
-def _with_tilt(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-    return replace(stated, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(own[0])))
-
-
-def _tilt(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    lower = "lower" if own[0] > 0 else "higher"
-    words = f"an axis {_digits(abs(own[0]))}° off plumb (the tip at rest {lower} than the axis)"
-    return own[0], "deg", words
-
-
-def _mass_kg(share: float, beam: Beam) -> float:
-    return share * beam.density_kg_per_m * beam.length_m
-
-
-def _with_tip_mass(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
-    return replace(stated, lumps=((1.0, _mass_kg(own[0], beam)),))
-
-
-def _tip_mass(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    mass_kg = _mass_kg(own[0], beam)
-    return mass_kg, "kg", f"a mass of {_digits(1e3 * mass_kg)} g at the tip"
-
-
-def _with_lump(stated: Alteration, own: Sequence[float], beam: Beam) -> Alteration:
-    return replace(stated, lumps=(*stated.lumps, (own[0], _mass_kg(own[1], beam))))
-
-
-def _lump(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    mass_kg = _mass_kg(own[1], beam)
-    at = f"{100 * own[0]:.0f} % of the length"
-    return mass_kg, "kg", f"a mass of {_digits(1e3 * mass_kg)} g on the beam at {at}"
-
-
-def _compliance(own: Sequence[float], beam: Beam) -> float:
-    return own[0] * beam.length_m / beam.bending_stiffness_n_m2
-
-
-def _with_clamp(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-    return replace(stated, clamp_compliance=own[0], clamp_loss=own[1] if len(own) > 1 else 0.0)
-
-
-def _clamp(own: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    stiffness = 1 / _compliance(own, beam)
-    loss = f" and a loss factor of {_digits(own[1])}" if len(own) > 1 else ""
-    return (
-        stiffness,
-        "N·m/rad",
-        f"a clamp with a stiffness of {_digits(stiffness)} N·m/rad{loss}",
-    )
-
-
-def _corner(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a low-pass filter of first order at {_digits(hz)} Hz in the torque channel"
-
-
-def _second_corner(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a low-pass filter of second order at {_digits(hz)} Hz in the torque channel"
-
-
-def _resonance(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    hz = _hz(own)
-    return hz, "Hz", f"a resonance of sensor or mount near {_digits(hz)} Hz"
-
-
-def _hz(own: Sequence[float]) -> float:
-    return 1e3 / (2 * math.pi * own[0])
-
-
-def _relaxation(own: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    time_s = math.exp(own[0])
-    words = (
-        f"a relaxation of the material in {_digits(1e3 * time_s)} ms that stiffens it by "
-        f"{_digits(100 * own[1])} %"
-    )
-    return own[1], "1", words
-
-
-def _digits(value: float) -> str:
-    """Two digits: no interval is known."""
-    return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"  # noqa: PLR2004
-
-
-def _uneven_mass(profile: Profile, words: str) -> _Cause:
-    def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, density=((profile, own[0]),))
-
-    return _Cause("uneven mass", _EITHER, (-0.3,), (0.3,), altered, _deviation(words))
-
-
-def _uneven_stiffness(profile: Profile, words: str) -> _Cause:
-    def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated, stiffness=((profile, own[0]),))
-
-    return _Cause("uneven stiffness", _EITHER, (-0.3,), (0.3,), altered, _deviation(words))
-
-
-def _deviation(words: str) -> Callable[[Sequence[float], Beam], tuple[float, str, str]]:
-    return lambda own, _: (own[0], "1", words.format(f"{float(f'{100 * own[0]:.2g}'):+g} %"))
-
-
-_EITHER: Final = ((-0.05,), (-0.01,), (0.01,), (0.05,))
-_CAUSES: Final = (
-    _Cause("tilt", ((-4.0,), (-1.0,), (1.0,), (4.0,)), (-10.0,), (10.0,), _with_tilt, _tilt),
-    _Cause(
-        "tip mass", ((0.003,), (0.02,), (0.1,), (0.25,)), (0.0,), (1.0,), _with_tip_mass, _tip_mass,
-        lambda own, plant: replace(plant, tip_mass_kg=_mass_kg(own[0], plant.beam)),
-    ),
-    _Cause(
-        "lump", tuple((0.05 * place, size) for place in range(3, 20, 2) for size in (0.003, 0.03)),
-        (0.02, 0.0), (0.99, 0.5), _with_lump, _lump, special=("tip mass",),
-    ),
-    _uneven_mass("taper", "a mass per length that changes by {} from root to tip"),
-    _uneven_mass("outer half", "an outer half with {} mass per length"),
-    _uneven_mass("wave", "a mass per length with {} at both ends and the opposite in the middle"),
-    _uneven_stiffness("taper", "a bending stiffness that changes by {} from root to tip"),
-    _uneven_stiffness("outer half", "an outer half with {} bending stiffness"),
-    _uneven_stiffness(
-        "wave", "a bending stiffness with {} at both ends and the opposite in the middle"
-    ),
-    _Cause(
-        "elastic clamp", ((1e-4,), (1e-3,), (1e-2,)), (0.0,), (0.2,), _with_clamp, _clamp,
-        lambda own, plant: replace(plant, root_compliance_rad_per_nm=_compliance(own, plant.beam)),
-    ),
-    _Cause(
-        "lossy clamp",
-        tuple((size, loss) for size in (1e-4, 1e-3, 1e-2) for loss in (0.02, 0.1)),
-        (0.0, 0.0), (0.2, 0.5), _with_clamp, _clamp, special=("elastic clamp",),
-    ),
-    _Cause(
-        "torque filter of first order", ((0.2,), (0.6,), (2.0,)), (0.0,), (20.0,),
-        lambda stated, own, _: replace(stated, lag_s=1e-3 * own[0]), _corner,
-        lambda own, plant: replace(plant, filter_time_constant_s=1e-3 * own[0]),
-    ),
-    _Cause(
-        "torque filter of second order", ((0.2,), (0.6,), (2.0,)), (0.0,), (10.0,),
-        lambda stated, own, _: replace(stated, sensor=(1e-3 * own[0], _BUTTERWORTH)),
-        _second_corner,
-        lambda own, plant: replace(plant, second_order_filter_time_constant_s=1e-3 * own[0]),
-    ),
-    _Cause(
-        "sensor resonance",
-        tuple((size, loss) for size in (0.3, 0.6, 1.0, 1.6) for loss in (0.05, 0.5)),
-        (0.0, 0.0), (3.0, 2.0),
-        lambda stated, own, _: replace(stated, sensor=(1e-3 * own[0], own[1])), _resonance,
-        special=("torque filter of second order",),
-    ),
-    _Cause(
-        RELAXATION,
-        tuple(
-            (math.log(time_s), strength)
-            for time_s in (5e-4, 1.5e-3, 4e-3, 1e-2, 3e-2, 0.1, 0.3)
-            for strength in (0.003, 0.01, 0.03, 0.1)
-        ),
-        (math.log(1e-4), 0.0), (math.log(3.0), 0.5),
-        lambda stated, own, _: replace(stated, relaxation=(own[1], math.exp(own[0]))), _relaxation,
-    ),
-)  # fmt: skip
-
-
 # Words
 
 
@@ -543,7 +349,9 @@ def finding(
     named = [each.words for each in found]
     if step is not None and step.named:
         named.append(step.words)
-    refused = f"A plain uniform beam does not predict the modes (p = {test.p_value:.1g})."
+    p_value = test.p_value or 0.0
+    probability = f"p = {p_value:.1g}" if p_value > _SMALLEST else f"p < {_SMALLEST:g}"
+    refused = f"A plain uniform beam does not predict the modes ({probability})."
     if not named:
         return Finding(
             kind="rival explanations",

@@ -56,7 +56,7 @@ _LN_RANGE: Final = 2.0
 _DELAY_UNIT_S: Final = 0.01
 _LARGEST_DELAY: Final = 1.0
 _RENEWALS: Final = 4
-"""Times that the shapes of a loaded or tilted beam are computed, each with the beam found so far."""
+"""Times that the shapes of a loaded or tilted beam are computed, with the beam found so far."""
 
 _CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS: Final = 0.2
