@@ -220,7 +220,8 @@ def _basis() -> _Basis:
     )
 
 
-def mode_terms(alteration: Alteration, beam: Beam, modes: Sequence[int]) -> ModeTerms:
+@lru_cache(maxsize=16)
+def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
     """Compute the numbers of some modes.
 
     Parameters
@@ -228,7 +229,7 @@ def mode_terms(alteration: Alteration, beam: Beam, modes: Sequence[int]) -> Mode
     alteration : Alteration
     beam : Beam
         Uniform one that is altered.
-    modes : sequence of int
+    modes : tuple of int
     """
     basis = _basis()
     length, places = beam.length_m, np.array(modes) - 1

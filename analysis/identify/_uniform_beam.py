@@ -168,7 +168,7 @@ class ConstantsProblem:
         self._z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self._k4 = (self._z / length) ** 4
         self.stated = Alteration.stated(nominal, tilt_deg)
-        self.terms = mode_terms(self.stated, nominal.beam, modes)
+        self.terms = mode_terms(self.stated, nominal.beam, self.modes)
         constants = self.measured.reshape(-1, len(CONSTANTS))
         self._omega = 2 * np.pi * np.exp(constants[:, 0])
         self._ratios = np.exp(constants[:, 1])
