@@ -157,14 +157,6 @@ def _uneven_mass(profile: Profile, words: str) -> Cause:
     return Cause("uneven mass", _EITHER, (-0.3,), (0.3,), altered, _deviation(words))
 
 
-def _uneven_thickness(words: str) -> Cause:
-    def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
-        taper: Profile = "taper"
-        return replace(stated, density=((taper, own[0]),), stiffness=((taper, 3 * own[0]),))
-
-    return Cause("uneven thickness", _EITHER, (-0.1,), (0.1,), altered, _deviation(words))
-
-
 def _uneven_stiffness(profile: Profile, words: str) -> Cause:
     def altered(stated: Alteration, own: Sequence[float], _: Beam) -> Alteration:
         return replace(stated, stiffness=((profile, own[0]),))
@@ -195,7 +187,6 @@ CAUSES: Final = (
     _uneven_stiffness(
         "wave", "a bending stiffness with {} at both ends and the opposite in the middle"
     ),
-    _uneven_thickness("a thickness that changes by {} from root to tip"),
     Cause(
         "elastic clamp", ((1e-4,), (1e-3,), (1e-2,)), (0.0,), (0.2,), _with_clamp, _clamp,
         lambda own, plant: replace(plant, root_compliance_rad_per_nm=_compliance(own, plant.beam)),
