@@ -60,9 +60,6 @@ _MOST_FURTHER: Final = 3
 _EVIDENCE: Final = 60.0
 """Deviance that a further resonance must save."""
 
-_SAME: Final = 1e-6
-"""Relative size of a spectrum that others make up."""
-
 _VISIBLE: Final = 400.0
 """Deviance by which a mode must improve the fit: its damping ratio is then known to a tenth."""
 
@@ -556,29 +553,3 @@ class _Problem:
             gradient=point.jacobian @ point.residual,
             hessian=point.jacobian @ point.jacobian.T,
         )
-
-
-def tangent(
-    comparison: Comparison, fit: ModalFit, columns: NDArray[np.complex128] | None = None
-) -> NDArray[np.float64]:
-    """Whitened spectra that the fit's parameters can add, orthonormal rows of shape (k, 2 K).
-
-    Parameters
-    ----------
-    comparison : Comparison
-        That was fitted to.
-    fit : ModalFit
-    columns : ndarray of complex, shape (c, K), optional
-        As `fit_modes` took them.
-    """
-    poles = np.array(fit.model.poles_rad_s)
-    omega = np.abs(poles)
-    x = np.array([np.log(omega), -2 * poles.real / omega]).T.ravel()
-    none = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-    problem = _Problem(comparison, fit.noise.weight, none if columns is None else columns)
-    point = problem.at(x)
-    rows = np.concatenate([point.columns, point.full_jacobian])
-    rows /= np.maximum(np.linalg.norm(rows, axis=1), np.finfo(float).tiny)[:, None]
-    _, sizes, right = np.linalg.svd(rows, full_matrices=False)
-    found: NDArray[np.float64] = right[sizes > _SAME * sizes[0]]
-    return found

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.identify._data import fast_length
-from analysis.identify._modal_fit import tangent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -77,9 +76,7 @@ class Step:
         }
 
 
-def step_score(
-    comparison: Comparison, fit: ModalFit, columns: NDArray[np.complex128] | None = None
-) -> Step:
+def step_score(comparison: Comparison, fit: ModalFit) -> Step:
     """Find the step of the stiffness that saves most of the modal model's residual.
 
     Parameters
@@ -87,19 +84,15 @@ def step_score(
     comparison : Comparison
         That was fitted to.
     fit : ModalFit
-    columns : ndarray of complex, shape (c, K), optional
-        As the fit took them.
     """
-    basis = tangent(comparison, fit, columns)
     residual = fit.residual.view(np.float64)
-    residual = residual - (residual @ basis.T) @ basis
     stiffened = _Stiffened(comparison, fit)
     best, places = Step(0.0, 0.0, 0.0), np.linspace(0, comparison.samples, _INSTANTS + 2)[1:-1]
     spacing = float(places[1] - places[0])
     for _ in range(2):
         found = np.array([stiffened.spectrum(int(place)) for place in places])
         rows = np.ascontiguousarray(found * fit.noise.weight).view(np.float64)
-        rows = rows - (rows @ basis.T) @ basis
+        rows = rows - (rows @ fit.span.T) @ fit.span
         sizes = np.einsum("ij,ij->i", rows, rows)
         sizes[sizes == 0] = np.inf
         along = -(rows @ residual)  # the residual is model less measurement

@@ -119,7 +119,7 @@ def fitted(constants, seed=1):
         model=ModalModel((), (), ()),
         numbers=MODES,
         constants=constants + off,
-        covariance=np.diag(STD**2),
+        joint_covariance=np.diag(STD**2),
         evidence=(1e4,) * len(MODES),
         residual=np.zeros(0, dtype=complex),
         deviance=0.0,
@@ -127,6 +127,8 @@ def fitted(constants, seed=1):
         noise=None,
         whiteness=None,
         input_relation=None,
+        ringing=None,
+        span=np.zeros((0, 0)),
     )
 
 

@@ -47,7 +47,7 @@ def score_of(session):
     starts = [(m.number, m.frequency_hz, m.damping_ratio) for m in field.likeliest.modes]
     fit = fit_modes(field.comparison, field.noise, starts, field.columns)
     assert fit.visible == (1, 2, 3)
-    return step_score(field.comparison, fit, field.columns)
+    return step_score(field.comparison, fit)
 
 
 def test_step_of_the_stiffness_is_found(sessions, plants, link):
