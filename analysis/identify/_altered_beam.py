@@ -61,7 +61,7 @@ class Alteration:
     density, stiffness : tuple of (str, float)
         Profile and size of a relative deviation of the mass per length, of the bending stiffness.
     clamp_compliance : float
-        Of the clamp, times EI over the length.
+        Compliance of the clamp, times EI over the length.
     clamp_loss : float
         Loss factor of the clamp.
     relaxation : tuple of (float, float)

@@ -31,14 +31,15 @@ if TYPE_CHECKING:
     from analysis.identify._uniform_beam import UniformBeamTest
 
 _TOLERANCES: Final = (0.03, 1e-3, 0.0)
-"""Of all constants, one after the other: frequencies are known so well that without any the way to
-a minimum would be long and narrow."""
+"""Tolerances of all constants, one after the other.
+
+Frequencies are known so well that without any the way to a minimum would be long and narrow."""
 
 _HOPELESS: Final = 6.0
 """Chi-square a degree of freedom, with a tolerance, from which a cause is given up."""
 
 _STEP: Final = 1e-6
-"""Of unknowns, for derivatives; those of a cause relative to their scale."""
+"""Steps of unknowns, for derivatives; those of a cause relative to their scale."""
 
 _MANY: Final = 12
 _LONGEST: Final = 1.0
@@ -76,7 +77,7 @@ class Explanation:
         In `unit`.
     unit : str
     chi_square, p_value : float
-        Of the modal constants with it.
+        Misfit of the modal constants with it, and how rarely chance makes it larger.
     plant : Plant or None
         Rig with it, where a `Plant` has such a thing.
     """
@@ -344,7 +345,7 @@ def finding(
     found : sequence of Explanation
         As `explanations` gives them.
     step : Step, optional
-        Of the stiffness, if one would explain what the modes leave.
+        Step of the stiffness, as `step_score` finds it.
     """
     named = [each.words for each in found]
     if step is not None and step.named:

@@ -45,7 +45,7 @@ class Step:
     instant_s : float
         Since the record's first tick.
     relative_change : float
-        Of the stiffness, from before to after.
+        Change of the stiffness, from before to after.
     """
 
     score: float

@@ -227,7 +227,7 @@ class ConstantsProblem:
         ----------
         x : ndarray, shape (m, 7)
         terms : ModeTerms, optional
-            Of another beam than the one stated.
+            Those of another beam than the one stated.
         """
         terms = self.terms if terms is None else terms
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
@@ -281,7 +281,7 @@ class ConstantsProblem:
         ----------
         x : ndarray, shape (m, 7)
         terms : ModeTerms, optional
-            Of another beam than the one stated.
+            Those of another beam than the one stated.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
             off = self.constants(x, terms) - self.measured
