@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+from analysis.identify._altered_beam import Alteration, mode_terms
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._modal_model import CONSTANTS
 from analysis.identify._plant import LOGARITHMIC, Plant
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._modal_fit import ModalFit
     from analysis.optimizer import Minimum
 
@@ -53,6 +55,9 @@ _LN_RANGE: Final = 2.0
 
 _DELAY_UNIT_S: Final = 0.01
 _LARGEST_DELAY: Final = 1.0
+_RENEWALS: Final = 4
+"""Times that the shapes of a loaded or tilted beam are computed, with the beam found so far."""
+
 _CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS: Final = 0.2
 """Of the circle round a pole, relative to the decay rate."""
@@ -135,9 +140,11 @@ class ConstantsProblem:
     modes : sequence of int
         Visible modes.
     nominal : Plant
-        Rig and specimen as the file states them.
+        Rig and specimen as the file states them; with a mass at the tip, if it states one.
     uniformity : float
         Relative standard deviation of each frequency, beside the noise.
+    tilt_deg : float, optional
+        Inclination of the plane of motion along the beam at rest as the file states it.
     """
 
     def __init__(
@@ -146,6 +153,7 @@ class ConstantsProblem:
         modes: Sequence[int],
         nominal: Plant,
         uniformity: float = 0.0,
+        tilt_deg: float | None = None,
     ) -> None:
         places = fit.rows(modes)
         count = len(modes)
@@ -162,13 +170,15 @@ class ConstantsProblem:
         length = nominal.beam.length_m
         self._z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self._k4 = (self._z / length) ** 4
-        self._share = 4 * length**3 / self._z**4
+        self.stated = Alteration.stated(nominal, tilt_deg)
+        self.terms = mode_terms(self.stated, nominal.beam, self.modes)
         constants = self.measured.reshape(-1, len(CONSTANTS))
         self._omega = 2 * np.pi * np.exp(constants[:, 0])
         self._ratios = np.exp(constants[:, 1])
         self._poles = self._omega * (1j - self._ratios)
         # Where the search begins: the mean of all modes.
-        self._ln_ratio = float(np.mean(np.log(self._k4) - 2 * np.log(self._omega)))
+        mass = self.terms.mass + self.terms.lump
+        self._ln_ratio = float(np.mean(np.log(self._k4 / mass) - 2 * np.log(self._omega)))
         ln_stiffness = constants[:, 2] - np.log(self._omega) + np.log(length / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
         low, high = _LN_LOSS_RANGE
@@ -211,24 +221,52 @@ class ConstantsProblem:
             delay_s=delay_s,
         )
 
-    def constants(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Modal constants of uniform beams, from unknowns of shape (m, 7): (m, 4 n)."""
+    def constants(
+        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+    ) -> NDArray[np.float64]:
+        """Modal constants of beams, from unknowns of shape (m, 7): (m, 4 n).
+
+        Parameters
+        ----------
+        x : ndarray, shape (m, 7)
+        terms : ModeTerms, optional
+            Those of another beam than the one stated.
+        """
+        terms = self.terms if terms is None else terms
         zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
-        zeta, gamma, ratio = np.exp(zeta), np.exp(gamma), np.exp(ratio)
+        zeta, gamma = np.exp(zeta), np.exp(gamma)
+        lighter = 1.0
+        if terms.density_kg_per_m is not None:
+            lighter = terms.density_kg_per_m * np.exp(-ratio - stiffness)
+        ratio = np.exp(ratio)
+        mass, arm = terms.mass + lighter * terms.lump, terms.mass_arm + lighter * terms.lump_arm
+        rest = terms.stiffness + terms.clamp + ratio * terms.tension
+        strength, time_s = terms.alteration.relaxation
         s = np.broadcast_to(self._poles, (len(x), self._poles.size))
         for _ in range(_NEWTON_STEPS):
             log_s = np.log(s)
-            internal = zeta * np.exp(alpha * log_s) * self._k4
+            internal = zeta * np.exp(alpha * log_s) * terms.stiffness
             external = gamma * np.exp(lambda_ * log_s)
-            inertia = ratio * s * s + external
-            slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s
-            step = (self._k4 + internal + inertia) / slope
+            inertia = ratio * s * s
+            slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
+            total = rest + internal + inertia * mass + external
+            if strength:
+                relaxed = strength * time_s / (1 + time_s * s) * terms.stiffness
+                total = total + relaxed * s
+                slope = slope + relaxed / (1 + time_s * s)
+            step = total / slope
             s = s - step
             if np.abs(step).max() < _EXACT * np.abs(s).max():
                 break
-        s = np.where((s.imag > 0) & (s.real < 0), s, np.nan)
+        s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
         channel = torque_channel(replace(self.nominal, delay_s=0.0), s) * np.exp(-delay * s)
-        log_residues = np.log(1j * self._share * inertia**2 / slope * channel) + stiffness
+        channel = channel * terms.alteration.channel(s)
+        turned = external * terms.turn_by_medium
+        turned = turned + internal / terms.stiffness * terms.turn_by_internal
+        pushed = inertia * (arm + turned)
+        pushed = pushed + external * terms.medium_arm + ratio * terms.tension_arm
+        volume = self.nominal.beam.length_m**3
+        log_residues = np.log(1j * volume * pushed**2 / slope * channel) + stiffness
         rows = (
             np.log(s.imag / (2 * np.pi)),
             np.log(-s.real / np.abs(s)),
@@ -237,12 +275,25 @@ class ConstantsProblem:
         )
         return np.stack(rows, axis=-1).reshape(len(x), -1)
 
-    def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def differences(
+        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+    ) -> NDArray[np.float64]:
+        """Differences from the constants measured, (m, 4 n).
+
+        Parameters
+        ----------
+        x : ndarray, shape (m, 7)
+        terms : ModeTerms, optional
+            Those of another beam than the one stated.
+        """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
-            off = self.constants(x) - self.measured
+            off = self.constants(x, terms) - self.measured
         phases = off[:, CONSTANTS.index("residue_phase_rad") :: len(CONSTANTS)]
         phases -= 2 * np.pi * np.round(phases / (2 * np.pi))
-        return np.nan_to_num(off @ self._whitener.T, nan=1e6)
+        return off
+
+    def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Chi-square at a point and its derivatives, by central differences."""
@@ -285,7 +336,14 @@ class ConstantsProblem:
 
     def minima(self) -> list[Minimum]:
         """Minima from all starts, the lowest first."""
-        return sorted((self.minimum(x) for x in self.starts()), key=lambda each: each.cost)
+        found = self._minima(self.starts())
+        for _ in range(_RENEWALS if self.stated != Alteration() else 0):
+            self.terms = mode_terms(self.stated, self.plant(found[0].x).beam, self.modes)
+            found = self._minima([each.x for each in found])
+        return found
+
+    def _minima(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
+        return sorted((self.minimum(x) for x in starts), key=lambda each: each.cost)
 
     def held_at_edge(self, place: int, x: NDArray[np.float64]) -> Minimum:
         """Descend with the size of a damping at the lower edge, where it does nothing.
@@ -444,14 +502,18 @@ class TolerantEstimate:
         return {"names": names, "matrix": self.covariance.tolist()}
 
 
-def uniform_beam_test(fit: ModalFit, nominal: Plant) -> UniformBeamTest:
+def uniform_beam_test(
+    fit: ModalFit, nominal: Plant, tilt_deg: float | None = None
+) -> UniformBeamTest:
     """Test whether a uniform beam with both dampings predicts the constants of the visible modes.
 
     Parameters
     ----------
     fit : ModalFit
     nominal : Plant
-        Rig and specimen as the file states them.
+        Rig and specimen as the file states them; with a mass at the tip, if it states one.
+    tilt_deg : float, optional
+        Inclination of the plane of motion along the beam at rest as the file states it.
     """
     modes = fit.visible
     places = fit.rows(modes) if modes else np.zeros(0, dtype=np.intp)
@@ -460,7 +522,7 @@ def uniform_beam_test(fit: ModalFit, nominal: Plant) -> UniformBeamTest:
     if freedom <= 0:
         none = np.full(measured.size, np.nan)
         return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, none, std)
-    problem = ConstantsProblem(fit, modes, nominal)
+    problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
     best = problem.minima()[0]
     freedom += _idle(problem, best)
     p_value = float(chi_square_p_value(best.cost, freedom))
@@ -476,7 +538,9 @@ def uniform_beam_test(fit: ModalFit, nominal: Plant) -> UniformBeamTest:
     )
 
 
-def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> TolerantEstimate | None:
+def tolerant_estimate(
+    fit: ModalFit, nominal: Plant, uniformity: float, tilt_deg: float | None = None
+) -> TolerantEstimate | None:
     """Estimate damping and beam with a tolerance of the geometry.
 
     A wider tolerance is taken where a uniform beam with the stated one does not predict the
@@ -489,6 +553,8 @@ def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> Toler
         Rig and specimen as the file states them.
     uniformity : float
         Stated relative standard deviation of each frequency.
+    tilt_deg : float, optional
+        Inclination of the plane of motion along the beam at rest as the file states it.
 
     Returns
     -------
@@ -505,7 +571,7 @@ def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> Toler
         ("losses", _LOOSE, REFUSED_BELOW),
     )
     for basis, tolerance, least in attempts:
-        problem = ConstantsProblem(fit, modes, nominal, tolerance)
+        problem = ConstantsProblem(fit, modes, nominal, tolerance, tilt_deg)
         minima = problem.minima()
         # With a loose geometry frequencies and residues count as compared no longer.
         compared = problem.compared // (2 if basis == "losses" else 1)
@@ -524,7 +590,7 @@ def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> Toler
     if not away:
         return found
     if basis == "geometry":
-        problem = ConstantsProblem(fit, modes, nominal, _LOOSE)
+        problem = ConstantsProblem(fit, modes, nominal, _LOOSE, tilt_deg)
         minima = problem.minima()
     best = minima[0]
     rises = {

@@ -1,0 +1,313 @@
+"""Causes of modes that are no uniform beam's: named with their sizes, from constants made apart.
+
+The constants are those of finite elements, which share nothing with the analyzer's shapes.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from analysis.identify import Plant
+from analysis.identify._altered_beam import GRAVITY_M_S2
+from analysis.identify._causes import CAUSES
+from analysis.identify._explanations import explanations, finding
+from analysis.identify._modal_fit import ModalFit
+from analysis.identify._modal_model import ModalModel
+from analysis.identify._step_in_time import Step
+from analysis.identify._uniform_beam import modal_constants, uniform_beam_test
+from rigd.beam import Beam, Damping
+
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+LAW = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
+NOMINAL = Plant(beam=LINK, damping=Damping())
+MODES = (1, 2, 3)
+STD = np.array([1e-5, 1.5e-3, 1e-3, 1e-3] * 3)
+ELEMENTS = 32
+
+
+@dataclass
+class Elements:
+    """Beam of Hermite elements on a hub that is held, with what differs from a uniform one."""
+
+    density: tuple = (1.0, 1.0)  # factors of the inner and the outer half
+    stiffness: tuple = (1.0, 1.0)
+    masses: tuple = ()  # (number of the node, kg)
+    gravity_m_s2: float = 0.0
+    root_nm_per_rad: complex = math.inf
+    relaxation: tuple = (0.0, 1.0)
+
+    def matrices(self):
+        size, h = 2 * ELEMENTS + 2, LINK.length_m / ELEMENTS
+        mass, medium, bending, tension = np.zeros((4, size, size))
+        points, weights = np.polynomial.legendre.leggauss(4)
+        outboard = sum(kg for _, kg in self.masses)
+        for element in range(ELEMENTS - 1, -1, -1):
+            half = int(element >= ELEMENTS // 2)
+            density = LINK.density_kg_per_m * self.density[half]
+            stiffness = LINK.bending_stiffness_n_m2 * self.stiffness[half]
+            outboard -= sum(kg for node, kg in self.masses if node == element)
+            carried = sum(kg for node, kg in self.masses if node > element)
+            at = slice(2 * element, 2 * element + 4)
+            for x, weight in zip((points + 1) / 2, weights * h / 2, strict=True):
+                shape = np.array([
+                    1 - 3 * x**2 + 2 * x**3, h * (x - 2 * x**2 + x**3),
+                    3 * x**2 - 2 * x**3, h * (x**3 - x**2),
+                ])  # fmt: skip
+                slope = np.array([
+                    (6 * x**2 - 6 * x) / h, 1 - 4 * x + 3 * x**2,
+                    (6 * x - 6 * x**2) / h, 3 * x**2 - 2 * x,
+                ])  # fmt: skip
+                curve = np.array([
+                    (12 * x - 6) / h**2, (6 * x - 4) / h, (6 - 12 * x) / h**2, (6 * x - 2) / h
+                ])  # fmt: skip
+                beyond_m = LINK.length_m - (element + x) * h
+                pulled = carried + LINK.density_kg_per_m * beyond_m
+                mass[at, at] += weight * density * np.outer(shape, shape)
+                medium[at, at] += weight * np.outer(shape, shape)
+                bending[at, at] += weight * stiffness * np.outer(curve, curve)
+                tension[at, at] += weight * self.gravity_m_s2 * pulled * np.outer(slope, slope)
+        for node, kg in self.masses:
+            mass[2 * node, 2 * node] += kg
+        return mass, medium, bending, tension
+
+    def constants(self):
+        """Logarithms of frequency, damping ratio and residue, and phase of each mode in turn."""
+        mass, medium, bending, tension = self.matrices()
+        rigid = np.zeros(len(mass))
+        rigid[0::2] = np.linspace(0, LINK.length_m, ELEMENTS + 1)
+        rigid[1::2] = 1.0
+        free = slice(2, None) if self.root_nm_per_rad == math.inf else slice(1, None)
+        root = np.zeros(len(mass))
+        root[1] = 0.0 if self.root_nm_per_rad == math.inf else 1.0
+        gamma = LAW.gamma * LINK.bending_stiffness_n_m2
+        strength, time_s = self.relaxation
+
+        def stiffness(s):  # dynamic, of all that the hub's turn does not bend too
+            elastic = 1 + LAW.zeta * s**LAW.alpha + strength * s * time_s / (1 + s * time_s)
+            moved = mass * s**2 + gamma * medium * s**LAW.lambda_ + tension
+            spring = np.diag(root * (self.root_nm_per_rad if root.any() else 0.0))
+            return (moved + elastic * bending + spring)[free, free], (moved @ rigid)[free]
+
+        found = []
+        undamped = bending + tension
+        if root.any():
+            undamped = undamped + np.diag(root * np.real(self.root_nm_per_rad))
+        lower = np.linalg.inv(np.linalg.cholesky(mass[free, free]))
+        squares, vectors = np.linalg.eigh(lower @ undamped[free, free] @ lower.T)
+        for number in range(len(MODES)):
+            s, shape = 1j * math.sqrt(squares[number]), lower.T @ vectors[:, number] + 0j
+            for _ in range(8):
+                step = 1e-4 * abs(s)
+                (here, _), (above, _), (below, _) = map(stiffness, (s, s + step, s - step))
+                slope = (above - below) / (2 * step)
+                shape = np.linalg.solve(here, slope @ shape)
+                shape /= np.abs(shape).max()
+                s -= (shape @ here @ shape) / (shape @ slope @ shape)
+            driven = stiffness(s)[1] @ shape
+            residue = np.log(-(driven**2) / (shape @ slope @ shape) / 1j)
+            decay = -s.real / abs(s)
+            found += [math.log(s.imag / (2 * math.pi)), math.log(decay), residue.real, residue.imag]
+        return np.array(found)
+
+
+def fitted(constants, seed=1):
+    """A fit that gave these constants, with noise of `STD`."""
+    off = np.random.default_rng(seed).normal(scale=STD)
+    return ModalFit(
+        model=ModalModel((), (), ()),
+        numbers=MODES,
+        constants=constants + off,
+        joint_covariance=np.diag(STD**2),
+        evidence=(1e4,) * len(MODES),
+        residual=np.zeros(0, dtype=complex),
+        deviance=0.0,
+        parameters=0,
+        noise=None,
+        whiteness=None,
+        input_relation=None,
+        ringing=None,
+        span=np.zeros((0, 0)),
+    )
+
+
+def poles(constants):
+    rows = constants.reshape(-1, 4)
+    omega, ratio = 2 * np.pi * np.exp(rows[:, 0]), np.exp(rows[:, 1])
+    return omega * (1j - ratio / np.sqrt(1 - ratio**2))
+
+
+def through(constants, channel):
+    """Constants behind an instrument with a response."""
+    passed = np.log(channel(poles(constants)))
+    shifted = constants.reshape(-1, 4).copy()
+    shifted[:, 2] += passed.real
+    shifted[:, 3] += passed.imag
+    return shifted.ravel()
+
+
+def second_order(hz, quality):
+    def channel(s):
+        q = s / (2 * np.pi * hz)
+        return 1 / (1 + q / quality + q**2)
+
+    return channel
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return Elements().constants()
+
+
+def test_finite_elements_of_the_uniform_beam_are_its_exact_modes(plain):
+    exact = modal_constants(replace(NOMINAL, damping=LAW), MODES)
+    assert plain == pytest.approx(exact, abs=5e-5)
+    assert uniform_beam_test(fitted(plain), NOMINAL).status == "passed"
+
+
+FURTHER = pytest.mark.further
+TILT = GRAVITY_M_S2 * math.sin(math.radians(2))
+
+
+@pytest.mark.parametrize(
+    ("name", "beam", "size", "within"),
+    [
+        pytest.param("tilt", Elements(gravity_m_s2=TILT), 2.0, 0.1, id="tilt", marks=FURTHER),
+        pytest.param(
+            "tilt", Elements(gravity_m_s2=-TILT), -2.0, 0.1, id="tip higher", marks=FURTHER
+        ),
+        pytest.param(
+            "tip mass",
+            Elements(masses=((ELEMENTS, 1e-4),)),
+            1e-4,
+            0.03,
+            id="tip mass",
+            marks=FURTHER,
+        ),
+        pytest.param(
+            "tip mass",
+            Elements(masses=((ELEMENTS, 6e-4),)),
+            6e-4,
+            0.03,
+            id="heavy tip",
+            marks=FURTHER,
+        ),
+        pytest.param("lump", Elements(masses=((19, 2e-4),)), 2e-4, 0.05, id="lump", marks=FURTHER),
+        pytest.param(
+            "uneven mass", Elements(density=(1, 1.03)), 0.03, 0.05, id="mass", marks=FURTHER
+        ),
+        pytest.param(
+            "uneven stiffness",
+            Elements(stiffness=(1, 0.96)),
+            -0.04,
+            0.05,
+            id="bending",
+            marks=FURTHER,
+        ),
+        pytest.param(
+            "elastic clamp", Elements(root_nm_per_rad=50.0), 50.0, 0.05, id="clamp", marks=FURTHER
+        ),
+        pytest.param(
+            "lossy clamp", Elements(root_nm_per_rad=30 + 3j), 30.0, 0.1, id="lossy", marks=FURTHER
+        ),
+        pytest.param("relaxation", Elements(relaxation=(0.03, 0.01)), 0.03, 0.1, id="relaxation"),
+    ],
+)
+def test_cause_is_named_with_its_size(name, beam, size, within):
+    fit = fitted(beam.constants())
+    assert uniform_beam_test(fit, NOMINAL).status == "refused"
+    found = {each.name: each for each in explanations(fit, NOMINAL)}
+    assert found[name].size == pytest.approx(size, rel=within)
+    assert found[name].p_value > 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "channel", "hz"),
+    [
+        pytest.param(
+            "torque filter of first order",
+            lambda s: 1 / (1 + s / (2 * np.pi * 120)),
+            120.0,
+            marks=FURTHER,
+        ),
+        pytest.param(
+            "torque filter of second order", second_order(90.0, 2**-0.5), 90.0, marks=FURTHER
+        ),
+        ("sensor resonance", second_order(200.0, 20.0), 200.0),
+    ],
+)
+def test_instrument_is_named_with_its_frequency(plain, name, channel, hz):
+    fit = fitted(through(plain, channel))
+    found = {each.name: each for each in explanations(fit, NOMINAL)}
+    assert found[name].size == pytest.approx(hz, rel=0.1)
+
+
+def test_rig_with_the_cause_predicts_the_modes():
+    constants = Elements(root_nm_per_rad=50.0).constants()
+    plants = [each.plant for each in explanations(fitted(constants), NOMINAL) if each.plant]
+    off = [(modal_constants(plant, MODES) - constants) / STD for plant in plants]
+    assert min(np.abs(each).max() for each in off) < 4
+
+
+def test_what_is_weighed_is_part_of_the_plain_beam():
+    fit = fitted(Elements(masses=((ELEMENTS, 3e-4),)).constants())
+    assert uniform_beam_test(fit, NOMINAL).status == "refused"
+    assert uniform_beam_test(fit, replace(NOMINAL, tip_mass_kg=3e-4)).status == "passed"
+    assert uniform_beam_test(fit, replace(NOMINAL, tip_mass_kg=1e-4)).status == "refused"
+
+
+def test_tilt_that_is_measured_is_part_of_the_plain_beam():
+    fit = fitted(Elements(gravity_m_s2=TILT, masses=((ELEMENTS, 1e-4),)).constants())
+    weighed = replace(NOMINAL, tip_mass_kg=1e-4)
+    assert uniform_beam_test(fit, weighed).status == "refused"
+    assert uniform_beam_test(fit, weighed, 2.0).status == "passed"
+    assert uniform_beam_test(fit, weighed, -2.0).status == "refused"
+
+
+@pytest.mark.further
+def test_tilt_is_found_beside_a_weighed_mass():
+    fit = fitted(Elements(gravity_m_s2=TILT, masses=((ELEMENTS, 1e-4),)).constants())
+    weighed = replace(NOMINAL, tip_mass_kg=1e-4)
+    (tilt,) = (each for each in explanations(fit, weighed) if each.name == "tilt")
+    assert tilt.size == pytest.approx(2.0, rel=0.1)
+
+
+def test_no_simple_cause_is_named_for_modes_of_nothing_on_the_list(plain):
+    moved = plain.copy()
+    moved[4] += 0.1  # mode 2 alone, by a tenth
+    fit = fitted(moved)
+    assert explanations(fit, NOMINAL) == ()
+    said = finding(uniform_beam_test(fit, NOMINAL), ())
+    assert "None of the simple causes" in said.sentence
+    assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
+
+
+def test_causes_are_named_and_never_facts():
+    fit = fitted(Elements(gravity_m_s2=TILT).constants())
+    test, found = uniform_beam_test(fit, NOMINAL), explanations(fit, NOMINAL)
+    assert 2 <= len(found) <= 5
+    assert {each.name: each.size for each in found}["tilt"] == pytest.approx(2.0, rel=0.1)
+    assert [each.p_value for each in found] == sorted((e.p_value for e in found), reverse=True)
+    said = finding(test, found, Step(25.0, 70.2, -0.0021))
+    assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
+    assert "an axis 2° off plumb (the tip at rest lower than the axis)" in said.sentence
+    assert "a step of the stiffness by about -0.2 % near 70 s" in said.sentence
+    assert "None is established by this record" in said.sentence
+    assert "step of" not in finding(test, found, Step(13.0, 70.2, -0.0021)).sentence
+    alone = finding(test, found[:1]).sentence
+    assert "It is not established by this record" in alone
+
+
+def test_two_modes_leave_nothing_to_compare_causes_by():
+    fit = fitted(Elements(gravity_m_s2=TILT).constants())
+    two = replace(fit, evidence=(1e4, 1e4, 0.0))
+    assert explanations(two, NOMINAL) == ()
+
+
+def test_every_cause_has_words_with_its_size():
+    for cause in CAUSES:
+        size, unit, words = cause.described([0.04, 0.1], LINK)
+        assert math.isfinite(size)
+        assert unit
+        assert any(character.isdigit() for character in words)
