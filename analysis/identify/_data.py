@@ -340,6 +340,7 @@ class Measurement:
             damping=Damping(),
             delay_s=self.delay_s,
             tool_inertia_kg_m2=self.tool_inertia_kg_m2,
+            tip_mass_kg=self.tip_mass_kg or 0.0,
             filter_time_constant_s=self.filter_time_constant_s,
             second_order_filter_time_constant_s=self.second_order_filter_time_constant_s,
         )

@@ -13,7 +13,6 @@ from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._residual_tests import SURE
-from analysis.identify._rig_findings import of_rig
 from analysis.statistics import NORMAL_95, chi_square_deviate
 from rigd.units import interval_text, to_uncertainty
 
@@ -28,14 +27,10 @@ if TYPE_CHECKING:
     from analysis.identify._result import ModeEstimate
 
 
-_MODES_TO_JUDGE: Final = 2
-
-
 def findings(
     field: CandidateSet,
     forces: tuple[NonlinearForce, ...],
     multiples: tuple[Harmonic, ...],
-    visible: tuple[int, ...],
 ) -> tuple[Finding, ...]:
     """Name what is there: of a record with a wrong sign or unit, only what needs no model.
 
@@ -46,9 +41,6 @@ def findings(
         Those the record calls for.
     multiples : tuple of Harmonic
         What the residual holds at multiples of the sweep's frequency.
-    visible : tuple of int
-        Modes that stand out of the noise. With fewer than two, what the file states is not
-        doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
     measurement = field.comparison.measurement
     seen = (*field.misread, *clipping(measurement), *stops(measurement))
@@ -61,9 +53,7 @@ def findings(
         *map(_force, forces),
         *_harmonics(multiples),
     )
-    if len(visible) < _MODES_TO_JUDGE:
-        return (*found, *at_edges(field))
-    return (*found, *(tuple(at_edges(field)) or of_rig(field)))
+    return (*found, *at_edges(field))
 
 
 # Settings at an edge, or not as the file states them

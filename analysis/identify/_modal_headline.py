@@ -86,7 +86,7 @@ def with_modal_model(
             },
             **_parameters(tolerant, doubt, effective),
         },
-        sizes=_sizes(tolerant, doubt),
+        sizes=_sizes(tolerant, doubt, effective),
         structures=_structures(condition, tolerant),
         simpler=None,
         exact=Numbers(
@@ -206,8 +206,13 @@ def _structures(
     return tuple((name, status(name, before)) for name, before in exact.structures)
 
 
-def _sizes(estimate: TolerantEstimate, doubt: str | None) -> tuple[Size, ...]:
-    """Loss factors where they depend least on their orders."""
+def _sizes(
+    estimate: TolerantEstimate, doubt: str | None, effective: str | None
+) -> tuple[Size, ...]:
+    """Loss factors where they depend least on their orders.
+
+    That of external damping is relative to the inertia, which may be an effective value.
+    """
     values = dict(estimate.values)
     found = []
     for damping, coefficient, order in (
@@ -225,13 +230,19 @@ def _sizes(estimate: TolerantEstimate, doubt: str | None) -> tuple[Size, ...]:
             size.value * math.exp(min(NORMAL_95 * spread, 300.0)),
         )
         flag = doubt or (NO_ORDER if estimate.basis == "none" else None)
+        flag = flag or (effective if damping == "external" else None)
         quantity = Quantity(size.value, size.std, ends, flag)
         found.append(Size(damping, size.omega_rad_s, quantity))  # type: ignore[arg-type]
     return tuple(found)
 
 
 def tolerant_order(
-    order: Order, estimate: TolerantEstimate, profile: Profile, doubt: str | None
+    order: Order,
+    estimate: TolerantEstimate,
+    profile: Profile,
+    doubt: str | None,
+    *,
+    refused: bool,
 ) -> OrderVerdict:
     """Judge one order with a tolerance of the geometry.
 
@@ -243,6 +254,9 @@ def tolerant_order(
         Profile of the order on an exactly uniform beam.
     doubt : str or None
         Why no number of the record is to be believed.
+    refused : bool
+        Whether a uniform beam does not predict the modes: what makes them differ may have a loss of
+        its own, so no order is excluded.
     """
     if estimate.basis == "none":
         return OrderVerdict(order, "not identifiable", None, None, NO_ORDER, profile)
@@ -254,6 +268,6 @@ def tolerant_order(
         return OrderVerdict(order, "open", value, (low, high), doubt, profile)
     if low <= 1 <= high:
         return OrderVerdict(order, "compatible", value, (low, high), None, profile)
-    fractional = estimate.deviance_of_one[order] > EXCLUDED[0]
+    fractional = estimate.deviance_of_one[order] > EXCLUDED[0] and not refused
     status: Status = "fractional" if fractional else "open"
     return OrderVerdict(order, status, value, (low, high), None, profile)

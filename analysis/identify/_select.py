@@ -22,6 +22,8 @@ from analysis.identify._drag import (
     with_air_drag,
     with_evident_drag,
 )
+from analysis.identify._explanations import explanations
+from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, UNEXPLAINED, Headline, headline, of_fit
@@ -40,6 +42,7 @@ from analysis.identify._residual_tests import (
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
 from analysis.identify._small_effects import small_effect
+from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
@@ -234,7 +237,7 @@ def _selected(
         modal = _modal(linear, small.column[None])
     field = field.with_orders_free()
     visible = _visible(field, modal)
-    test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
+    test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
     # Another valley that a part of the record excludes, all of it does as well.
     settled = earlier.settled(field.freest.kind) if earlier and again else ()
@@ -243,7 +246,7 @@ def _selected(
     told = field.led_by(field.freest)
     white, related, multiples = _tests(told, modal, band_hz)
     explained = white.white and not related.related
-    found = findings(told, forces, multiples, visible)
+    found = findings(told, forces, multiples)
     kinds = {finding.kind for finding in found}
     wrong = _wrong(kinds, explained=explained)
     clipped = _CLIPPED if "clipping" in kinds else None
@@ -258,7 +261,8 @@ def _selected(
     numbers = _with_modes(numbers, measurement, modal, test, doubt, mode_doubt)
     if numbers.tolerant is not None:
         alpha, lambda_ = (
-            tolerant_order(each.order, numbers.tolerant, each, doubt) for each in profiles
+            tolerant_order(each.order, numbers.tolerant, each, doubt, refused=refused)
+            for each in profiles
         )
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
@@ -270,6 +274,8 @@ def _selected(
         along = tuple(changing(changes, one_sweep=measurement.one_sweep))
         found += _settings(told, numbers, kinds)
         found += () if small is None else (small.finding(),)
+        if modal is not None and test is not None and refused:
+            found += (_explanation(measurement, told, modal, test),)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
@@ -363,8 +369,26 @@ def _with_modes(
         return exact
     tolerant = None
     if measurement.uniformity or test.status == "refused":
-        tolerant = tolerant_estimate(modal, measurement.nominal, measurement.uniformity)
+        tolerant = tolerant_estimate(
+            modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
+        )
     return with_modal_model(exact, modal, test, tolerant, doubt, mode_doubt)
+
+
+def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
+    """Test whether the beam that the file states predicts the modes, but for its parameters."""
+    if modal is None:
+        return None
+    return uniform_beam_test(modal, measurement.nominal, measurement.axis_tilt_deg)
+
+
+def _explanation(
+    measurement: Measurement, told: CandidateSet, modal: ModalFit, test: UniformBeamTest
+) -> Finding:
+    """Name simple causes that would explain what a uniform beam does not."""
+    causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
+    step = step_score(told.comparison, modal) if measurement.one_sweep else None
+    return explanation_finding(test, causes, step)
 
 
 def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:
@@ -457,7 +481,7 @@ def _freest_alone(
     modal = _modal(field)
     visible = _visible(field, modal)
     white, related, multiples = _tests(field, modal, band_hz)
-    found = findings(field, (), multiples, visible)
+    found = findings(field, (), multiples)
     kinds = {finding.kind for finding in found}
     explained = white.white and not related.related
     wrong = _wrong(kinds, explained=explained)
@@ -470,7 +494,7 @@ def _freest_alone(
         both=None if misread else field.with_both_dampings(field.best),
     )
     doubt = wrong or (_CLIPPED if "clipping" in kinds else None)
-    test = None if modal is None else uniform_beam_test(modal, measurement.nominal)
+    test = _uniform_beam_test(measurement, modal)
     told = _with_modes(told, measurement, modal, test, doubt, doubt)
     if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
