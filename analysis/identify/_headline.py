@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, Self
 
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._verdict import (
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
-    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify._verdict import OrderVerdict
@@ -237,7 +237,7 @@ class Numbers:
         Whether a uniform beam predicts the modal constants; None if no mode shows.
     tolerant : TolerantEstimate or None
         Estimate that parameters and sizes are of, if they allow for a tolerance of the geometry.
-    modal : ModalFit or None
+    modal : ModalEstimate or None
         Fit of the modal model.
     """
 
@@ -252,7 +252,29 @@ class Numbers:
     exact: Numbers | None = None
     uniform_beam: UniformBeamTest | None = None
     tolerant: TolerantEstimate | None = None
-    modal: ModalFit | None = None
+    modal: ModalEstimate | None = None
+
+    def doubted(self, flag: str) -> Self:
+        """Flag every number that has no flag yet.
+
+        Parameters
+        ----------
+        flag : str
+            The reason.
+        """
+        return replace(
+            self,
+            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
+            sizes=tuple(each.flagged(flag) for each in self.sizes),
+            modes=tuple(
+                replace(
+                    each,
+                    frequency_hz=each.frequency_hz.flagged(flag),
+                    damping_ratio=each.damping_ratio.flagged(flag),
+                )
+                for each in self.modes
+            ),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,28 +304,6 @@ class Headline(Numbers):
     def visible_modes(self) -> tuple[int, ...]:
         """Numbers of the modes that the record shows."""
         return tuple(mode.number for mode in self.modes if mode.shown)
-
-    def doubted(self, flag: str) -> Headline:
-        """Flag every number that has no flag yet.
-
-        Parameters
-        ----------
-        flag : str
-            The reason.
-        """
-        return replace(
-            self,
-            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
-            sizes=tuple(each.flagged(flag) for each in self.sizes),
-            modes=tuple(
-                replace(
-                    each,
-                    frequency_hz=each.frequency_hz.flagged(flag),
-                    damping_ratio=each.damping_ratio.flagged(flag),
-                )
-                for each in self.modes
-            ),
-        )
 
     def with_law_assumed(self) -> Headline:
         """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""

@@ -1,10 +1,10 @@
 """Test whether a uniform beam predicts the modal constants, and what its parameters then are.
 
 A plain uniform beam with both dampings predicts frequency, damping ratio and residue of every mode
-from seven parameters. Chi-square of the constants measured (`ModalFit`) against those predicted is
-the test. No antenna is uniform to the precision at which frequencies are measured, so parameters
-are estimated with a stated tolerance: each ln f is uncertain by that much, each ln of a residue by
-three times as much, beside the noise.
+from seven parameters. Chi-square of the constants measured against those predicted is the test. No
+antenna is uniform to the precision at which frequencies are measured, so parameters are estimated
+with a stated tolerance: each ln f is uncertain by that much, each ln of a residue by three times as
+much, beside the noise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.optimizer import Minimum
 
 PARAMETERS: Final = (
@@ -131,7 +131,7 @@ class ConstantsProblem:
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     modes : sequence of int
         Visible modes.
     nominal : Plant
@@ -142,7 +142,7 @@ class ConstantsProblem:
 
     def __init__(
         self,
-        fit: ModalFit,
+        fit: ModalEstimate,
         modes: Sequence[int],
         nominal: Plant,
         uniformity: float = 0.0,
@@ -444,17 +444,17 @@ class TolerantEstimate:
         return {"names": names, "matrix": self.covariance.tolist()}
 
 
-def uniform_beam_test(fit: ModalFit, nominal: Plant) -> UniformBeamTest:
+def uniform_beam_test(fit: ModalEstimate, nominal: Plant) -> UniformBeamTest:
     """Test whether a uniform beam with both dampings predicts the constants of the visible modes.
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     nominal : Plant
         Rig and specimen as the file states them.
     """
     modes = fit.visible
-    places = fit.rows(modes) if modes else np.zeros(0, dtype=np.intp)
+    places = fit.rows(modes)
     measured, std = fit.constants[places], np.sqrt(np.diag(fit.covariance)[places])
     freedom = len(places) - len(PARAMETERS)
     if freedom <= 0:
@@ -476,7 +476,9 @@ def uniform_beam_test(fit: ModalFit, nominal: Plant) -> UniformBeamTest:
     )
 
 
-def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> TolerantEstimate | None:
+def tolerant_estimate(
+    fit: ModalEstimate, nominal: Plant, uniformity: float
+) -> TolerantEstimate | None:
     """Estimate damping and beam with a tolerance of the geometry.
 
     A wider tolerance is taken where a uniform beam with the stated one does not predict the
@@ -484,7 +486,7 @@ def tolerant_estimate(fit: ModalFit, nominal: Plant, uniformity: float) -> Toler
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     nominal : Plant
         Rig and specimen as the file states them.
     uniformity : float
