@@ -169,8 +169,8 @@ class Experiment:
 
     @property
     def rising(self) -> bool | None:
-        """Whether the frequency of its sweep rises; None if it is no such sweep."""
-        if self.facts.get("excitation") not in (None, _SWEEP):
+        """Whether the frequency of its sweep rises; None if it is no sweep, or does both."""
+        if self.facts.get("excitation") != _SWEEP or "there_and_back" in self.facts:
             return None
         first, last = (self.facts.get(key) for key in _ENDS)
         if not isinstance(first, float) or not isinstance(last, float) or first == last:

@@ -103,9 +103,10 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
     std = (found.interval[1] - found.interval[0]) / (2 * NORMAL_95)
     value, low, high = to_uncertainty((found.value, *found.interval), std)
     shown = [mode.frequency_hz for mode in modal.modes]
-    condition = f"by {_BASES['losses']}"
+    condition, alone_excludes = f"by {_BASES['losses']}", "1 is excluded"
     if estimate.basis == "geometry":
         condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
+        alone_excludes = "damping ratios and residue phases alone exclude 1"
     said = (
         f"Between {min(shown):.3g} and {max(shown):.3g} Hz the {loss} grows as f^{value} "
         f"({found.order}; 95 %: {low} to {high}), {condition}"
@@ -114,8 +115,8 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
         return f"{said}; not established, because {found.reason}. {alone}"
     end = {
         "compatible": "consistent with 1",
-        "fractional": "damping ratios and residue phases alone exclude order 1",
-        "open": "not 1 then, but damping ratios and residue phases alone do not exclude order 1",
+        "fractional": alone_excludes,
+        "open": "not 1 then, but damping ratios and residue phases alone do not exclude 1",
     }
     return f"{said}: {end[found.status]}. {alone}"
 

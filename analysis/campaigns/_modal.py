@@ -87,21 +87,24 @@ class PooledModal(ModalEstimate):
     @property
     def modes(self) -> tuple[PooledMode, ...]:
         """Its modes."""
-        std = np.sqrt(np.diag(self.covariance))
         found = []
         for number in self.numbers:
-            at, ratio_at = self.rows([number])[[_LN_FREQUENCY, _LN_RATIO]]
-            frequency_hz, ratio = np.exp(self.constants[[at, ratio_at]]).tolist()
-            inertia, relative_std = self.inertia(number)
+            mode, (inertia, relative_std) = self.mode(number), self.inertia(number)
+            between = self.between_std[self.rows([number])]
             found.append(
                 PooledMode(
-                    number,
-                    frequency_hz, frequency_hz * float(std[at]),
-                    frequency_hz * float(self.between_std[at]),
-                    ratio, ratio * float(std[ratio_at]), ratio * float(self.between_std[ratio_at]),
-                    "modal", inertia, inertia * relative_std,
+                    number=number,
+                    frequency_hz=mode.frequency_hz,
+                    frequency_std_hz=mode.frequency_std_hz,
+                    frequency_between_std_hz=mode.frequency_hz * float(between[_LN_FREQUENCY]),
+                    damping_ratio=mode.damping_ratio,
+                    damping_ratio_std=mode.damping_ratio_std,
+                    damping_ratio_between_std=mode.damping_ratio * float(between[_LN_RATIO]),
+                    source="modal",
+                    participation_kg_m2=inertia,
+                    participation_std_kg_m2=inertia * relative_std,
                 )
-            )  # fmt: skip
+            )
         return tuple(found)
 
 

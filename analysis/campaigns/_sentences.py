@@ -298,7 +298,7 @@ def _effective(found: PooledOrder) -> str:
     said = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
-        "open": "which does not exclude order 1 without the geometry",
+        "open": "which alone does not exclude order 1",
     }
     return f"{loss} growing as f^({number}), {said[found.status]}"
 
@@ -431,7 +431,7 @@ def welch_bias(
     biases: Sequence[WelchBias],
     withheld: Collection[str],
     *,
-    mixed: bool,
+    comparable: bool,
 ) -> list[str]:
     """Say by how much the Welch fits of the type that the numbers are of are biased.
 
@@ -442,10 +442,11 @@ def welch_bias(
     biases : sequence of WelchBias
     withheld : collection of str
         Orders that are not reported; their coefficients are not, either.
-    mixed : bool
-        Whether the sessions are of several specimens: their means are compared with nothing then.
+    comparable : bool
+        Whether the sessions are of one specimen, and a uniform beam predicts its modes: else there
+        is nothing to compare with.
     """
-    if mixed:
+    if not comparable:
         return []
     of_type = [each for each in biases if each.structure == freest.name]
     best = [each for each in of_type if (each.structure, each.weighting) in BEST]

@@ -212,6 +212,7 @@ def campaign_verdict(
         for order in ("alpha", "lambda")
     )
     sweeps = opposite_sweeps(sessions)
+    refused = modal is not None and modal.uniform_beam.status == "refused"
     found = common_findings(sessions)
     close = rivals(pooled, EVEN)
     alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
@@ -240,7 +241,9 @@ def campaign_verdict(
             *_slopes(alpha, lambda_, modal),
             *geometry.sweeps(sweeps),
             *geometry.if_exact(freest, (alpha, lambda_), modal),
-            *sentences.welch_bias(freest, biases, _withheld(alpha, lambda_), mixed=alike.mixed),
+            *sentences.welch_bias(
+                freest, biases, _withheld(alpha, lambda_), comparable=not (alike.mixed or refused)
+            ),
             sentences.selected(pooled, close, alone, len(verdicts)),
             *(finding.sentence for finding in found),
             *sentences.dissenting([(each.file, each.structure) for each in dissent], best),

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from analysis.identify._result import ModeEstimate
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -175,6 +177,20 @@ class ModalEstimate:
         each = np.arange(len(CONSTANTS))
         places = [each + each.size * self.numbers.index(number) for number in numbers]
         return np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
+
+    def mode(self, number: int) -> ModeEstimate:
+        """Return a mode with its standard deviations.
+
+        Parameters
+        ----------
+        number : int
+        """
+        rows = self.rows([number])[:2]
+        frequency_hz, ratio = np.exp(self.constants[rows]).tolist()
+        of_frequency, of_ratio = np.sqrt(np.diag(self.covariance)[rows]).tolist()
+        return ModeEstimate(
+            number, frequency_hz, frequency_hz * of_frequency, ratio, ratio * of_ratio
+        )
 
     def inertia(self, number: int) -> tuple[float, float]:
         """Effective inertia of a mode in kg m², and its relative standard deviation.

@@ -107,6 +107,11 @@ def used(estimate: PooledEstimate, campaign: CampaignResult) -> str:
     return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
 
 
+def exactly(campaign: CampaignResult) -> str:
+    """Return the condition of the types' pooled estimates, nothing where they are the headline."""
+    return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
+
+
 def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
     """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
 
@@ -152,8 +157,7 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
     role = "freest structure"
     if only is not headline:
         role = "lowest BIC; valid only if it is the true one"
-    if campaign.modal is not None and campaign.modal.leads:
-        role = f"{role}; {EXACT_CONDITION}"
+    role += exactly(campaign)
     notes = [
         "One session's std: standard deviation that a typical session states. Between sessions: "
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
