@@ -60,7 +60,7 @@ def test_noise_averages_out_and_an_unevenness_does_not(sessions_of):
 
 
 def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of):
-    found = pooled_modal(sessions_of(20, TRUE + UNEVEN))
+    found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
     rows = (TRUE + UNEVEN).reshape(-1, len(CONSTANTS))
     for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
         assert mode.source == "modal"
@@ -99,26 +99,26 @@ def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of):
 
 
 def test_a_mode_that_few_sessions_show_is_left_out(sessions_of):
-    first, *others = sessions_of(4)
+    first, *others = sessions_of(4, uniformity=0.0)
     two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).of_visible())
     assert two.modal.constants.size == 2 * len(CONSTANTS)
     found = pooled_modal([two, *others])
     assert found.visible == (1, 2)
-    many = pooled_modal([two, *sessions_of(12, first=1)])
+    many = pooled_modal([two, *sessions_of(12, first=1, uniformity=0.0)])
     assert (many.visible, many.sessions) == (MODES, 12)
     assert pooled_modal([first]) is None
     assert pooled_modal([replace(first, modal=None), others[0]]) is None
 
 
 def test_phases_are_pooled_modulo_whole_turns(sessions_of):
-    plain = sessions_of(4)
+    plain = sessions_of(4, uniformity=0.0)
     turn = np.zeros(TRUE.size)
     turn[CONSTANTS.index("residue_phase_rad")] = 2 * np.pi
     modal = plain[2].modal
     turned = replace(plain[2], modal=replace(modal, constants=modal.constants - turn))
     one, other = pooled_modal(plain), pooled_modal([*plain[:2], turned, plain[3]])
     assert other.constants == pytest.approx(one.constants, abs=1e-9)
-    assert other.tolerant.values == pytest.approx(one.tolerant.values, rel=1e-6)
+    assert other.uniform_beam.chi_square == pytest.approx(one.uniform_beam.chi_square, rel=1e-6)
 
 
 # Rising and falling sweeps
@@ -165,10 +165,11 @@ def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, count):
 
 
 def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of):
-    every = sessions_of(4, TRUE + UNEVEN, **UP)
-    (advice,) = sentences.experiments(None, pooled_modal(every), every)
+    every = sessions_of(4, TRUE + UNEVEN, uniformity=0.0, **UP)
+    refused = pooled_modal(every)
+    (advice,) = sentences.experiments(None, refused, every)
     assert advice.startswith("Add falling sweeps")
-    assert sentences.experiments(None, pooled_modal(every), sessions_of(4)) == []
+    assert sentences.experiments(None, refused, sessions_of(4)) == []
 
 
 # Verdict
