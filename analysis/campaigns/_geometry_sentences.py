@@ -88,7 +88,7 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
     Parameters
     ----------
     found : PooledOrder
-        Of `modal.tolerant`.
+        The order as `modal.tolerant` has it.
     modal : PooledModal
     """
     estimate = modal.tolerant

@@ -207,7 +207,7 @@ def tolerant_pooled_order(
     exact : PooledOrder
         The same order on an exactly uniform beam.
     estimate : TolerantEstimate
-        Of all sessions.
+        Estimate from the modal constants of all sessions.
     verdicts : sequence of Verdict
         Verdicts of the sessions.
     """

@@ -293,7 +293,7 @@ class ConstantsProblem:
         Parameters
         ----------
         place : int
-            Of its coefficient among `PARAMETERS`.
+            Place of its coefficient among `PARAMETERS`.
         x : ndarray, shape (7,)
             Unknowns from which the search begins.
         """
@@ -416,7 +416,7 @@ class TolerantEstimate:
         95 %, by the profile of chi-square; an end is infinite, or the edge of the range, where the
         modes do not bound it.
     covariance : ndarray, shape (7, 7)
-        Of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
+        Covariance of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
     first_rad_s : float
         Frequency of the first visible mode.
     deviance_of_one : mapping of str to float
