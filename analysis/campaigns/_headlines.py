@@ -90,7 +90,7 @@ def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
     if modal is None:
         return exact
     told = with_modal_model(
-        exact, modal, modal.uniform_beam, modal.tolerant, every, half_width=modal.half_width
+        exact, modal, modal.uniform_beam, modal.tolerant, every, every, half_width=modal.half_width
     )
     return _flagged(told, campaign, orders)
 

@@ -51,8 +51,6 @@ _PHASE: Final = CONSTANTS.index("residue_phase_rad")
 class PooledModal(ModalEstimate):
     """Modal model of all sessions together.
 
-    The background is the mean of the sessions'.
-
     Attributes
     ----------
     sessions : int
@@ -120,12 +118,8 @@ def pooled_modal(sessions: Sequence[SessionResult]) -> PooledModal | None:
     used = [each for each in shown if each.modal and set(modes) <= set(each.modal.visible)]
     if not modes or len(used) < _FEWEST:
         return None
-    estimates = [each.modal for each in used if each.modal is not None]
-    effects = _pooled_constants(estimates, modes)
-    background = np.mean([each.model.background for each in estimates], axis=0).tolist()
-    estimate = ModalEstimate(
-        ModalModel.of_constants(effects.mean, background), modes, effects.mean, effects.covariance
-    )
+    effects = _pooled_constants([each.modal for each in used if each.modal is not None], modes)
+    estimate = _estimate(modes, effects.mean, effects.covariance)
     nominal = used[0].nominal
     assert nominal is not None
     stated = tuple(sorted({each.uniformity for each in used}))
@@ -133,19 +127,28 @@ def pooled_modal(sessions: Sequence[SessionResult]) -> PooledModal | None:
     if stated[-1]:
         # Intervals are normal ones, and Student's t of few sessions is wider.
         widened = (student_t_quantile(0.95, len(used) - 1) / NORMAL_95) ** 2
-        wide = replace(estimate, covariance=widened * effects.covariance)
+        wide = replace(estimate, joint_covariance=widened * effects.covariance)
         tolerant = tolerant_estimate(wide, nominal, stated[-1])
     return PooledModal(
         model=estimate.model,
         numbers=modes,
-        constants=effects.mean,
-        covariance=effects.covariance,
+        constants=estimate.constants,
+        joint_covariance=effects.covariance,
         sessions=len(used),
-        between_std=effects.between_std,
+        between_std=effects.between_std[: estimate.constants.size],
         stated=stated,
         uniform_beam=uniform_beam_test(estimate, nominal),
         tolerant=tolerant,
     )
+
+
+def _estimate(
+    modes: tuple[int, ...], joint: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> ModalEstimate:
+    """Return the estimate with given constants and background, and their covariance."""
+    constants, background = np.split(joint, [len(modes) * len(CONSTANTS)])
+    model = ModalModel.of_constants(constants, background.tolist())
+    return ModalEstimate(model, modes, constants, covariance)
 
 
 def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
@@ -156,17 +159,26 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
-    """Pool `CONSTANTS` of some modes, phases as near to those of the first as whole turns allow."""
-    rows = [each.rows(modes) for each in estimates]
-    values = np.array([each.constants[its] for each, its in zip(estimates, rows, strict=True)])
-    phases = values[:, _PHASE :: len(CONSTANTS)]
+    """Pool `CONSTANTS` of some modes, and the background with them.
+
+    Phases are as near to those of the first as whole turns allow.
+    """
+    values, covariances = map(np.array, zip(*(_joint(e, modes) for e in estimates), strict=True))
+    phases = values[:, _PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]
     phases -= 2 * math.pi * np.round((phases - phases[0]) / (2 * math.pi))
-    return random_effects(
-        values,
-        np.array([
-            each.covariance[np.ix_(its, its)] for each, its in zip(estimates, rows, strict=True)
-        ]),
-    )  # fmt: skip
+    return random_effects(values, covariances)
+
+
+def _joint(
+    estimate: ModalEstimate, modes: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Constants of some modes and background of one session, with their covariance."""
+    rows = estimate.rows(modes)
+    joint = np.concatenate(
+        [rows, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
+    )
+    values = np.concatenate([estimate.constants[rows], estimate.model.background])
+    return values, estimate.joint_covariance[np.ix_(joint, joint)]
 
 
 # Rising and falling sweeps
@@ -236,7 +248,7 @@ def opposite_sweeps(sessions: Sequence[SessionResult]) -> OppositeSweeps | None:
         return None
     values, covariances = zip(*_of_groups((rising, falling), modes), strict=True)
     difference, covariance = values[1] - values[0], covariances[0] + covariances[1]
-    phases = difference[_PHASE :: len(CONSTANTS)]  # a view
+    phases = difference[_PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]  # a view
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
     found = []
     for place, mode in enumerate(modes):
@@ -258,11 +270,10 @@ def opposite_sweeps(sessions: Sequence[SessionResult]) -> OppositeSweeps | None:
 def _of_groups(
     groups: Iterable[Sequence[ModalEstimate]], modes: Sequence[int]
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield constants of each group with their covariance."""
+    """Yield constants and background of each group with their covariance."""
     for group in groups:
         if len(group) < _FEWEST:
-            rows = group[0].rows(modes)
-            yield group[0].constants[rows], group[0].covariance[np.ix_(rows, rows)]
+            yield _joint(group[0], modes)
         else:
             effects = _pooled_constants(group, modes)
             yield effects.mean, effects.covariance

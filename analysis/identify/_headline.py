@@ -9,7 +9,7 @@ true. What a simpler one would give stands beside it, as a condition.
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, Self
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
+    from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
@@ -289,11 +290,13 @@ class Headline(Numbers):
         Whether it leaves nothing but noise; else every number carries a flag.
     with_both : RecordFit
         That fit with the damping that it lacks, if it does, which the modes are of.
+    modal : ModalFit or None
     """
 
     fit: RecordFit
     explained: bool
     with_both: RecordFit
+    modal: ModalFit | None = field(default=None, kw_only=True)
 
     @property
     def flags(self) -> dict[str, str]:

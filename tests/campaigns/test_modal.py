@@ -35,7 +35,10 @@ def sessions_of(make_session, make_experiment):
         for number in range(first, first + count):
             own = constants + std * np.random.default_rng(number).normal(size=std.size)
             modal = ModalEstimate(
-                ModalModel.of_constants(own, (0.0,) * 5), MODES, own, np.diag(std**2)
+                ModalModel.of_constants(own, (0.0,) * 5),
+                MODES,
+                own,
+                np.diag(np.concatenate([std**2, np.ones(5)])),
             )
             name = f"{number}.mcap"
             found.append(
@@ -102,6 +105,7 @@ def test_a_mode_that_few_sessions_show_is_left_out(sessions_of):
     first, *others = sessions_of(4, uniformity=0.0)
     two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).of_visible())
     assert two.modal.constants.size == 2 * len(CONSTANTS)
+    assert two.modal.joint_covariance.shape == (13, 13)
     found = pooled_modal([two, *others])
     assert found.visible == (1, 2)
     many = pooled_modal([two, *sessions_of(12, first=1, uniformity=0.0)])
