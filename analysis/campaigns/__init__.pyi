@@ -6,9 +6,13 @@ from ._experiment import CampaignError as CampaignError
 from ._experiment import LoneSessionError as LoneSessionError
 from ._experiment import in_dispute as in_dispute
 from ._experiment import told as told
+from ._headlines import campaign_numbers as campaign_numbers
 from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity
+from ._modal import ModeInSweeps as ModeInSweeps
+from ._modal import OppositeSweeps as OppositeSweeps
+from ._modal import PooledModal as PooledModal
 from ._pooling import PooledEstimate as PooledEstimate
 from ._pooling import PooledMode as PooledMode
 from ._pooling import PooledParameter as PooledParameter

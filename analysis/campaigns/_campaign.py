@@ -15,8 +15,9 @@ from analysis.campaigns._experiment import (
     told_apart,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
+from analysis.campaigns._modal import PooledModal, pooled_modal
 from analysis.campaigns._orders import freest_estimate
-from analysis.campaigns._pooling import PooledEstimate, pooled_estimates
+from analysis.campaigns._pooling import PooledEstimate, PooledMode, pooled_estimates
 from analysis.campaigns._session import (
     SessionFailure,
     SessionResult,
@@ -74,6 +75,9 @@ class CampaignResult:
     pooled : tuple of PooledEstimate
         Structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
+    modal : PooledModal or None
+        Modal model of all sessions, and what it says of a nearly uniform beam; None unless two
+        sessions show a common mode.
     verdict : CampaignVerdict or None
         Which of them the data support, and what else they say; None without any.
     validation : tuple of LeftOutError
@@ -93,6 +97,7 @@ class CampaignResult:
     homogeneity: Homogeneity
     structures: tuple[RankedStructure, ...]
     pooled: tuple[PooledEstimate, ...]
+    modal: PooledModal | None
     verdict: CampaignVerdict | None
     validation: tuple[LeftOutError, ...]
     lost_trials: tuple[LostTrial, ...]
@@ -101,6 +106,13 @@ class CampaignResult:
     def headline(self) -> PooledEstimate | None:
         """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
         return freest_estimate(self.pooled)
+
+    @property
+    def modes(self) -> tuple[PooledMode, ...]:
+        """Modes over all sessions: of the modal model, or of an exactly uniform beam."""
+        if self.modal is not None and self.modal.leads:
+            return self.modal.modes
+        return self.headline.modes if self.headline else ()
 
     @property
     def validity(self) -> Validity:
@@ -238,6 +250,7 @@ def campaign_result(
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     alike = homogeneity(sessions, pooled, specimens)
     biases = welch_biases(sessions, pooled)
+    modal = pooled_modal(sessions)
     return CampaignResult(
         settings=sessions[0].settings,
         record_band_hz=sessions[0].record_band_hz,
@@ -249,7 +262,8 @@ def campaign_result(
         homogeneity=alike,
         structures=ranked_structures(sessions, pooled),
         pooled=pooled,
-        verdict=campaign_verdict(sessions, pooled, alike, validation, lost, biases),
+        modal=modal,
+        verdict=campaign_verdict(sessions, pooled, alike, validation, lost, biases, modal),
         validation=tuple(validation),
         lost_trials=tuple(lost),
     )

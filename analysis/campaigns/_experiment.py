@@ -64,6 +64,10 @@ LABEL: Final = "specimen"
 
 _OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
                        "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
+_ENDS: Final = ("start_hz", "stop_hz")
+"""Keys of the ends of a sweep. The same band in the other direction is the same experiment."""
+
+_SWEEP: Final = "chirp"
 _SEARCH: Final = "until"
 """Excitation that was planned while it ran: each is another one."""
 
@@ -153,11 +157,25 @@ class Experiment:
     def difference(self, other: Experiment) -> str | None:
         """Name the first fact in which another one differs, None if it is the same experiment."""
         planned = self.searched or other.searched
+        stated = dict(other.facts)
+        if {self.rising, other.rising} == {True, False}:
+            first, last = _ENDS
+            stated[first], stated[last] = stated[last], stated[first]
         for key, mine in self.facts.items():
-            theirs = mine if planned and key in _STATED else other.facts.get(key, mine)
+            theirs = mine if planned and key in _STATED else stated.get(key, mine)
             if not _same(theirs, mine):
                 return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
         return None
+
+    @property
+    def rising(self) -> bool | None:
+        """Whether the frequency of its sweep rises; None if it is no sweep, or does both."""
+        if self.facts.get("excitation") != _SWEEP or "there_and_back" in self.facts:
+            return None
+        first, last = (self.facts.get(key) for key in _ENDS)
+        if not isinstance(first, float) or not isinstance(last, float) or first == last:
+            return None
+        return first < last
 
     def same_specimen(self, other: Experiment) -> bool:
         """Whether another one states the same beam and the same tool inertia."""

@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.identify import STRONG, Mode, Numbers, Quantity, Simpler, Size, headline_json
+from analysis.identify import (
+    STRONG,
+    Mode,
+    Numbers,
+    Quantity,
+    Simpler,
+    Size,
+    headline_json,
+    with_modal_model,
+)
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -16,12 +25,12 @@ if TYPE_CHECKING:
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._statistics import RankedStructure
-    from analysis.campaigns._verdict import CampaignVerdict
     from analysis.identify import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _MIXTURE: Final = "the mean of a mixture: sessions differ significantly"
 _ON_BOUND: Final = "the unweighted mean: at its bound in at least one session"
+_NOT_SHOWN: Final = "computed from the model: too few records show this mode"
 _ADEQUATE: Final = 0.9
 
 
@@ -39,31 +48,79 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         whole-record fits there are none.
     """
     found = [dict(each.headline) for each in campaign.sessions if each.headline]
-    pooled, verdict = campaign.headline, campaign.verdict
-    if pooled is not None and verdict is not None:
-        found.append(_shared(campaign, pooled, verdict))
+    numbers, verdict = campaign_numbers(campaign), campaign.verdict
+    if numbers is not None and verdict is not None:
+        orders = (verdict.alpha, verdict.lambda_)
+        named = (
+            replace(each.example, sentence=each.sentence, interval=None)
+            for each in verdict.findings
+        )
+        found.append(headline_json(None, numbers, orders, named, campaign.validity))
     return found
 
 
-def _shared(
-    campaign: CampaignResult, pooled: PooledEstimate, verdict: CampaignVerdict
-) -> dict[str, Any]:
+def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
+    """Collect the numbers of all sessions together, with flags.
+
+    Parameters
+    ----------
+    campaign : CampaignResult
+
+    Returns
+    -------
+    Numbers or None
+        None without whole-record fits.
+    """
+    pooled, verdict, modal = campaign.headline, campaign.verdict, campaign.modal
+    if pooled is None or verdict is None:
+        return None
     orders = (verdict.alpha, verdict.lambda_)
+    exactly = tuple(each.exact or each for each in orders)
     explained = verdict.adequate >= _ADEQUATE * verdict.sessions
     every = None if explained else _UNEXPLAINED
-    told = Numbers(
+    exact = Numbers(
         name=pooled.name,
-        parameters=_parameters(campaign, pooled, orders, every),
-        sizes=_sizes(pooled, orders, every),
+        parameters=_parameters(campaign, pooled, exactly, every),
+        sizes=_sizes(pooled, exactly, every),
         modes=_modes(campaign, pooled, every),
         structures=tuple((each.name, _status(each, pooled)) for each in campaign.structures),
         simpler=_simpler(campaign, pooled),
         drag_speed_m_s=None,
     )
-    named = (
-        replace(each.example, sentence=each.sentence, interval=None) for each in verdict.findings
+    if modal is None:
+        return exact
+    told = with_modal_model(
+        exact, modal, modal.uniform_beam, modal.tolerant, every, every, half_width=modal.half_width
     )
-    return headline_json(None, told, orders, named, campaign.validity)
+    return _flagged(told, campaign, orders)
+
+
+def _flagged(told: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder, ...]) -> Numbers:
+    """Flag what sessions differ in, what orders share their reasons, and modes that do not show."""
+    flags, mixed = _flags(orders), campaign.homogeneity.is_mixed
+
+    def of_mixture(quantity: str) -> str | None:
+        return _MIXTURE if mixed(quantity) else None
+
+    return replace(
+        told,
+        parameters={
+            name: each.flagged(of_mixture(name) or flags.get(name))
+            for name, each in told.parameters.items()
+        },
+        modes=tuple(
+            replace(
+                each,
+                frequency_hz=each.frequency_hz.flagged(
+                    of_mixture(f"frequency_hz_{each.number}") if each.shown else _NOT_SHOWN
+                ),
+                damping_ratio=each.damping_ratio.flagged(
+                    of_mixture(f"damping_ratio_{each.number}") if each.shown else _NOT_SHOWN
+                ),
+            )
+            for each in told.modes
+        ),
+    )
 
 
 def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:

@@ -9,11 +9,11 @@ Intervals of the freest structure hold whichever simpler one is true.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns._pooling import by_structure
-from analysis.identify import STRONG, WIDEST_SHARE, too_few_modes
+from analysis.identify import STRONG, WIDEST_SHARE, tolerant_status, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._pooling import PooledEstimate, PooledParameter
     from analysis.campaigns._session import SessionResult
-    from analysis.identify import Order, Verdict
+    from analysis.identify import Order, TolerantEstimate, Verdict
 
 
 # Common structure
@@ -102,6 +102,7 @@ def _freedom(estimate: RecordEstimate) -> int:
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
+_UNEXPLAINED: Final = "part of the records is unexplained"
 _ADEQUATE: Final = 0.9
 """Share of the sessions that must leave nothing but noise before an order is reported."""
 
@@ -127,6 +128,8 @@ class PooledOrder:
         Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
     std : float or None
         Its standard deviation; None as above.
+    exact : PooledOrder or None
+        The same on condition that the beam is uniform to 1e-5; None where that is what it is.
     reason : str or None
         Why the number is not a property of the specimen; None if it is.
     alone : mapping of str to int
@@ -144,6 +147,13 @@ class PooledOrder:
     alone: Mapping[str, int]
     mixture: bool = False
     std: float | None = None
+    exact: PooledOrder | None = None
+
+    def doubted(self, reason: str) -> PooledOrder:
+        """Give it a reason for doubt, unless it has one."""
+        if self.reason is not None:
+            return self
+        return replace(self, status="open" if self.interval else self.status, reason=reason)
 
 
 def pooled_order(
@@ -187,6 +197,48 @@ def pooled_order(
     )
 
 
+def tolerant_pooled_order(
+    exact: PooledOrder,
+    estimate: TolerantEstimate,
+    verdicts: Sequence[Verdict],
+    *,
+    refused: bool,
+) -> PooledOrder:
+    """Judge one order with a tolerance of the geometry.
+
+    Parameters
+    ----------
+    exact : PooledOrder
+        The same order on an exactly uniform beam.
+    estimate : TolerantEstimate
+        Estimate from the modal constants of all sessions.
+    verdicts : sequence of Verdict
+        Verdicts of the sessions.
+    refused : bool
+        Whether a uniform beam does not predict the pooled constants.
+    """
+    order = exact.order
+    status, reason = tolerant_status(order, estimate, refused=refused)
+    found = PooledOrder(
+        order=order,
+        status=status,
+        value=estimate.values[order] if reason is None else None,
+        interval=estimate.interval[order] if reason is None else None,
+        reason=reason,
+        alone=exact.alone,
+        std=estimate.std[order] if reason is None else None,
+        exact=exact,
+    )
+    if exact.mixture and exact.reason is not None:
+        return replace(found.doubted(exact.reason), mixture=True)
+    return found if _adequate(verdicts) else found.doubted(_UNEXPLAINED)
+
+
+def _adequate(verdicts: Sequence[Verdict]) -> bool:
+    """Whether nearly all sessions leave nothing but noise."""
+    return sum(each.adequate for each in verdicts) >= _ADEQUATE * len(verdicts)
+
+
 def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
     """Return those whose BIC is less than so much above the lowest, without the best."""
     return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
@@ -215,8 +267,8 @@ def _judged(
     if not freest.uniform and len(structure.free) > modes:
         # The modes' frequencies say nothing of the damping here: a loss factor each is all.
         return "not identifiable", (f"on a non-uniform beam only {modes} loss factors determine it")
-    if sum(v.adequate for v in verdicts) < _ADEQUATE * len(verdicts):
-        return "open", "part of the records is unexplained"
+    if not _adequate(verdicts):
+        return "open", _UNEXPLAINED
     integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
     if any(each.beam != freest.beam for each in integer):
         return "open", "order 1 on another kind of beam explains the records about as well"

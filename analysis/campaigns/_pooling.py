@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -129,6 +129,10 @@ class PooledMode:
         Scatter between sessions beyond their own uncertainties.
     damping_ratio, damping_ratio_std, damping_ratio_between_std : float
         Likewise.
+    source : str
+        Model that it is of: "modal", or "beam".
+    participation_kg_m2, participation_std_kg_m2 : float or None
+        Inertia about the motor axis that takes part in it, of a mode of the modal model.
     """
 
     number: int
@@ -138,6 +142,9 @@ class PooledMode:
     damping_ratio: float
     damping_ratio_std: float
     damping_ratio_between_std: float
+    source: Literal["modal", "beam"] = "beam"
+    participation_kg_m2: float | None = None
+    participation_std_kg_m2: float | None = None
 
 
 def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate, PooledMode
+    from analysis.campaigns._pooling import PooledEstimate, PooledMode, PooledSize
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.identify import Order
@@ -221,6 +221,7 @@ def _files(names: Sequence[str]) -> str:
 # Verdict
 
 _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
+LOSSES: Final = {"alpha": "internal loss", "lambda": "external damping torque"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _CLASSICAL: Final = "III"
 """Type of integer orders with both dampings."""
@@ -247,7 +248,8 @@ def answer(
     alpha, lambda_ : PooledOrder
     validation : sequence of LeftOutError
     """
-    dampings = f"{_answered(alpha)} and {_answered(lambda_)}"
+    joint = " and " if alpha.exact is None else "; "
+    dampings = f"{_answered(alpha)}{joint}{_answered(lambda_)}"
     said = f"{dampings[0].upper()}{dampings[1:]}."
     errors: dict[str, list[str]] = {}
     for name in dict.fromkeys((f"{_CLASSICAL}{freest.beam}", freest.name)):
@@ -265,6 +267,8 @@ def answer(
 
 def _answered(found: PooledOrder) -> str:
     """Say in a few words of which order a damping is."""
+    if found.exact is not None:
+        return _effective(found)
     of = _OF[found.order]
     if found.status == "absent":
         return f"no {of}"
@@ -282,6 +286,21 @@ def _answered(found: PooledOrder) -> str:
     if abs(found.value - 1) < _NEARLY_INTEGER:
         return f"{of} of nearly integer order ({value}; 1 is excluded)"
     return f"{of} of fractional order ({value})"
+
+
+def _effective(found: PooledOrder) -> str:
+    """Say in a few words how a loss grows over the modes in sight."""
+    loss = LOSSES[found.order]
+    if found.value is None or found.interval is None or found.reason is not None:
+        return f"{loss} with a slope that is not established"
+    half = (found.interval[1] - found.interval[0]) / 2
+    number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
+    said = {
+        "compatible": "consistent with order 1",
+        "fractional": "which excludes order 1",
+        "open": "which alone does not exclude order 1",
+    }
+    return f"{loss} growing as f^({number}), {said[found.status]}"
 
 
 def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
@@ -313,10 +332,10 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     return said
 
 
-def sizes(freest: PooledEstimate) -> list[str]:
+def sizes(found: Sequence[PooledSize]) -> list[str]:
     """Say how large each damping is where it depends least on its order."""
     said = []
-    for each in freest.sizes:
+    for each in found:
         if each.omega_rad_s is None:
             continue
         value, low, high = to_uncertainty((each.value, *each.interval), each.std)
@@ -345,7 +364,8 @@ def selected(
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
         said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
-    return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions)}"
+    selections = {f"type {name}": count for name, count in alone.items()}
+    return f"{said} {in_single_sessions(selections, sessions)}"
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
@@ -355,20 +375,25 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
             f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
             "beam, and standard deviations are meaningless."
         )
+    return noise_alone(adequate, sessions)
+
+
+def noise_alone(adequate: int, sessions: int) -> str:
+    """Say in how many sessions the residual is noise."""
     if adequate == sessions:
-        return "The residual is noise in every session; no unmodelled effect found."
+        return "The residual is noise in every session: the model suffices for these records."
     return (
         f"The residual is noise in {adequate} of {sessions} sessions; in the others something is "
         "unexplained."
     )
 
 
-def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
+def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
     """Say how the modes are damped; of a mixture, that it is one."""
-    if not best.modes:
+    if not found:
         return []
-    t = student_t_quantile(0.95, best.sessions - 1)
-    said = "; ".join(_mode(each, t) for each in best.modes)
+    t = student_t_quantile(0.95, sessions - 1)
+    said = "; ".join(_mode(each, t) for each in found)
     of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {said} (± 95 % of the mean over {of})."]
 
@@ -377,7 +402,7 @@ def order(found: PooledOrder) -> str:
     """Say what is known of one order."""
     name, of = found.order, _OF[found.order]
     counts = {f"“{status}”": count for status, count in found.alone.items()}
-    alone = f" {_alone(counts, sum(counts.values()))}"
+    alone = f" {in_single_sessions(counts, sum(counts.values()))}"
     if found.status == "absent":
         return f"No {of} was found, so its order {name} has no meaning.{alone}"
     if found.status == "compatible" and found.interval is None:
@@ -406,7 +431,7 @@ def welch_bias(
     biases: Sequence[WelchBias],
     withheld: Collection[str],
     *,
-    mixed: bool,
+    comparable: bool,
 ) -> list[str]:
     """Say by how much the Welch fits of the type that the numbers are of are biased.
 
@@ -417,10 +442,11 @@ def welch_bias(
     biases : sequence of WelchBias
     withheld : collection of str
         Orders that are not reported; their coefficients are not, either.
-    mixed : bool
-        Whether the sessions are of several specimens: their means are compared with nothing then.
+    comparable : bool
+        Whether the sessions are of one specimen, and a uniform beam predicts its modes: else there
+        is nothing to compare with.
     """
-    if mixed:
+    if not comparable:
         return []
     of_type = [each for each in biases if each.structure == freest.name]
     best = [each for each in of_type if (each.structure, each.weighting) in BEST]
@@ -540,7 +566,7 @@ def _on_beam(estimate: PooledEstimate) -> str:
     return f"{modes}, with {more}" if more else modes
 
 
-def _alone(counts: Mapping[str, int], sessions: int) -> str:
+def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
     """Say what single sessions find, and how many of them."""
     (first, count), *others = counts.items()
     more = "".join(f", {what} in {n}" for what, n in others)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Candidate, Setting, Verdict
+    from analysis.identify import Candidate, ModalEstimate, Plant, Setting, Verdict
     from analysis.paper import Peak
     from analysis.results import WholeRecord
     from rigd.beam import Beam
@@ -95,6 +95,12 @@ class SessionResult:
         Digests of its samples: see `rigd.session.sample_digests`.
     validity : Validity
         How exact the linear model is for the session.
+    modal : ModalEstimate or None
+        Modes that the whole record shows; None without any.
+    nominal : Plant or None
+        Rig and specimen as the file states them; None without whole-record fits.
+    uniformity : float
+        Stated relative standard deviation of each mode's frequency from that of a uniform beam.
     """
 
     path: Path
@@ -116,6 +122,9 @@ class SessionResult:
     name: str = ""
     digests: frozenset[bytes] = frozenset()
     validity: Validity = field(default_factory=Validity)
+    modal: ModalEstimate | None = None
+    nominal: Plant | None = None
+    uniformity: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
@@ -223,6 +232,7 @@ def _session_result(
     measured = _NO_RESPONSE if welch is None else welch.response
     delay_s = record.torque_delay_s - record.angle_delay_s
     settings = welch_settings(record, task.settings, task.band_hz)
+    modal = None if whole is None else whole.headline.modal
     if welch is not None:
         settings = replace(settings, **asdict(welch.segmentation))
     return SessionResult(
@@ -246,6 +256,9 @@ def _session_result(
         record_band_hz=record_band_hz(record, task.band_hz),
         digests=sample_digests(record.angle_rad, record.torque_nm),
         validity=result.validity,
+        modal=None if modal is None or not modal.visible else modal.of_visible(),
+        nominal=None if whole is None else whole.analysis.comparison.measurement.nominal,
+        uniformity=record.uniformity,
     )
 
 

@@ -8,21 +8,30 @@ from dataclasses import dataclass
 from statistics import median_low
 from typing import TYPE_CHECKING, Final
 
+from analysis.campaigns import _geometry_sentences as geometry
 from analysis.campaigns import _sentences as sentences
 from analysis.campaigns import _sentences as specimen_sentences
-from analysis.campaigns._orders import PooledOrder, freest_estimate, pooled_order, rivals
-from analysis.identify import EVEN, STRONG
+from analysis.campaigns._modal import OppositeSweeps, opposite_sweeps
+from analysis.campaigns._orders import (
+    PooledOrder,
+    freest_estimate,
+    pooled_order,
+    rivals,
+    tolerant_pooled_order,
+)
+from analysis.identify import EVEN, STRONG, refused_reason
 from rigd.units import interval_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from analysis.campaigns._homogeneity import Homogeneity
+    from analysis.campaigns._modal import PooledModal
     from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import WelchBias
-    from analysis.identify import Finding
+    from analysis.identify import Finding, Verdict
 
 
 # Findings in common
@@ -139,6 +148,8 @@ class CampaignVerdict:
     findings : tuple of CommonFinding
         What else is in the records.
     dissent : tuple of Dissent
+    sweeps : OppositeSweeps or None
+        Whether rising and falling sweeps show the same modes; None without both.
     sentences : tuple of str
         The verdict in words, the most important first.
     experiments : tuple of str
@@ -156,12 +167,13 @@ class CampaignVerdict:
     lambda_: PooledOrder
     findings: tuple[CommonFinding, ...]
     dissent: tuple[Dissent, ...]
+    sweeps: OppositeSweeps | None
     sentences: tuple[str, ...]
     experiments: tuple[str, ...]
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Orders that are not to be reported."""
+        """Orders that are not to be reported of an exactly uniform beam."""
         return _withheld(self.alpha, self.lambda_)
 
 
@@ -172,6 +184,7 @@ def campaign_verdict(
     validation: Sequence[LeftOutError],
     lost: Sequence[LostTrial],
     biases: Sequence[WelchBias] = (),
+    modal: PooledModal | None = None,
 ) -> CampaignVerdict | None:
     """Judge a campaign; None if fewer than two sessions determine any structure's damping.
 
@@ -186,19 +199,27 @@ def campaign_verdict(
     lost : sequence of LostTrial
     biases : sequence of WelchBias, optional
         Differences of the Welch fits from the pooled estimates.
+    modal : PooledModal, optional
+        Modal model of all sessions.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
         return None
     best, freest = pooled[0], freest_estimate(pooled)
     assert freest is not None
-    alpha, lambda_ = (pooled_order(order, pooled, verdicts, alike) for order in ("alpha", "lambda"))
+    alpha, lambda_ = (
+        _order(pooled_order(order, pooled, verdicts, alike), verdicts, modal)
+        for order in ("alpha", "lambda")
+    )
+    sweeps = opposite_sweeps(sessions)
+    refused = modal is not None and modal.uniform_beam.status == "refused"
     found = common_findings(sessions)
     close = rivals(pooled, EVEN)
     alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
     adequate = sum(verdict.adequate for verdict in verdicts)
     dissent = _dissent(sessions, best)
-    advice = Counter(advice for verdict in verdicts for advice in verdict.experiments)
+    counted = Counter(advice for verdict in verdicts for advice in verdict.experiments)
+    advice = [what for what, count in counted.most_common() if 2 * count > len(verdicts)]
     return CampaignVerdict(
         headline=freest.name,
         structure=best.structure,
@@ -211,16 +232,18 @@ def campaign_verdict(
         lambda_=lambda_,
         findings=found,
         dissent=dissent,
+        sweeps=sweeps,
         sentences=(
             *specimen_sentences.specimens(alike),
             sentences.answer(freest, alpha, lambda_, validation),
-            sentences.headline(freest, best),
-            sentences.left_over(freest, adequate, len(verdicts)),
-            *sentences.sizes(freest),
-            *sentences.modes(freest, mixed=alike.mixed),
-            sentences.order(alpha),
-            sentences.order(lambda_),
-            *sentences.welch_bias(freest, biases, _withheld(alpha, lambda_), mixed=alike.mixed),
+            *_numbers(freest, best, modal, adequate, len(verdicts)),
+            *_modes(freest, modal, mixed=alike.mixed),
+            *_slopes(alpha, lambda_, modal),
+            *geometry.sweeps(sweeps),
+            *geometry.if_exact(freest, (alpha, lambda_), modal),
+            *sentences.welch_bias(
+                freest, biases, _withheld(alpha, lambda_), comparable=not (alike.mixed or refused)
+            ),
             sentences.selected(pooled, close, alone, len(verdicts)),
             *(finding.sentence for finding in found),
             *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
@@ -228,14 +251,58 @@ def campaign_verdict(
             *sentences.foresight(freest, validation, len(sessions)),
             *sentences.lost_trials(lost, len(sessions)),
         ),
-        experiments=tuple(
-            what for what, count in advice.most_common() if 2 * count > len(verdicts)
-        ),
+        experiments=(*geometry.experiments(sweeps, modal, sessions), *advice),
     )
 
 
+def _order(
+    exact: PooledOrder, verdicts: Sequence[Verdict], modal: PooledModal | None
+) -> PooledOrder:
+    """Judge an order by the modal constants, where these say more than an exact beam."""
+    if modal is None:
+        return exact
+    if modal.tolerant is not None:
+        refused = modal.uniform_beam.status == "refused"
+        return tolerant_pooled_order(exact, modal.tolerant, verdicts, refused=refused)
+    reason = refused_reason(modal.uniform_beam)
+    return exact if reason is None else exact.doubted(reason)
+
+
+def _numbers(
+    freest: PooledEstimate,
+    best: PooledEstimate,
+    modal: PooledModal | None,
+    adequate: int,
+    sessions: int,
+) -> tuple[str, ...]:
+    """Say what the numbers are of, whether they explain the records, and how large the losses."""
+    gate = geometry.uniform_beam(modal)
+    if modal is None or modal.tolerant is None:
+        left = sentences.left_over(freest, adequate, sessions)
+        return sentences.headline(freest, best), *gate, left, *sentences.sizes(freest.sizes)
+    left = sentences.noise_alone(adequate, sessions)
+    return (
+        geometry.tolerance(modal, modal.tolerant),
+        *gate,
+        left,
+        *sentences.sizes(geometry.sizes(modal.tolerant)),
+    )
+
+
+def _modes(freest: PooledEstimate, modal: PooledModal | None, *, mixed: bool) -> list[str]:
+    if modal is not None and modal.leads:
+        return sentences.modes(modal.modes, modal.sessions, mixed=mixed)
+    return sentences.modes(freest.modes, freest.sessions, mixed=mixed)
+
+
+def _slopes(alpha: PooledOrder, lambda_: PooledOrder, modal: PooledModal | None) -> tuple[str, str]:
+    if modal is None or modal.tolerant is None:
+        return sentences.order(alpha), sentences.order(lambda_)
+    return geometry.slope(alpha, modal), geometry.slope(lambda_, modal)
+
+
 def _withheld(*orders: PooledOrder) -> frozenset[str]:
-    return frozenset(each.order for each in orders if each.reason is not None)
+    return frozenset(each.order for each in orders if (each.exact or each).reason is not None)
 
 
 def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:

@@ -10,6 +10,7 @@ from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record
 from ._free_decay import Pole as Pole
 from ._free_decay import mode_poles as mode_poles
+from ._headline import EXACT_CONDITION as EXACT_CONDITION
 from ._headline import MISREAD as MISREAD
 from ._headline import Damping as Damping
 from ._headline import Headline as Headline
@@ -21,7 +22,13 @@ from ._headline import Size as Size
 from ._headline import StructureStatus as StructureStatus
 from ._headline import headline_json as headline_json
 from ._headline import of_fit as of_fit
+from ._modal_headline import refused_reason as refused_reason
+from ._modal_headline import tolerant_sizes as tolerant_sizes
+from ._modal_headline import tolerant_status as tolerant_status
+from ._modal_headline import with_modal_model as with_modal_model
 from ._modal_model import BACKGROUND as BACKGROUND
+from ._modal_model import CONSTANTS as CONSTANTS
+from ._modal_model import ModalEstimate as ModalEstimate
 from ._modal_model import ModalModel as ModalModel
 from ._noise import Line as Line
 from ._parametrization import Steps as Steps
@@ -57,6 +64,10 @@ from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
+from ._uniform_beam import TolerantEstimate as TolerantEstimate
+from ._uniform_beam import UniformBeamTest as UniformBeamTest
+from ._uniform_beam import tolerant_estimate as tolerant_estimate
+from ._uniform_beam import uniform_beam_test as uniform_beam_test
 from ._verdict import EVEN as EVEN
 from ._verdict import STRONG as STRONG
 from ._verdict import OrderVerdict as OrderVerdict

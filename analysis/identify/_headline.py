@@ -9,9 +9,9 @@ true. What a simpler one would give stands beside it, as a condition.
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, Self
 
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._verdict import (
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify._verdict import OrderVerdict
@@ -237,7 +238,7 @@ class Numbers:
         Whether a uniform beam predicts the modal constants; None if no mode shows.
     tolerant : TolerantEstimate or None
         Estimate that parameters and sizes are of, if they allow for a tolerance of the geometry.
-    modal : ModalFit or None
+    modal : ModalEstimate or None
         Fit of the modal model.
     """
 
@@ -252,38 +253,9 @@ class Numbers:
     exact: Numbers | None = None
     uniform_beam: UniformBeamTest | None = None
     tolerant: TolerantEstimate | None = None
-    modal: ModalFit | None = None
+    modal: ModalEstimate | None = None
 
-
-@dataclass(frozen=True, slots=True)
-class Headline(Numbers):
-    """What one record says in numbers, and the fit that they are of.
-
-    Attributes
-    ----------
-    fit : RecordFit
-        Fit of the freest structure that the record supports.
-    explained : bool
-        Whether it leaves nothing but noise; else every number carries a flag.
-    with_both : RecordFit
-        That fit with the damping that it lacks, if it does, which the modes are of.
-    """
-
-    fit: RecordFit
-    explained: bool
-    with_both: RecordFit
-
-    @property
-    def flags(self) -> dict[str, str]:
-        """Reasons by parameter, of those that have one."""
-        return {name: each.flag for name, each in self.parameters.items() if each.flag}
-
-    @property
-    def visible_modes(self) -> tuple[int, ...]:
-        """Numbers of the modes that the record shows."""
-        return tuple(mode.number for mode in self.modes if mode.shown)
-
-    def doubted(self, flag: str) -> Headline:
+    def doubted(self, flag: str) -> Self:
         """Flag every number that has no flag yet.
 
         Parameters
@@ -304,6 +276,37 @@ class Headline(Numbers):
                 for each in self.modes
             ),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Headline(Numbers):
+    """What one record says in numbers, and the fit that they are of.
+
+    Attributes
+    ----------
+    fit : RecordFit
+        Fit of the freest structure that the record supports.
+    explained : bool
+        Whether it leaves nothing but noise; else every number carries a flag.
+    with_both : RecordFit
+        That fit with the damping that it lacks, if it does, which the modes are of.
+    modal : ModalFit or None
+    """
+
+    fit: RecordFit
+    explained: bool
+    with_both: RecordFit
+    modal: ModalFit | None = field(default=None, kw_only=True)
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Reasons by parameter, of those that have one."""
+        return {name: each.flag for name, each in self.parameters.items() if each.flag}
+
+    @property
+    def visible_modes(self) -> tuple[int, ...]:
+        """Numbers of the modes that the record shows."""
+        return tuple(mode.number for mode in self.modes if mode.shown)
 
     def with_law_assumed(self) -> Headline:
         """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify._free_decay import Pole, mode_poles
-from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
+from analysis.identify._modal_model import BACKGROUND, ModalEstimate, ModalModel
 from analysis.identify._noise import smooth_power, with_peaks
 from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.identify._result import Ringing
@@ -70,19 +70,11 @@ _VISIBLE: Final = 400.0
 
 
 @dataclass(frozen=True, slots=True)
-class ModalFit:
+class ModalFit(ModalEstimate):
     """Modal model fitted to a record.
 
     Attributes
     ----------
-    model : ModalModel
-    numbers : tuple of int
-        Number of each mode of the model among those of the beam, from 1; 0 for a resonance of
-        something else.
-    constants : ndarray, shape (4 n,)
-        `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
-    joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
-        Covariance of the constants and the coefficients of the background.
     evidence : tuple of float
         Deviance that each mode saves.
     residual : ndarray of complex, shape (K,)
@@ -101,10 +93,6 @@ class ModalFit:
         parts side by side.
     """
 
-    model: ModalModel
-    numbers: tuple[int, ...]
-    constants: NDArray[np.float64]
-    joint_covariance: NDArray[np.float64]
     evidence: tuple[float, ...]
     residual: NDArray[np.complex128]
     deviance: float
@@ -131,11 +119,6 @@ class ModalFit:
         return saved
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
-        """Covariance of the constants, shape (4 n, 4 n)."""
-        return self.joint_covariance[: self.constants.size, : self.constants.size]
-
-    @property
     def explained(self) -> bool:
         """Whether nothing but noise remains."""
         return self.whiteness.white and not self.input_relation.related
@@ -145,28 +128,6 @@ class ModalFit:
         """Numbers of the beam's modes that the record shows."""
         shown = zip(self.numbers, self.evidence, strict=True)
         return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
-
-    def as_json(self) -> dict[str, Any]:
-        """Modal model with the covariance of its constants, as `json.dumps` takes it."""
-        names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
-        names += [f"background_{power}" for power in range(BACKGROUND)]
-        return {
-            **self.model.as_json(),
-            "modes": list(self.numbers),
-            "constants": self.constants.tolist(),
-            "names": names,
-            "covariance": self.joint_covariance.tolist(),
-        }
-
-    def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
-        """Places of the constants of some modes, shape (4 m,).
-
-        Parameters
-        ----------
-        numbers : sequence of int
-        """
-        each = np.arange(len(CONSTANTS))
-        return np.concatenate([each + each.size * self.numbers.index(n) for n in numbers])
 
 
 def fit_modes(

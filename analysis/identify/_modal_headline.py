@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
-from analysis.identify._headline import Headline, Mode, Numbers, Quantity, Size
+from analysis.identify._headline import Mode, Numbers, Quantity, Size
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._profile_likelihood import WIDEST_SHARE
 from analysis.identify._uncertainty import damping_size
@@ -25,7 +25,7 @@ from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from analysis.identify._headline import StructureStatus
-    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._profile_likelihood import Order, Profile
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
 
@@ -46,33 +46,40 @@ def refused_reason(test: UniformBeamTest) -> str | None:
     return f"a uniform beam does not predict the modal constants (p = {test.p_value:.1g})"
 
 
+_N = TypeVar("_N", bound=Numbers)
+
+
 def with_modal_model(
-    exact: Headline,
-    modal: ModalFit,
+    exact: _N,
+    modal: ModalEstimate,
     test: UniformBeamTest,
     tolerant: TolerantEstimate | None,
     doubt: str | None,
     mode_doubt: str | None,
-) -> Headline:
+    *,
+    half_width: float = NORMAL_95,
+) -> _N:
     """Put modes and tolerant parameters in front of those of an exactly uniform beam.
 
     Parameters
     ----------
-    exact : Headline
-        That of the exactly uniform beam.
-    modal : ModalFit
+    exact : Numbers
+        Those of the exactly uniform beam.
+    modal : ModalEstimate
     test : UniformBeamTest
     tolerant : TolerantEstimate or None
         None to keep the parameters: the beam is stated to be uniform, or too few modes show.
     doubt, mode_doubt : str or None
         Why no number of the record, or no mode, is to be believed.
+    half_width : float
+        Half width of the modes' 95 % intervals, in standard deviations.
     """
     refused = refused_reason(test)
     effective = None if refused is None else NOT_UNIFORM
     condition = exact if refused is None else exact.doubted(refused)
     # What drag does depends on how a mode decays, which the beam takes into account.
     of_beam = refused is None and (tolerant is None or "drag" in exact.parameters)
-    modes = _modes(condition, modal, mode_doubt, own=of_beam)
+    modes = _modes(condition, modal, mode_doubt, half_width, own=of_beam)
     told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
         return told
@@ -86,7 +93,7 @@ def with_modal_model(
             },
             **_parameters(tolerant, doubt, effective),
         },
-        sizes=_sizes(tolerant, doubt, effective),
+        sizes=tolerant_sizes(tolerant, doubt, effective),
         structures=_structures(condition, tolerant),
         simpler=None,
         exact=Numbers(
@@ -102,7 +109,9 @@ def with_modal_model(
     )
 
 
-def _modes(told: Headline, modal: ModalFit, doubt: str | None, *, own: bool) -> tuple[Mode, ...]:
+def _modes(
+    told: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
+) -> tuple[Mode, ...]:
     """Modes that show by the modal model, the others as the beam has them."""
     std = np.sqrt(np.diag(modal.covariance)).reshape(-1, 4)
     constants = modal.constants.reshape(-1, 4)
@@ -111,18 +120,14 @@ def _modes(told: Headline, modal: ModalFit, doubt: str | None, *, own: bool) -> 
         if number not in modal.visible:
             continue
         ln_frequency, ln_ratio, *_ = constants[place]
-        inertia = modal.model.effective_inertias_kg_m2[place]
-        # ln of the inertia: ln of the residue less three times ln of the frequency
-        rows = slice(4 * place, 4 * place + 4)
-        slope = np.array([-3.0, 0.0, 1.0, 0.0])
-        spread = math.sqrt(float(slope @ modal.covariance[rows, rows] @ slope))
+        inertia, spread = modal.inertia(number)
         mode = Mode(
             number,
-            _relative(math.exp(ln_frequency), std[place, 0], doubt),
-            _relative(math.exp(ln_ratio), std[place, 1], doubt),
+            _relative(math.exp(ln_frequency), std[place, 0], doubt, half_width),
+            _relative(math.exp(ln_ratio), std[place, 1], doubt, half_width),
             shown=True,
             source="modal",
-            participation=_relative(inertia, spread, doubt),
+            participation=_relative(inertia, spread, doubt, half_width),
         )
         if own and number in found:
             before = found[number]
@@ -134,9 +139,9 @@ def _modes(told: Headline, modal: ModalFit, doubt: str | None, *, own: bool) -> 
     )
 
 
-def _relative(value: float, spread: float, flag: str | None) -> Quantity:
+def _relative(value: float, spread: float, flag: str | None, half_width: float) -> Quantity:
     """Quantity with a relative standard deviation."""
-    half = NORMAL_95 * spread
+    half = half_width * spread
     return Quantity(value, value * spread, (value * (1 - half), value * (1 + half)), flag)
 
 
@@ -184,7 +189,7 @@ def identifiable(estimate: TolerantEstimate, order: str) -> bool:
 
 
 def _structures(
-    exact: Headline, estimate: TolerantEstimate
+    exact: Numbers, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures the losses exclude: what the modes' places would exclude is no proof."""
 
@@ -206,12 +211,20 @@ def _structures(
     return tuple((name, status(name, before)) for name, before in exact.structures)
 
 
-def _sizes(
+def tolerant_sizes(
     estimate: TolerantEstimate, doubt: str | None, effective: str | None
 ) -> tuple[Size, ...]:
-    """Loss factors where they depend least on their orders.
+    """Return the loss factors where they depend least on their orders.
 
     That of external damping is relative to the inertia, which may be an effective value.
+
+    Parameters
+    ----------
+    estimate : TolerantEstimate
+    doubt : str or None
+        Why no number of the record is to be believed.
+    effective : str or None
+        Why the inertia is not that of the beam alone.
     """
     values = dict(estimate.values)
     found = []
@@ -258,16 +271,33 @@ def tolerant_order(
         Whether a uniform beam does not predict the modes: what makes them differ may have a loss of
         its own, so no order is excluded.
     """
-    if estimate.basis == "none":
-        return OrderVerdict(order, "not identifiable", None, None, NO_ORDER, profile)
-    if not identifiable(estimate, order):
-        return OrderVerdict(order, "not identifiable", None, None, NOT_DETERMINED, profile)
-    low, high = estimate.interval[order]
-    value = estimate.values[order]
+    status, reason = tolerant_status(order, estimate, refused=refused)
+    if reason is not None:
+        return OrderVerdict(order, status, None, None, reason, profile)
+    value, ends = estimate.values[order], estimate.interval[order]
     if doubt is not None:
-        return OrderVerdict(order, "open", value, (low, high), doubt, profile)
+        return OrderVerdict(order, "open", value, ends, doubt, profile)
+    return OrderVerdict(order, status, value, ends, None, profile)
+
+
+def tolerant_status(
+    order: Order, estimate: TolerantEstimate, *, refused: bool
+) -> tuple[Status, str | None]:
+    """Judge one order by an estimate, with the reason where it is not identifiable.
+
+    Parameters
+    ----------
+    order : str
+    estimate : TolerantEstimate
+    refused : bool
+        As `tolerant_order` takes it.
+    """
+    if estimate.basis == "none":
+        return "not identifiable", NO_ORDER
+    if not identifiable(estimate, order):
+        return "not identifiable", NOT_DETERMINED
+    low, high = estimate.interval[order]
     if low <= 1 <= high:
-        return OrderVerdict(order, "compatible", value, (low, high), None, profile)
+        return "compatible", None
     fractional = estimate.deviance_of_one[order] > EXCLUDED[0] and not refused
-    status: Status = "fractional" if fractional else "open"
-    return OrderVerdict(order, status, value, (low, high), None, profile)
+    return ("fractional" if fractional else "open"), None

@@ -16,14 +16,17 @@ form with complex modal constants.
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from analysis.identify._result import ModeEstimate
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -41,7 +44,7 @@ class ModalModel:
     Attributes
     ----------
     poles_rad_s : tuple of complex
-        Of each conjugate pair the upper, by rising frequency.
+        Upper pole of each conjugate pair, by rising frequency.
     residues : tuple of complex
         Residue at each, in N·m/s.
     background : tuple of float
@@ -82,7 +85,7 @@ class ModalModel:
     def effective_inertias_kg_m2(self) -> tuple[float, ...]:
         """Inertia about the motor axis that takes part in each mode.
 
-        Of an undamped beam they add up to its moment of inertia.
+        Those of an undamped beam add up to its moment of inertia.
         """
         return tuple(
             2 * abs(residue) / abs(pole) ** 3
@@ -98,6 +101,27 @@ class ModalModel:
         }
 
     @classmethod
+    def of_constants(
+        cls, constants: NDArray[np.float64], background: Sequence[float]
+    ) -> ModalModel:
+        """Return the model with given constants.
+
+        Parameters
+        ----------
+        constants : ndarray, shape (4 n,)
+            `CONSTANTS` of each mode in turn, by rising frequency.
+        background : sequence of float
+        """
+        rows = constants.reshape(-1, len(CONSTANTS)).tolist()
+        poles, residues = [], []
+        for ln_frequency, ln_ratio, ln_residue, phase_rad in rows:
+            ratio = math.exp(ln_ratio)
+            damped_rad_s = 2 * math.pi * math.exp(ln_frequency)
+            poles.append(damped_rad_s * complex(-ratio / math.sqrt(1 - ratio * ratio), 1.0))
+            residues.append(1j * cmath.rect(math.exp(ln_residue), phase_rad))
+        return cls(tuple(poles), tuple(residues), tuple(background))
+
+    @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> ModalModel:
         """Read what `as_json` wrote.
 
@@ -110,3 +134,102 @@ class ModalModel:
             tuple(complex(*pair) for pair in content["residues"]),
             tuple(float(value) for value in content["background"]),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ModalEstimate:
+    """Modal model with the covariance of its constants, of one record or of several together.
+
+    Attributes
+    ----------
+    model : ModalModel
+    numbers : tuple of int
+        Number of each mode of the model among those of the beam, from 1; 0 for a resonance of
+        something else.
+    constants : ndarray, shape (4 n,)
+        `CONSTANTS` of each mode in turn; the phase is that of the residue over j.
+    joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
+        Covariance of the constants and the coefficients of the background.
+    """
+
+    model: ModalModel
+    numbers: tuple[int, ...]
+    constants: NDArray[np.float64]
+    joint_covariance: NDArray[np.float64]
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of the constants, shape (4 n, 4 n)."""
+        return self.joint_covariance[: self.constants.size, : self.constants.size]
+
+    @property
+    def visible(self) -> tuple[int, ...]:
+        """Numbers of the beam's modes that the data show."""
+        return tuple(sorted(number for number in self.numbers if number))
+
+    def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
+        """Places of the constants of some modes, shape (4 m,).
+
+        Parameters
+        ----------
+        numbers : sequence of int
+        """
+        each = np.arange(len(CONSTANTS))
+        places = [each + each.size * self.numbers.index(number) for number in numbers]
+        return np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
+
+    def mode(self, number: int) -> ModeEstimate:
+        """Return a mode with its standard deviations.
+
+        Parameters
+        ----------
+        number : int
+        """
+        rows = self.rows([number])[:2]
+        frequency_hz, ratio = np.exp(self.constants[rows]).tolist()
+        of_frequency, of_ratio = np.sqrt(np.diag(self.covariance)[rows]).tolist()
+        return ModeEstimate(
+            number, frequency_hz, frequency_hz * of_frequency, ratio, ratio * of_ratio
+        )
+
+    def inertia(self, number: int) -> tuple[float, float]:
+        """Effective inertia of a mode in kg m², and its relative standard deviation.
+
+        Parameters
+        ----------
+        number : int
+        """
+        rows = self.rows([number])
+        # ln of the inertia: ln of the residue less three times ln of the frequency
+        slope = np.zeros(len(CONSTANTS))
+        slope[CONSTANTS.index("ln_frequency")] = -3.0
+        slope[CONSTANTS.index("ln_residue")] = 1.0
+        spread = math.sqrt(float(slope @ self.covariance[np.ix_(rows, rows)] @ slope))
+        return self.model.effective_inertias_kg_m2[self.numbers.index(number)], spread
+
+    def of_visible(self) -> ModalEstimate:
+        """Return the estimate of the visible modes alone, with the same background."""
+        rows, places = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
+        joint = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
+        return ModalEstimate(
+            ModalModel(
+                tuple(self.model.poles_rad_s[place] for place in places),
+                tuple(self.model.residues[place] for place in places),
+                self.model.background,
+            ),
+            self.visible,
+            self.constants[rows],
+            self.joint_covariance[np.ix_(joint, joint)],
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """As `json.dumps` takes it."""
+        names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
+        names += [f"background_{power}" for power in range(BACKGROUND)]
+        return {
+            **self.model.as_json(),
+            "modes": list(self.numbers),
+            "constants": self.constants.tolist(),
+            "names": names,
+            "covariance": self.joint_covariance.tolist(),
+        }

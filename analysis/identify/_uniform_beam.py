@@ -1,10 +1,10 @@
 """Test whether a uniform beam predicts the modal constants, and what its parameters then are.
 
 A plain uniform beam with both dampings predicts frequency, damping ratio and residue of every mode
-from seven parameters. Chi-square of the constants measured (`ModalFit`) against those predicted is
-the test. No antenna is uniform to the precision at which frequencies are measured, so parameters
-are estimated with a stated tolerance: each ln f is uncertain by that much, each ln of a residue by
-three times as much, beside the noise.
+from seven parameters. Chi-square of the constants measured against those predicted is the test. No
+antenna is uniform to the precision at which frequencies are measured, so parameters are estimated
+with a stated tolerance: each ln f is uncertain by that much, each ln of a residue by three times as
+much, beside the noise.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._altered_beam import ModeTerms
-    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.optimizer import Minimum
 
 PARAMETERS: Final = (
@@ -136,7 +136,7 @@ class ConstantsProblem:
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     modes : sequence of int
         Visible modes.
     nominal : Plant
@@ -149,7 +149,7 @@ class ConstantsProblem:
 
     def __init__(
         self,
-        fit: ModalFit,
+        fit: ModalEstimate,
         modes: Sequence[int],
         nominal: Plant,
         uniformity: float = 0.0,
@@ -351,7 +351,7 @@ class ConstantsProblem:
         Parameters
         ----------
         place : int
-            Of its coefficient among `PARAMETERS`.
+            Place of its coefficient among `PARAMETERS`.
         x : ndarray, shape (7,)
             Unknowns from which the search begins.
         """
@@ -474,7 +474,7 @@ class TolerantEstimate:
         95 %, by the profile of chi-square; an end is infinite, or the edge of the range, where the
         modes do not bound it.
     covariance : ndarray, shape (7, 7)
-        Of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
+        Covariance of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
     first_rad_s : float
         Frequency of the first visible mode.
     deviance_of_one : mapping of str to float
@@ -503,20 +503,20 @@ class TolerantEstimate:
 
 
 def uniform_beam_test(
-    fit: ModalFit, nominal: Plant, tilt_deg: float | None = None
+    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
 ) -> UniformBeamTest:
     """Test whether a uniform beam with both dampings predicts the constants of the visible modes.
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     nominal : Plant
         Rig and specimen as the file states them; with a mass at the tip, if it states one.
     tilt_deg : float, optional
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
     modes = fit.visible
-    places = fit.rows(modes) if modes else np.zeros(0, dtype=np.intp)
+    places = fit.rows(modes)
     measured, std = fit.constants[places], np.sqrt(np.diag(fit.covariance)[places])
     freedom = len(places) - len(PARAMETERS)
     if freedom <= 0:
@@ -539,7 +539,7 @@ def uniform_beam_test(
 
 
 def tolerant_estimate(
-    fit: ModalFit, nominal: Plant, uniformity: float, tilt_deg: float | None = None
+    fit: ModalEstimate, nominal: Plant, uniformity: float, tilt_deg: float | None = None
 ) -> TolerantEstimate | None:
     """Estimate damping and beam with a tolerance of the geometry.
 
@@ -548,7 +548,7 @@ def tolerant_estimate(
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     nominal : Plant
         Rig and specimen as the file states them.
     uniformity : float

@@ -19,7 +19,7 @@ from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_text
-from analysis.report._pooled_tables import used
+from analysis.report._pooled_tables import exactly, used
 from analysis.report._table import MARK, unreported
 from rigd.view import magnitude_db, phase_deg
 
@@ -123,8 +123,8 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
             f"{used(estimate, campaign)} — pooled whole-record estimate, type {estimate.name}",
             campaign.homogeneity,
         ),
-        f"freest type that the sessions support, residual {estimate.misfit:.3g} times the noise ·  "
-        "p: p-value of Cochran's Q"
+        f"freest type that the sessions support{exactly(campaign)}  ·  "
+        f"residual {estimate.misfit:.3g} times the noise  ·  p: p-value of Cochran's Q"
         f"{note}",
     )  # fmt: skip
     grid = figure.add_gridspec(

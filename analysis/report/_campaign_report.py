@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.text import Text
 
 from analysis.campaigns import lost_trials, specimens
+from analysis.identify import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
@@ -186,6 +187,7 @@ def _how(campaign: CampaignResult) -> list[Facts]:
                     "random effects: sessions with their own covariances, and a between-session "
                     "variance of each parameter (DerSimonian and Laird); Student's t",
                 ),
+                *_of_geometry(campaign),
                 (
                     "structure",
                     "the freest on the beam of the lowest Bayesian information criterion of all "
@@ -208,6 +210,20 @@ def _how(campaign: CampaignResult) -> list[Facts]:
     if not campaign.sessions[0].record_estimates:
         del parts[1]
     return parts
+
+
+def _of_geometry(campaign: CampaignResult) -> list[tuple[str, str]]:
+    """Say what modes and parameters are of, where a tolerance of the geometry is stated."""
+    if campaign.modal is None or not campaign.modal.leads:
+        return []
+    return [
+        (
+            "modes and parameters",
+            "modal constants (frequency, damping ratio, residue of each mode) pooled over the "
+            "sessions; a beam fitted to these, with the tolerance of the geometry added to their "
+            f"covariance; {EXACT_CONDITION}: the pooled estimates of the types",
+        )
+    ]
 
 
 # Folder
@@ -272,7 +288,7 @@ def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], 
     from analysis.report._pooled_figures import damping_figure, response_figure
 
     found: dict[str, tuple[Callable[[], Figure], str]] = {}
-    if campaign.headline is not None and campaign.headline.modes:
+    if campaign.headline is not None and campaign.modes:
         found["damping"] = (
             partial(damping_figure, campaign),
             "Damping ratios of all sessions' modes against frequency, and the pooled ones with "

@@ -19,6 +19,8 @@ from analysis.report._pooled_tables import (
     pooled_table,
     specimens_table,
     structures_table,
+    tolerant_table,
+    uniform_beam_table,
 )
 from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
 from rigd.session import META_PREFIX
@@ -37,8 +39,8 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
         session_list_table(campaign),
         *([specimens_table(campaign)] if len(found.specimens) > 1 else []),
         *(scatter if found.mixed else []),
-        *(pooled_table(campaign, each) for each in estimates[:1]),
-        *([modes_table(campaign)] if campaign.headline and campaign.headline.modes else []),
+        *headline_tables(campaign),
+        *([uniform_beam_table(campaign)] if campaign.modal else []),
         *(pooled_table(campaign, each) for each in estimates[1:]),
         *([structures_table(campaign)] if campaign.structures else []),
         *([validation_summary(campaign)] if campaign.validation else []),
@@ -48,10 +50,17 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Tables that the terminal shows unasked: pooled modes and parameters."""
-    if campaign.headline is None:
-        return ()
-    modes = [modes_table(campaign)] if campaign.headline.modes else []
-    return (*modes, pooled_table(campaign, campaign.headline))
+    return headline_tables(campaign) if campaign.headline else ()
+
+
+def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
+    """Modes, parameters with a tolerance of the geometry, and those of the type pooled."""
+    made = (
+        modes_table(campaign),
+        tolerant_table(campaign),
+        *(pooled_table(campaign, each) for each in likely_estimates(campaign)[:1]),
+    )
+    return tuple(table for table in made if table.rows)
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
@@ -64,6 +73,8 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         structures_table(campaign),
         *([specimens_table(campaign)] if len(campaign.homogeneity.specimens) > 1 else []),
         homogeneity_table(campaign),
+        tolerant_table(campaign),
+        uniform_beam_table(campaign),
         pooled_table(campaign),
         modes_table(campaign),
         validation_table(campaign),

@@ -12,7 +12,7 @@ from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._bands import dense_grid, loss_factors, response_band
 from analysis.report._campaign_figures import INTERVAL, SESSION, draw_session, shown_sessions
-from analysis.report._pooled_tables import used
+from analysis.report._pooled_tables import exactly, used
 from analysis.statistics import NORMAL_95, student_t_quantile
 from rigd.view import magnitude_db, phase_deg
 
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, PooledEstimate, PooledMode
     from analysis.identify import ModeEstimate, Plant
     from analysis.models import Structure
+
+_FREEST: Final = "VI"
+"""Type with both dampings, of free orders."""
 
 _POINTS: Final = 400
 _COLUMNS: Final = 1500
@@ -42,6 +45,23 @@ class _PooledFit:
     parameters: Mapping[str, float]
     determined: tuple[str, ...]
     covariance: NDArray[np.float64]
+
+    @classmethod
+    def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
+        """Take the estimate that parameters are of; None where the modal constants have none."""
+        modal, pooled = campaign.modal, campaign.headline
+        tolerant = modal.tolerant if modal else None
+        if tolerant is None:
+            return None if pooled is None else cls.of(pooled)
+        if tolerant.basis == "none":
+            return None
+        return cls(
+            structure=STRUCTURES[_FREEST],
+            plant=tolerant.plant,
+            parameters=tolerant.values,
+            determined=tuple(tolerant.std),
+            covariance=tolerant.covariance,
+        )
 
     @classmethod
     def of(cls, pooled: PooledEstimate) -> _PooledFit:
@@ -72,29 +92,28 @@ def damping_figure(campaign: CampaignResult) -> Figure:
 
     pooled = campaign.headline
     assert pooled is not None
-    modes = pooled.modes
+    modes, sessions = campaign.modes, _sessions_of_modes(campaign, pooled)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
         title(f"Damping against frequency, {used(pooled, campaign)}", campaign.homogeneity),
-        f"type {pooled.name}  ·  curve: half the pooled loss factor between the modes  ·  below: "
-        "each mode, frequency from the pooled mean",
+        f"{_source(campaign, pooled)}  ·  curve: half the pooled loss factor between the modes  ·  "
+        "below: each mode, frequency from the pooled mean",
     )  # fmt: skip
     grid = figure.add_gridspec(
         2, len(modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
         height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
     )  # fmt: skip
     axes = figure.add_subplot(grid[0, :])
-    _curve(axes, pooled)
-    of_sessions = _modes_of_sessions(campaign, pooled)
+    _curve(axes, modes, _PooledFit.of_campaign(campaign))
     for column, mode in enumerate(modes):
-        own = [each[column] for each in of_sessions]
+        own = _mode_of_sessions(campaign, pooled, mode)
         axes.plot(
             [each.frequency_hz for each in own], [100 * each.damping_ratio for each in own], "o",
             color=style.INK, markersize=3.0,
         )  # fmt: skip
-        _pooled_mode(axes, mode, pooled.sessions)
-        _enlarged(figure.add_subplot(grid[1, column]), mode, own, pooled.sessions)
+        _pooled_mode(axes, mode, sessions)
+        _enlarged(figure.add_subplot(grid[1, column]), mode, own, sessions)
     figure.axes[1].set_ylabel("Damping ratio (%)")
     style.frequency_axis(axes, (modes[0].frequency_hz / _BESIDE, modes[-1].frequency_hz * _BESIDE))
     axes.set_ylim(bottom=0.0)
@@ -111,27 +130,39 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def _modes_of_sessions(
-    campaign: CampaignResult, pooled: PooledEstimate
-) -> list[tuple[ModeEstimate, ...]]:
-    """Modes of every session by the structure pooled, those that all have."""
-    count = len(pooled.modes)
+def _source(campaign: CampaignResult, pooled: PooledEstimate) -> str:
+    """Name the model that the modes are of."""
+    of_modal_model = campaign.modal is not None and campaign.modal.leads
+    return "modal model" if of_modal_model else f"type {pooled.name}"
+
+
+def _sessions_of_modes(campaign: CampaignResult, pooled: PooledEstimate) -> int:
+    modal = campaign.modal
+    return modal.sessions if modal is not None and modal.leads else pooled.sessions
+
+
+def _mode_of_sessions(
+    campaign: CampaignResult, pooled: PooledEstimate, mode: PooledMode
+) -> list[ModeEstimate]:
+    """Return one mode of every session, by the model that the pooled one is of."""
+    if mode.source == "modal":
+        shown = (each.modal for each in campaign.sessions)
+        return [each.mode(mode.number) for each in shown if each and mode.number in each.visible]
     return [
-        each.modes[:count]
+        own
         for session in campaign.sessions
         for each in session.record_estimates
-        if each.name == pooled.name and len(each.modes) >= count
+        for own in each.modes
+        if each.name == pooled.name and own.number == mode.number
     ]
 
 
-def _curve(axes: Axes, pooled: PooledEstimate) -> None:
+def _curve(axes: Axes, modes: Sequence[PooledMode], fit: _PooledFit | None) -> None:
     """Draw half the loss factor between the first and the last mode: a damping ratio there."""
-    if len(pooled.modes) < 2:
+    if len(modes) < 2 or fit is None:
         return
-    frequency_hz = np.geomspace(
-        pooled.modes[0].frequency_hz, pooled.modes[-1].frequency_hz, _POINTS
-    )
-    total = loss_factors(_PooledFit.of(pooled), frequency_hz).total
+    frequency_hz = np.geomspace(modes[0].frequency_hz, modes[-1].frequency_hz, _POINTS)
+    total = loss_factors(fit, frequency_hz).total
     low, high = total.limits()
     axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL, linewidth=0)
     axes.plot(frequency_hz, 50 * total.value, color=style.BLUE)
@@ -187,7 +218,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
 
     pooled = campaign.headline
     assert pooled is not None
-    peaks_hz = [mode.frequency_hz for mode in pooled.modes]
+    peaks_hz = [mode.frequency_hz for mode in campaign.modes]
     first_hz, last_hz = _band_hz(campaign, peaks_hz)
     band = response_band(_PooledFit.of(pooled), dense_grid(first_hz, last_hz, peaks_hz))
     measured = bool(campaign.sessions[0].frequency_hz.size)
@@ -195,7 +226,8 @@ def response_figure(campaign: CampaignResult) -> Figure:
     figure = style.new_figure(
         width_in, height_in,
         title(f"Pooled frequency response, {used(pooled, campaign)}", campaign.homogeneity),
-        f"coupling torque over motor angle, without delays  ·  pooled: type {pooled.name}"
+        "coupling torque over motor angle, without delays  ·  pooled: type "
+        f"{pooled.name}{exactly(campaign)}"
         + (
             f"  ·  sessions: {ESTIMATOR_WORDS[campaign.settings.estimator]}, which a fast sweep "
             "biases at the resonances"

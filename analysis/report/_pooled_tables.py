@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from analysis.campaigns import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
+    campaign_numbers,
     in_dispute,
     label,
     percent,
@@ -16,8 +17,10 @@ from analysis.campaigns import (
     told,
     with_unit,
 )
+from analysis.identify import EXACT_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report._table import (
+    MARK,
     WORDS,
     Cell,
     Column,
@@ -46,6 +49,10 @@ if TYPE_CHECKING:
         RankedStructure,
     )
 
+_PARTICIPATION: Final = (
+    Column("inertia (10⁻⁶ kg·m²)", "participation_kg_m2"),
+    Column("std", "participation_std_kg_m2", spread=True),
+)
 NOT_POOLED: Final = (
     "In grey: not pooled, as fewer than two sessions determine its damping or not all were fitted."
 )
@@ -100,6 +107,11 @@ def used(estimate: PooledEstimate, campaign: CampaignResult) -> str:
     return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
 
 
+def exactly(campaign: CampaignResult) -> str:
+    """Return the condition of the types' pooled estimates, nothing where they are the headline."""
+    return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
+
+
 def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
     """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
 
@@ -145,6 +157,7 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
     role = "freest structure"
     if only is not headline:
         role = "lowest BIC; valid only if it is the true one"
+    role += exactly(campaign)
     notes = [
         "One session's std: standard deviation that a typical session states. Between sessions: "
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
@@ -201,11 +214,99 @@ def _pooled_row(
     }
 
 
+def tolerant_table(campaign: CampaignResult) -> Table:
+    """Parameters of all sessions with a tolerance of the geometry, with those of an exact beam.
+
+    Without rows where no tolerance is stated.
+    """
+    modal, numbers = campaign.modal, campaign_numbers(campaign)
+    tolerant = modal.tolerant if modal else None
+    columns = (
+        Column("parameter", "parameter", WORDS), Column("value", "value"),
+        Column("std", "std", spread=True),
+        Column("95 % from", "low_95"), Column("to", "high_95"),
+        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", spread=True),
+    )  # fmt: skip
+    if modal is None or tolerant is None or numbers is None:
+        return Table("parameters", "", columns, ())
+    exact = numbers.exact.parameters if numbers.exact else {}
+    rows: list[Row] = []
+    for name, quantity in numbers.parameters.items():
+        _, factor, _ = label(name)
+        low, high = quantity.interval_95 or (None, None)
+        value, *others = estimate(
+            (quantity.value, quantity.std, low, high), quantity.std or None, factor
+        )
+        its = exact.get(name)
+        of_exact = estimate((its.value, its.std), its.std, factor) if its else (None, None)
+        rows.append(
+            {
+                "parameter": Cell(name, with_mark(with_unit(name), name, campaign.homogeneity)),
+                "value": marked(value) if quantity.flag else replace(value, strong=True),
+                **dict(zip(("std", "low_95", "high_95"), others, strict=True)),
+                **dict(zip(("exact", "exact_std"), of_exact, strict=True)),
+                "uniformity_percent": 100 * tolerant.uniformity,
+                "basis": tolerant.basis,
+                "flag": quantity.flag,
+            }
+        )
+    flags = dict.fromkeys(each.flag for each in numbers.parameters.values() if each.flag)
+    return Table(
+        "parameters",
+        title(
+            f"Parameters from the modal constants of {modal.sessions} sessions"
+            + (
+                f", uniform to {100 * tolerant.uniformity:g} %"
+                if tolerant.basis == "geometry"
+                else ""
+            ),
+            campaign.homogeneity,
+        ),
+        columns,
+        tuple(rows),
+        (
+            "The tolerance of the geometry is common to all sessions: more of them do not reduce "
+            "it.",
+            *(f"{MARK} {flag}." for flag in flags),
+        ),
+    )
+
+
+def uniform_beam_table(campaign: CampaignResult) -> Table:
+    """Modal constants of all sessions against those of the uniform beam that fits best."""
+    modal, found = campaign.modal, campaign.homogeneity
+    test = modal.uniform_beam if modal else None
+    rows: list[Row] = []
+    for constant in test.as_json()["constants"] if test else ():
+        measured, std, predicted = (constant[key] for key in ("measured", "std", "predicted"))
+        value, spread, theirs = estimate((measured, std, predicted), std)
+        rows.append(
+            {
+                "mode": constant["mode"],
+                "constant": Cell(constant["name"], constant["name"].replace("_", " ")),
+                "measured": value,
+                "std": spread,
+                "predicted": theirs,
+                "deviation": (measured - predicted) / std,
+            }
+        )
+    return Table(
+        "uniform_beam",
+        title("Modal constants, and those of the uniform beam that fits best", found),
+        (
+            Column("mode", "mode"), Column("constant", "constant", WORDS),
+            Column("measured", "measured"), Column("std", "std", spread=True),
+            Column("uniform beam", "predicted"), Column("difference (std)", "deviation", ".1f"),
+        ),
+        tuple(rows),
+    )  # fmt: skip
+
+
 def modes_table(campaign: CampaignResult) -> Table:
-    """Modes over all sessions, of the structure that the numbers are of."""
+    """Modes over all sessions."""
     found = campaign.homogeneity
     rows: list[Row] = []
-    for mode in campaign.headline.modes if campaign.headline else ():
+    for mode in campaign.modes:
         shown: dict[str, Entry] = {"mode": mode.number}
         for name, std, between, factor in (
             ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
@@ -216,9 +317,13 @@ def modes_table(campaign: CampaignResult) -> Table:
             text = with_mark(mean.text, f"{name}_{mode.number}", found)
             shown[name] = replace(mean, text=text)
             shown[between] = number(getattr(mode, between), ".2g", factor)
+        its = mode.participation_std_kg_m2
+        value, spread = estimate((mode.participation_kg_m2, its), its, 1e6)
+        shown |= {"participation_kg_m2": value, "participation_std_kg_m2": spread}
         rows.append(
             {
                 **shown,
+                "source": mode.source,
                 "frequency_mixture": found.is_mixed(f"frequency_hz_{mode.number}"),
                 "damping_ratio_mixture": found.is_mixed(f"damping_ratio_{mode.number}"),
             }
@@ -235,6 +340,7 @@ def modes_table(campaign: CampaignResult) -> Table:
             Column("damping ratio (%)", "damping_ratio"),
             Column("std", "damping_ratio_std", spread=True),
             Column("between sessions", "damping_ratio_between_std"),
+            *(_PARTICIPATION if any(row["source"] == "modal" for row in rows) else ()),
         ),
         tuple(rows),
         (MIXTURE_NOTE,) if mixed else (),

@@ -21,6 +21,7 @@ from analysis.report._campaign_tables import session_list_table, sessions_table,
 from analysis.report._table import json_rows
 from analysis.report._text import as_text
 from analysis.results import whole_record
+from rigd.beam import modes
 
 
 def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, other_beam):
@@ -147,7 +148,9 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert how in page
     assert how in " ".join((tmp_path / "tables.txt").read_text().split())
     assert (
-        page.index("type VI: internal damping") < page.index("<figure") < page.index('id="table3"')
+        page.index("the internal loss grows as f^")
+        < page.index("<figure")
+        < page.index('id="table3"')
     )
     assert "torn.mcap" in page
     assert "http" not in page.replace("http://www.w3.org", "")
@@ -157,7 +160,13 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert found.validity.predicted_peak_tip_slope_rad == slope_rad > 0.14
     assert found.validity.sentence in text
     assert found.validity.sentence in page
+    of_beam = content["headlines"][-1]["validity"].pop("uniform_beam")
     assert content["validity"] == content["headlines"][-1]["validity"] == found.validity.as_json()
+    assert of_beam["status"] == found.modal.uniform_beam.status == "passed"
+    assert len(content["uniform_beam"]) == len(of_beam["constants"]) == 12
+    alpha = next(row for row in content["parameters"] if row["parameter"] == "alpha")
+    assert (alpha["value"], alpha["basis"]) == (found.verdict.alpha.value, "geometry")
+    assert alpha["exact"] == found.verdict.alpha.exact.value
     for of_file in (*content["headlines"][:-1], *content["files"]):
         assert of_file["validity"]["predicted_peak_tip_slope_rad"] > 0.14
     for words in ("Table 3", "Table 4", "Table 5", "Pooled", "Leave-one-out", "torn"):
@@ -179,17 +188,20 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert verdict.dissent == ()
     stated, answer, structure, *_ = verdict.sentences
     assert stated.startswith("The files state 2 different specimens: beam_length_m 0.98")
-    assert answer.startswith("Internal damping of integer order (alpha = ")
-    assert "and external damping of integer order (lambda = " in answer
+    assert answer.startswith("Internal loss growing as f^(")
+    assert "external damping torque growing as f^(" in answer
+    assert answer.count("consistent with order 1") == 2
     assert "for an unseen session: types III and VI with " in answer
-    assert structure.startswith(
-        "The numbers are those of type VI: internal damping (alpha free) and external"
-    )
+    assert "from the modal constants of 4 sessions; each mode lies where" in structure
+    assert "to 0.1 % as the files state it" in structure
+    (condition,) = (each for each in verdict.sentences if each.startswith("If the beam is"))
+    assert condition.startswith("If the beam is uniform to 1e-5 (type VI): alpha ")
+    assert condition.count("consistent with 1") == 2
     assert not found.homogeneity.mixed
     assert any(
         "No significant between-session variance" in sentence for sentence in verdict.sentences
     )
-    assert "\nThe numbers are those of type VI: internal" in campaign_text(found)
+    assert "\nParameters are those of a beam with both dampings" in campaign_text(found)
     document = campaign_document(found)
     assert document["verdict"]["structure"] == "III"
     *each, shared = document["headlines"]
@@ -198,10 +210,21 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     alpha = shared["parameters"]["alpha"]
     assert alpha["interval_95"] == list(verdict.alpha.interval)
     assert alpha["flag"] is None
+    assert {*each[0], *shared} - {*shared} == {"scale_uncertainty", "combined"}
+    assert (shared["uniformity_percent"], shared["basis"]) == (0.1, "geometry")
+    exact = shared["exact_geometry"]
+    assert exact["condition"] == "if the beam is uniform to 1e-5"
+    for name, quantity in exact["parameters"].items():
+        if quantity["interval_95"] is not None:
+            own = found.headline.by_name[name]
+            assert quantity["interval_95"] == list(own.interval)
+            assert shared["parameters"][name]["std"] >= 0.9 * quantity["std"]
+    assert shared["covariance"]["names"][0] == "ln_zeta"
+    assert np.shape(shared["covariance"]["matrix"]) == (7, 7)
+    assert shared["modal_model"]["modes"] == [1, 2, 3]
     statuses = {one["type"]: one["status"] for one in shared["structures"]}
     expected = {"VI": "selected", "III": "compatible", "I": "excluded"}
     assert statuses.items() >= expected.items()
-    assert shared["conditional"]["on"] == {"alpha": 1.0, "lambda": 1.0}
     internal, external = shared["sizes"]
     beam, damping = truth
     for size, loss in (
@@ -211,7 +234,13 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
         low, high = size["interval_95"]
         assert low < loss(size["omega_rad_s"]) < high
         assert high / low < 1.5
-    assert [mode["mode"] for mode in shared["modes"]] == [1, 2, 3]
+    true = modes(*truth, 3)
+    for mode, own in zip(shared["modes"], true, strict=True):
+        assert (mode["source"], mode["shown"]) == ("modal", True)
+        for name in ("frequency_hz", "damping_ratio"):
+            low, high = mode[name]["interval_95"]
+            assert low < getattr(own, name) < high
+        assert mode["participation"]["std"] < 0.05 * mode["participation"]["value"]
     assert document["files"][0]["verdict"]["structure"]
     fits = {(fit["file"], fit["estimator"], fit["type"], fit["weighting"]) for fit in
             document["fits"]}  # fmt: skip

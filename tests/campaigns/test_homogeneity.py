@@ -154,7 +154,9 @@ def mixture(
     ]  # fmt: skip
     paths = [*short_sessions[:2], *others, other_beam]
     with in_this_process():
-        return campaign(paths, replace(settings, types=("I",)), structures=("III", "IV"))
+        return campaign(
+            paths, replace(settings, types=("I",)), structures=("III", "IV"), uniformity=0.0
+        )
 
 
 @pytest.mark.further  # as made by hand above

@@ -53,7 +53,7 @@ def test_the_modes_have_student_s_interval_as_the_figure_of_them(estimates_of):
     """Of four sessions it is 3.18 standard deviations to either side, and not 1.96."""
     found = pooled(estimates_of("VI", 100.0))
     std = found.modes[0].damping_ratio_std
-    (said_of,) = sentences.modes(found, mixed=False)
+    (said_of,) = sentences.modes(found.modes, found.sessions, mixed=False)
     half = float(said_of.split("± ")[1].split(" %")[0]) / 100
     assert half == pytest.approx(student_t_quantile(0.95, 3) * std, rel=0.05)
 

@@ -1,0 +1,203 @@
+"""Sentences of a campaign on modes and damping with a tolerance of the geometry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from analysis.campaigns._pooling import PooledSize
+from analysis.campaigns._sentences import LOSSES, in_single_sessions, probability
+from analysis.identify import EXACT_CONDITION, tolerant_sizes
+from analysis.statistics import NORMAL_95
+from rigd.printable import listed
+from rigd.units import to_uncertainty
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
+    from analysis.campaigns._orders import PooledOrder
+    from analysis.campaigns._pooling import PooledEstimate
+    from analysis.campaigns._session import SessionResult
+    from analysis.identify import TolerantEstimate
+
+_BASES: Final = {
+    "losses": "damping ratios and residue phases alone",
+    "none": "no beam with one order of each damping, which do not explain the losses",
+}
+
+
+def chance(p_value: float) -> str:
+    """Write a p-value."""
+    written = probability(p_value)
+    return f"p {written}" if written.startswith("<") else f"p = {written}"
+
+
+def sizes(estimate: TolerantEstimate) -> list[PooledSize]:
+    """Loss factors at the frequencies where they depend least on the orders."""
+    return [
+        PooledSize(
+            each.damping, "alpha" if each.damping == "internal" else "lambda", each.omega_rad_s,
+            each.size.value, each.size.std or 0.0, each.size.interval_95 or (0.0, 0.0),
+        )
+        for each in tolerant_sizes(estimate, None, None)
+    ]  # fmt: skip
+
+
+def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
+    """Say what parameters are estimated from, and which tolerance of the geometry they have."""
+    stated = modal.stated[-1]
+    given = f"{100 * stated:g} % as the files state it"
+    if len(modal.stated) > 1:
+        every = listed([f"{100 * each:g}" for each in modal.stated])
+        given = f"{100 * stated:g} %, the largest of the {every} % that the files state"
+    said = (
+        f"Parameters are those of a beam with both dampings, from the modal constants of "
+        f"{modal.sessions} sessions"
+    )
+    if estimate.basis != "geometry":
+        return (
+            f"{said}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
+            f"beam to {given}, nor with a wider tolerance."
+        )
+    used = given
+    if estimate.uniformity > stated:
+        used = f"{100 * estimate.uniformity:g} % ({given} does not suffice)"
+    return (
+        f"{said}; each mode lies where that of a uniform beam does, to {used}. An unevenness of "
+        "the specimen is common to all sessions and does not average out."
+    )
+
+
+def uniform_beam(modal: PooledModal | None) -> list[str]:
+    """Say whether a uniform beam predicts the modal constants."""
+    test = modal.uniform_beam if modal else None
+    if test is None or test.p_value is None:
+        return []
+    which = (
+        f"frequencies, damping ratios and residues of modes {listed([str(n) for n in test.modes])} "
+        f"({chance(test.p_value)})"
+    )
+    if test.status == "passed":
+        return [f"A uniform beam predicts {which}."]
+    return [f"A uniform beam does not predict {which}: the modes are reported without it."]
+
+
+def slope(found: PooledOrder, modal: PooledModal) -> str:
+    """Say what is known of an order as the slope of a loss over the modes in sight.
+
+    Parameters
+    ----------
+    found : PooledOrder
+        The order as `modal.tolerant` has it.
+    modal : PooledModal
+    """
+    estimate = modal.tolerant
+    assert estimate is not None
+    loss = LOSSES[found.order]
+    counts = {f"“{status}”": count for status, count in found.alone.items()}
+    alone = in_single_sessions(counts, sum(counts.values()))
+    if found.value is None or found.interval is None:
+        return (
+            f"The slope of the {loss} ({found.order}) is not identifiable: {found.reason}. {alone}"
+        )
+    std = (found.interval[1] - found.interval[0]) / (2 * NORMAL_95)
+    value, low, high = to_uncertainty((found.value, *found.interval), std)
+    shown = [mode.frequency_hz for mode in modal.modes]
+    condition, alone_excludes = f"by {_BASES['losses']}", "1 is excluded"
+    if estimate.basis == "geometry":
+        condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
+        alone_excludes = "damping ratios and residue phases alone exclude 1"
+    said = (
+        f"Between {min(shown):.3g} and {max(shown):.3g} Hz the {loss} grows as f^{value} "
+        f"({found.order}; 95 %: {low} to {high}), {condition}"
+    )
+    if found.reason is not None:
+        return f"{said}; not established, because {found.reason}. {alone}"
+    end = {
+        "compatible": "consistent with 1",
+        "fractional": alone_excludes,
+        "open": "not 1 then, but damping ratios and residue phases alone do not exclude 1",
+    }
+    return f"{said}: {end[found.status]}. {alone}"
+
+
+def if_exact(
+    freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
+) -> list[str]:
+    """Say what the orders are on condition that the beam is exactly uniform.
+
+    Nothing where a uniform beam does not predict the modes.
+    """
+    if modal is None or modal.uniform_beam.status == "refused":
+        return []
+    said = []
+    for each in orders:
+        exact = each.exact
+        if exact is None or exact.reason or exact.value is None or exact.interval is None:
+            continue
+        half = (exact.interval[1] - exact.interval[0]) / 2
+        value, low, high = to_uncertainty((exact.value, *exact.interval), exact.std or half)
+        end = {
+            "compatible": "consistent with 1",
+            "fractional": "which would exclude 1",
+            "open": "1 would be doubtful",
+        }
+        said.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
+    return (
+        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(said)}."] if said else []
+    )
+
+
+# Rising and falling sweeps
+
+
+def sweeps(found: OppositeSweeps | None) -> list[str]:
+    """Say whether rising and falling sweeps show the same modes."""
+    if found is None:
+        return []
+    which = f"{found.rising} rising and {found.falling} falling sweeps"
+    if not found.changed:
+        least = min(each.chance for each in found.modes)
+        most = max(abs(each.frequency) + NORMAL_95 * each.frequency_std for each in found.modes)
+        return [
+            f"Nothing changed along the records: {which} have the same modal constants (lowest "
+            f"{chance(least)}; frequencies to {100 * most:.1g} %)."
+        ]
+    each = "; ".join(map(_difference, found.changed))
+    return [
+        f"Something changes along the records, or with the direction of the sweep: {which} differ "
+        f"in {each}. Each mode is as it was when the sweep passed it."
+    ]
+
+
+def _difference(each: ModeInSweeps) -> str:
+    def percent(value: float, std: float) -> str:
+        size, spread = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
+        return f"{size} ± {spread} % {'higher' if value > 0 else 'lower'}"
+
+    return (
+        f"mode {each.mode} (falling: frequency {percent(each.frequency, each.frequency_std)}, "
+        f"damping ratio {percent(each.damping, each.damping_std)}; {chance(each.chance)})"
+    )
+
+
+def experiments(
+    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionResult]
+) -> list[str]:
+    """Say which sweeps would decide whether something changes along the records."""
+    if found is not None and found.changed:
+        modes = listed([str(each.mode) for each in found.changed])
+        return [
+            "To tell a change in time from one with amplitude, repeat both sweeps with half the "
+            f"amplitude: a difference in mode {modes} that stays is a change in time. Then check "
+            "clamp and temperature."
+        ]
+    one_way = {each.experiment.rising for each in sessions}
+    refused = modal is not None and modal.uniform_beam.status == "refused"
+    if found is None and refused and one_way in ({True}, {False}):
+        other = "falling" if True in one_way else "rising"
+        return [
+            f"Add {other} sweeps (start_hz and stop_hz exchanged): in sweeps of one direction a "
+            "change along the record looks like a beam that is not uniform."
+        ]
+    return []

@@ -1,0 +1,236 @@
+"""Modal constants of all sessions: the tolerance of the geometry does not average out."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from analysis.campaigns import _geometry_sentences as sentences
+from analysis.campaigns._homogeneity import Homogeneity
+from analysis.campaigns._modal import opposite_sweeps, pooled_modal
+from analysis.campaigns._pooling import pooled
+from analysis.campaigns._verdict import campaign_verdict
+from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
+from analysis.identify._uniform_beam import modal_constants
+from rigd.testing import PAPER_BEAM, PAPER_DAMPING
+
+PLANT = Plant(PAPER_BEAM, PAPER_DAMPING)
+MODES = (1, 2, 3)
+TRUE = modal_constants(PLANT, MODES)
+STD = np.tile([3e-5, 2e-3, 1e-3, 1e-3], len(MODES))
+"""About those of a record of two minutes."""
+
+UNEVEN = np.zeros(TRUE.size)
+UNEVEN[:: len(CONSTANTS)] = 0.7e-3, -0.3e-3, -0.4e-3
+
+
+@pytest.fixture
+def sessions_of(make_session, make_experiment):
+    """Sessions that show these constants, each with its own noise."""
+
+    def make(count, constants=TRUE, *, first=0, uniformity=1e-3, std=STD, **facts):
+        found = []
+        for number in range(first, first + count):
+            own = constants + std * np.random.default_rng(number).normal(size=std.size)
+            modal = ModalEstimate(
+                ModalModel.of_constants(own, (0.0,) * 5),
+                MODES,
+                own,
+                np.diag(np.concatenate([std**2, np.ones(5)])),
+            )
+            name = f"{number}.mcap"
+            found.append(
+                replace(
+                    make_session(name), modal=modal, nominal=Plant(PAPER_BEAM, PAPER_DAMPING),
+                    uniformity=uniformity, experiment=make_experiment(name, **facts),
+                )
+            )  # fmt: skip
+        return found
+
+    return make
+
+
+def test_noise_averages_out_and_an_unevenness_does_not(sessions_of):
+    five, forty = (pooled_modal(sessions_of(count, uniformity=3e-3)) for count in (5, 40))
+    for few, many in zip(five.modes, forty.modes, strict=True):
+        assert many.frequency_std_hz < 0.5 * few.frequency_std_hz
+    stiffness = [each.tolerant.std["bending_stiffness_n_m2"] for each in (five, forty)]
+    assert stiffness[1] == pytest.approx(stiffness[0], rel=0.1)
+    # Three modes whose frequencies are uncertain by 0.3 % each
+    assert stiffness[1] > 2e-3 * PAPER_BEAM.bending_stiffness_n_m2
+
+
+def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of):
+    found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
+    rows = (TRUE + UNEVEN).reshape(-1, len(CONSTANTS))
+    for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
+        assert mode.source == "modal"
+        assert abs(mode.frequency_hz - np.exp(ln_frequency)) < 4 * mode.frequency_std_hz
+        assert abs(mode.damping_ratio - np.exp(ln_ratio)) < 4 * mode.damping_ratio_std
+        assert 0 < mode.participation_std_kg_m2 < 0.01 * mode.participation_kg_m2
+
+
+def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of):
+    even, uneven = (pooled_modal(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
+    assert even.uniform_beam.status == "passed"
+    assert even.leads
+    assert "A uniform beam predicts" in sentences.uniform_beam(even)[0]
+    assert uneven.uniform_beam.status == "refused"
+    assert uneven.uniform_beam.p_value < 1e-10
+    assert "does not predict" in sentences.uniform_beam(uneven)[0]
+    # Losses are the same, and the tolerance covers what the places of the modes would say.
+    for name, true in PLANT.parameters.items():
+        if name in ("alpha", "lambda"):
+            low, high = uneven.tolerant.interval[name]
+            assert low < true < high
+
+
+def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of):
+    zero = pooled_modal(sessions_of(4, uniformity=0.0))
+    assert zero.tolerant is None
+    assert not zero.leads
+    mixed = pooled_modal([*sessions_of(3, uniformity=0.0), *sessions_of(3, first=3)])
+    assert mixed.tolerant.uniformity == 1e-3
+    said = sentences.tolerance(mixed, mixed.tolerant)
+    assert "to 0.1 %, the largest of the 0 and 0.1 % that the files state" in said
+    # An uneven beam stated to be exact: nothing is said of orders on that condition.
+    uneven = pooled_modal(sessions_of(4, TRUE + UNEVEN, uniformity=0.0))
+    assert uneven.tolerant is None
+    assert uneven.leads
+
+
+def test_a_mode_that_few_sessions_show_is_left_out(sessions_of):
+    first, *others = sessions_of(4, uniformity=0.0)
+    two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).of_visible())
+    assert two.modal.constants.size == 2 * len(CONSTANTS)
+    assert two.modal.joint_covariance.shape == (13, 13)
+    found = pooled_modal([two, *others])
+    assert found.visible == (1, 2)
+    many = pooled_modal([two, *sessions_of(12, first=1, uniformity=0.0)])
+    assert (many.visible, many.sessions) == (MODES, 12)
+    assert pooled_modal([first]) is None
+    assert pooled_modal([replace(first, modal=None), others[0]]) is None
+
+
+def test_phases_are_pooled_modulo_whole_turns(sessions_of):
+    plain = sessions_of(4, uniformity=0.0)
+    turn = np.zeros(TRUE.size)
+    turn[CONSTANTS.index("residue_phase_rad")] = 2 * np.pi
+    modal = plain[2].modal
+    turned = replace(plain[2], modal=replace(modal, constants=modal.constants - turn))
+    one, other = pooled_modal(plain), pooled_modal([*plain[:2], turned, plain[3]])
+    assert other.constants == pytest.approx(one.constants, abs=1e-9)
+    assert other.uniform_beam.chi_square == pytest.approx(one.uniform_beam.chi_square, rel=1e-6)
+
+
+# Rising and falling sweeps
+
+UP = {"excitation": "chirp", "start_hz": 0.05, "stop_hz": 50.0}
+DOWN = {"excitation": "chirp", "start_hz": 50.0, "stop_hz": 0.05}
+
+
+def test_a_falling_sweep_is_the_same_experiment(make_experiment):
+    up, down = make_experiment(**UP), make_experiment(**DOWN)
+    assert (up.rising, down.rising, make_experiment().rising) == (True, False, None)
+    assert up.difference(down) is None
+    assert down.difference(up) is None
+    assert "start_hz" in up.difference(make_experiment(**{**DOWN, "stop_hz": 0.5}))
+    assert make_experiment(**{**UP, "excitation": "multisine"}).rising is None
+    assert make_experiment(**UP, there_and_back=1.0).rising is None
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_opposite_sweeps_that_agree_say_that_nothing_changed(sessions_of, count):
+    rising, falling = sessions_of(count, **UP), sessions_of(count, first=50, **DOWN)
+    found = opposite_sweeps([*rising, *falling])
+    assert (found.rising, found.falling, found.changed) == (count, count, ())
+    assert sentences.sweeps(found)[0].startswith("Nothing changed along the records")
+    assert sentences.experiments(found, None, [*rising, *falling]) == []
+    assert opposite_sweeps(rising) is None
+    assert sentences.sweeps(None) == []
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, count):
+    """The stiffness of mode 2 falls by 0.4 % after the rising sweep has passed it."""
+    later = TRUE.copy()
+    later[len(CONSTANTS)] -= 2e-3
+    every = [*sessions_of(count, **UP), *sessions_of(count, later, first=50, **DOWN)]
+    found = opposite_sweeps(every)
+    (changed,) = found.changed
+    assert changed.mode == 2
+    assert abs(changed.frequency + 2e-3) < 4 * changed.frequency_std
+    (said,) = sentences.sweeps(found)
+    assert re.search(r"mode 2 \(falling: frequency 0\.(19|20)\d* ± 0\.0\d+ % lower", said)
+    (advice,) = sentences.experiments(found, None, every)
+    assert "half the amplitude" in advice
+
+
+def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of):
+    every = sessions_of(4, TRUE + UNEVEN, uniformity=0.0, **UP)
+    refused = pooled_modal(every)
+    (advice,) = sentences.experiments(None, refused, every)
+    assert advice.startswith("Add falling sweeps")
+    assert sentences.experiments(None, refused, sessions_of(4)) == []
+
+
+# Verdict
+
+VERDICT = SimpleNamespace(
+    structure="VI", uniform=True, adequate=True, visible_modes=MODES, findings=(), experiments=(),
+    alpha=SimpleNamespace(status="compatible"), lambda_=SimpleNamespace(status="fractional"),
+)  # fmt: skip
+
+
+@pytest.fixture
+def verdict_of(make_estimate):
+    """Verdict on sessions with narrow estimates of type VI, as an exactly uniform beam has them."""
+    names = ("zeta", "alpha", "gamma", "lambda")
+    values = {name: PLANT.parameters[name] for name in names}
+    estimate = make_estimate("VI", values, np.diag([1e-6] * 4), names)
+
+    def judge(sessions):
+        every = [replace(each, record_estimates=(estimate,), verdict=VERDICT) for each in sessions]
+        found = pooled([estimate] * len(every))
+        modal = pooled_modal(every)
+        return campaign_verdict(every, [found], Homogeneity((), ()), (), (), (), modal)
+
+    return judge
+
+
+def test_an_order_is_the_slope_of_a_loss_and_an_exact_value_a_condition(sessions_of, verdict_of):
+    found = verdict_of(sessions_of(8))
+    for order, exact in ((found.alpha, found.alpha.exact), (found.lambda_, found.lambda_.exact)):
+        low, high = order.interval
+        assert low < PLANT.parameters[order.order] < high
+        assert high - low > 5 * (exact.interval[1] - exact.interval[0])
+    text = " ".join(found.sentences)
+    assert "Between 2.57 and 44.8 Hz the internal loss grows as f^" in text
+    assert "if frequencies are those of a uniform beam to 0.1 %: consistent with 1." in text
+    (condition,) = (each for each in found.sentences if each.startswith("If the beam is uniform"))
+    assert "to 1e-5 (type VI): alpha 0.99" in condition
+    assert "lambda 0.59" in condition
+    assert "which would exclude 1" in condition
+    assert "; 1 is excluded" not in text
+    assert found.withheld == frozenset()
+
+
+def test_exact_values_are_withheld_where_a_uniform_beam_is_refused(sessions_of, verdict_of):
+    found = verdict_of(sessions_of(8, TRUE + UNEVEN))
+    assert not any("uniform to 1e-5" in each for each in found.sentences)
+    assert found.alpha.interval[1] - found.alpha.interval[0] > 0.02
+    exact = verdict_of(sessions_of(8, TRUE + UNEVEN, uniformity=0.0))
+    assert exact.lambda_.status == "open"
+    assert "does not predict the modal constants" in exact.lambda_.reason
+    assert "1 is excluded" not in " ".join(exact.sentences)
+
+
+def test_with_a_uniformity_of_0_the_numbers_are_the_narrow_ones(sessions_of, verdict_of):
+    found = verdict_of(sessions_of(8, uniformity=0.0))
+    assert found.lambda_.exact is None
+    assert found.lambda_.status == "fractional"
+    assert found.lambda_.interval[1] - found.lambda_.interval[0] < 0.003
+    assert found.sentences[1].startswith("The numbers are those of type VI")
+    assert not any(each.startswith("If the beam") for each in found.sentences)
