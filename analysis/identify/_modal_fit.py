@@ -249,7 +249,8 @@ class _Search:
             least = int(np.argmin(saved))
             if saved[least] > _EVIDENCE:
                 break
-            search = search._without(least).descended()
+            search = search._without(least)
+            search = search.descended() if search.numbers else search
         return search
 
     def _without(self, place: int) -> _Search:
@@ -364,7 +365,7 @@ class _Problem:
                 slopes.append(row * ((eta * q + 2 * q * q) * over - power))
                 slopes.append(-row * q * over)
         count = len(rows)
-        spectra = self._spectra(np.array(rows + slopes))
+        spectra = self._spectra(np.array(rows + slopes).reshape(-1, self._s.size))
         nuisance = self._white(self._nuisance(x))
         columns = np.concatenate([spectra[:count], self._background, nuisance])
         scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))

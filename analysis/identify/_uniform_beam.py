@@ -223,7 +223,7 @@ class ConstantsProblem:
             s = s - step
             if np.abs(step).max() < _EXACT * np.abs(s).max():
                 break
-        s = np.where((s.imag > 0) & (s.real < 0), s, np.nan)
+        s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
         channel = torque_channel(replace(self.nominal, delay_s=0.0), s) * np.exp(-delay * s)
         log_residues = np.log(1j * self._share * inertia**2 / slope * channel) + stiffness
         rows = (
