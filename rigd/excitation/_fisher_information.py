@@ -17,7 +17,7 @@ L. Pronzato and A. Pázman, Design of experiments in nonlinear models, Springer 
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, pi
 from typing import Any, Final
 
@@ -84,6 +84,10 @@ _PRIOR_STD: Final = {
 }
 """What is known without any record: coefficients within a factor of 20, orders within (0, 2)."""
 
+_DEVIATIONS: Final = {"ln_frequency_": 1.0, "ln_residue_": 3.0}
+"""By what a mode of an antenna differs from that of the beam, with the number of the mode after it:
+its standard deviation over the uniformity, as the analyser has it."""
+
 _RATE_OVER_BAND: Final = 2.4
 _TAPER: Final = 1.1
 _DECAY: Final = 5.0
@@ -102,7 +106,7 @@ class BeamEstimate:
     damping: Damping
     """Damping as estimated; a coefficient of 0 is a kind of damping that the structure has not."""
     names: tuple[str, ...]
-    """Parameters that the fit leaves free, of `PARAMETERS`."""
+    """Parameters that the fit leaves free, of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: Real
     """Shape (m,), increasing: where the spectrum of the noise is given."""
     noise_nm2_per_hz: Real
@@ -115,6 +119,10 @@ class BeamEstimate:
     """Point mass at the tip."""
     root_compliance_rad_per_nm: float = 0.0
     """By how much the clamp turns for a torque."""
+    stiffness_offsets: tuple[float, ...] = ()
+    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    uniformity: float = 0.0
+    """Relative standard deviation of each mode's frequency from that of the beam."""
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
@@ -125,8 +133,8 @@ class BeamEstimate:
         document
             ``beam`` with the keys of `Beam`; ``damping`` with zeta, alpha, gamma and lambda;
             ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and perhaps
-            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg`` and
-            ``root_compliance_rad_per_nm``. Other keys are ignored.
+            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg``, ``root_compliance_rad_per_nm``
+            and ``stiffness_offsets``. Other keys are ignored.
 
         Raises
         ------
@@ -152,6 +160,7 @@ class BeamEstimate:
                 noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
                 **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
+                stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
             )
         except KeyError as error:
             raise ExcitationError(f"The estimate of the beam has no key {error}.") from None
@@ -178,6 +187,7 @@ class BeamEstimate:
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
             *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
+            *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
         ):
             if not (isfinite(value) and least <= value < below):
                 raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
@@ -195,6 +205,23 @@ class BeamEstimate:
             )
         if not self.names:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
+
+    def with_tolerance(self, uniformity: float) -> "BeamEstimate":
+        """Leave the modes free within a tolerance of the geometry, and the orders of the damping.
+
+        Parameters
+        ----------
+        uniformity
+            Relative standard deviation of each mode's frequency; 0 changes nothing.
+        """
+        if not uniformity:
+            return self
+        orders = [name for name in ("alpha", "lambda") if name not in self.names]
+        present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
+        modes = [mode.number for mode in self.modes()]
+        deviations = [f"{name}{number}" for number in modes for name in _DEVIATIONS]
+        free = (*self.names, *(name for name in orders if present[name]), *deviations)
+        return replace(self, names=free, uniformity=uniformity)
 
     @property
     def values(self) -> dict[str, float]:
@@ -215,7 +242,7 @@ class BeamEstimate:
     @property
     def loaded(self) -> LoadedBeam | None:
         """The beam with what is at its ends; None if nothing is, and nothing of it is free."""
-        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm
+        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
             return None
         return self.loaded_beam
@@ -224,7 +251,11 @@ class BeamEstimate:
     def loaded_beam(self) -> LoadedBeam:
         """The beam with what is at its ends."""
         return LoadedBeam(
-            self.beam, self.damping, self.tip_mass_kg, self.root_compliance_rad_per_nm
+            self.beam,
+            self.damping,
+            self.tip_mass_kg,
+            self.root_compliance_rad_per_nm,
+            self.stiffness_offsets,
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
@@ -248,7 +279,8 @@ class BeamEstimate:
         pairs = (
             poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
         )
-        names = [_BY_PARAMETER.get(name, name) for name in self.names]
+        parameters = [name for name in self.names if name in PARAMETERS]
+        names = [_BY_PARAMETER.get(name, name) for name in parameters]
         shown = {
             number: pole
             for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
@@ -263,10 +295,14 @@ class BeamEstimate:
         else:
             moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
         scales = _scales(self)
-        return tuple(
-            EstimatedMode(number, pole, (row * scales).astype(np.complex128))
-            for (number, pole), row in zip(shown.items(), moved, strict=True)
-        )
+        found = []
+        for (number, pole), row in zip(shown.items(), moved, strict=True):
+            gradient = np.zeros(len(self.names), dtype=np.complex128)
+            gradient[: len(parameters)] = row * scales
+            if (own := f"ln_frequency_{number}") in self.names:
+                gradient[self.names.index(own)] = pole
+            found.append(EstimatedMode(number, pole, gradient))
+        return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +343,8 @@ class EstimatedMode:
 def _scales(estimate: BeamEstimate) -> Real:
     """Return factors from derivatives of the exact model to those by the free parameters."""
     values = estimate.values
-    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in estimate.names])
+    names = [name for name in estimate.names if name in PARAMETERS]
+    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])
 
 
 # Whitened derivatives of the torque
@@ -428,7 +465,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     sample_hz
         Rate of the samples whose noise is to have variance 1.
     """
-    names = estimate.names
+    names = [name for name in estimate.names if name in PARAMETERS]
     wrt = [_BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
     loaded = estimate.loaded
     g, of_beam = (
@@ -437,9 +474,10 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
     )
     late = np.exp(-s * estimate.delay_s)
-    kernels: Complex = np.empty((len(names), s.size), dtype=np.complex128)
+    kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
+    kernels[len(names) :] = _by_deviations(estimate, s) * late
     rows = iter(of_beam)
-    for out, name, scale in zip(kernels, names, _scales(estimate), strict=True):
+    for out, name, scale in zip(kernels[: len(names)], names, _scales(estimate), strict=True):
         if name == "delay_s":
             out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * late
         elif name == "tool_inertia_kg_m2":
@@ -448,6 +486,20 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
             out[:] = scale * next(rows) * late
     kernels *= _whitening(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
+
+
+def _by_deviations(estimate: BeamEstimate, s: Complex) -> Complex:
+    """Differentiate the response by the deviations of modes that are free, shape (m, K)."""
+    if not estimate.uniformity:
+        return np.zeros((0, s.size), dtype=np.complex128)
+    rows = []
+    for mode in estimate.modes():
+        pole = np.array([mode.pole_rad_s])
+        residue = complex((estimate.loaded_beam.residues(pole) * pole**2)[0])
+        at, size = (mode.pole_rad_s, mode.pole_rad_s.conjugate()), (residue, residue.conjugate())
+        rows.append(sum(r * p / (s - p) ** 2 for p, r in zip(at, size, strict=True)))
+        rows.append(sum(r / (s - p) for p, r in zip(at, size, strict=True)))
+    return np.array(rows, dtype=np.complex128)
 
 
 def reduction(rate_hz: float) -> int:
@@ -621,6 +673,9 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
     beam = estimate.beam
+    for deviation, size in _DEVIATIONS.items():
+        if name.startswith(deviation):
+            return size * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":
