@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import Pole
+from analysis.identify._free_decay import Pole, mode_poles
 from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
 from analysis.identify._noise import smooth_power
 from analysis.identify._residual_tests import input_relation, whiteness
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Noise
+    from analysis.identify._plant import Plant
     from analysis.identify._residual_tests import InputRelation, Whiteness
 
 _TOLERANCE: Final = 1e-8
@@ -123,6 +124,32 @@ class ModalFit:
             "names": names,
             "covariance": self.covariance.tolist(),
         }
+
+    def plant_like(self, plant: Plant) -> Plant:
+        """Give a plant the frequencies of the visible modes, each by a stiffness of its own.
+
+        Parameters
+        ----------
+        plant : Plant
+            Without anything at its ends.
+        """
+        visible = self.visible
+        if not visible or any(plant.extras.values()) or len(visible) != visible[-1]:
+            return plant
+        poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
+        bare = replace(plant, stiffness_offsets=())
+        stiffer = [
+            (poles[pole.mode].imag / pole.at_rad_s.imag) ** 2
+            for pole in mode_poles(bare, visible[-1], ())
+            if pole.oscillates
+        ]
+        if len(stiffer) < visible[-1]:
+            return plant
+        density = plant.beam.density_kg_per_m / stiffer[0]
+        offsets = tuple(each / stiffer[0] - 1 for each in stiffer[1:])
+        return replace(
+            plant, beam=replace(plant.beam, density_kg_per_m=density), stiffness_offsets=offsets
+        )
 
     def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
         """Places of the constants of some modes, shape (4 m,).

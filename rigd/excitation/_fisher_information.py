@@ -169,6 +169,34 @@ class BeamEstimate:
         estimate.check()
         return estimate
 
+    @classmethod
+    def stated(
+        cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
+    ) -> "BeamEstimate":
+        """Return a beam that is known beforehand, all parameters of a uniform one free.
+
+        Parameters
+        ----------
+        beam, damping
+            As stated.
+        noise_nm2_per_hz
+            One-sided power spectral density of the torque's noise, white.
+        tip_mass_kg
+            Point mass at the tip, held.
+        """
+        absent = {
+            *(() if damping.zeta else ("zeta", "alpha")),
+            *(() if damping.gamma else ("gamma", "lambda")),
+        }
+        return cls(
+            beam,
+            damping,
+            tuple(name for name in OF_UNIFORM if name not in absent),
+            np.array([1.0]),
+            np.array([noise_nm2_per_hz]),
+            tip_mass_kg=tip_mass_kg,
+        )
+
     def check(self) -> None:
         """Refuse what no record can be predicted from.
 
