@@ -22,7 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, LoadedBeam
-from rigd.excitation._fisher_information import BeamEstimate, RecordSoFar
+from rigd.excitation._fisher_information import (
+    BeamEstimate,
+    RecordSoFar,
+    covariance_of,
+    information,
+)
 from rigd.excitation._piece_search import (
     LOOK_AHEAD_S,
     SHORTEST_S,
@@ -203,6 +208,26 @@ def geometry_floors(
         )
         if not item.impossible
     )
+
+
+def expected_precisions(
+    angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
+) -> tuple[Precision, ...]:
+    """Compute how precisely a record is expected to determine what is asked.
+
+    Parameters
+    ----------
+    angle_rad
+        Shape (n,): motor angle; the beam rested at the first.
+    estimate
+        Beam, damping and noise.
+    targets
+        What is asked.
+    rate_hz
+        Rate of the angle.
+    """
+    covariance = covariance_of(information(angle_rad, estimate, rate_hz), estimate)
+    return Quantities.of(targets, estimate).precisions(covariance)
 
 
 def design_excitation(

@@ -16,7 +16,7 @@ M. B. Zarrop, Optimal experiment design for dynamic system identification, Sprin
 L. Pronzato and A. Pázman, Design of experiments in nonlinear models, Springer (2013).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite, pi
 from typing import Any, Final
@@ -84,9 +84,15 @@ _PRIOR_STD: Final = {
 }
 """What is known without any record: coefficients within a factor of 20, orders within (0, 2)."""
 
-_DEVIATIONS: Final = {"ln_frequency_": 1.0, "ln_residue_": 3.0}
-"""By what a mode of an antenna differs from that of the beam, with the number of the mode after it:
-its standard deviation over the uniformity, as the analyser has it."""
+_TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
+"""By what a mode of an antenna differs from that of the beam, with its standard deviation over the
+uniformity, as the analyser has it. The number of the mode follows the name."""
+
+_MODAL: Final = (*_TOLERATED, "ln_damping_ratio", "residue_phase_rad")
+"""What a mode of the modal model is free in."""
+
+_BACKGROUND: Final = 5
+"""Terms of the modal model's background."""
 
 _RATE_OVER_BAND: Final = 2.4
 _TAPER: Final = 1.1
@@ -247,9 +253,16 @@ class BeamEstimate:
         orders = [name for name in ("alpha", "lambda") if name not in self.names]
         present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
         modes = [mode.number for mode in self.modes()]
-        deviations = [f"{name}{number}" for number in modes for name in _DEVIATIONS]
+        deviations = [f"{name}_{number}" for number in modes for name in _TOLERATED]
         free = (*self.names, *(name for name in orders if present[name]), *deviations)
         return replace(self, names=free, uniformity=uniformity)
+
+    def modal(self) -> "BeamEstimate":
+        """Leave the constants of each mode free and a background, and nothing of the beam."""
+        modes = [mode.number for mode in self.modes()]
+        constants = [f"{name}_{number}" for number in modes for name in _MODAL]
+        background = [f"background_{power}" for power in range(_BACKGROUND)]
+        return replace(self, names=(*constants, *background), uniformity=1.0)
 
     @property
     def values(self) -> dict[str, float]:
@@ -327,10 +340,21 @@ class BeamEstimate:
         for (number, pole), row in zip(shown.items(), moved, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales
-            if (own := f"ln_frequency_{number}") in self.names:
-                gradient[self.names.index(own)] = pole
+            for place, name in enumerate(self.names):
+                if name.endswith(f"_{number}"):
+                    gradient[place] = _CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
             found.append(EstimatedMode(number, pole, gradient))
         return tuple(found)
+
+
+_CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]] = {
+    "ln_frequency": lambda pole, _: (pole, 0j),
+    "ln_damping_ratio": lambda pole, _: (complex(pole.real), 0j),
+    "ln_residue": lambda _, residue: (0j, residue),
+    "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
+    "background": lambda *_: (0j, 0j),
+}
+"""Derivatives of the pole and the residue of a mode by its constants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -496,14 +520,16 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     names = [name for name in estimate.names if name in PARAMETERS]
     wrt = [_BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
     loaded = estimate.loaded
-    g, of_beam = (
-        transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
-        if loaded is None
-        else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
-    )
+    g = of_beam = np.zeros((0, s.size), dtype=np.complex128)
+    if names:
+        g, of_beam = (
+            transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+            if loaded is None
+            else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
+        )
     late = np.exp(-s * estimate.delay_s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(names) :] = _by_deviations(estimate, s) * late
+    kernels[len(names) :] = _by_constants(estimate, s) * late
     rows = iter(of_beam)
     for out, name, scale in zip(kernels[: len(names)], names, _scales(estimate), strict=True):
         if name == "delay_s":
@@ -516,18 +542,25 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     return kernels
 
 
-def _by_deviations(estimate: BeamEstimate, s: Complex) -> Complex:
-    """Differentiate the response by the deviations of modes that are free, shape (m, K)."""
-    if not estimate.uniformity:
-        return np.zeros((0, s.size), dtype=np.complex128)
+def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
+    """Differentiate the response by the constants of modes that are free and the background."""
+    poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
     rows = []
-    for mode in estimate.modes():
-        pole = np.array([mode.pole_rad_s])
-        residue = complex((estimate.loaded_beam.residues(pole) * pole**2)[0])
-        at, size = (mode.pole_rad_s, mode.pole_rad_s.conjugate()), (residue, residue.conjugate())
-        rows.append(sum(r * p / (s - p) ** 2 for p, r in zip(at, size, strict=True)))
-        rows.append(sum(r / (s - p) for p, r in zip(at, size, strict=True)))
-    return np.array(rows, dtype=np.complex128)
+    for name in estimate.names:
+        if name in PARAMETERS:
+            continue
+        kind, _, number = name.rpartition("_")
+        if kind == "background":
+            rows.append((s / (2 * pi * BAND_HZ)) ** int(number))
+            continue
+        pole = poles[int(number)]
+        residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
+        by_pole, by_residue = _CHANGES[kind](pole, residue)
+        upper, lower = s - pole, s - pole.conjugate()
+        row = residue * by_pole / upper**2 + by_residue / upper
+        other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
+        rows.append(row + other)
+    return np.array(rows, dtype=np.complex128).reshape(-1, s.size)
 
 
 def reduction(rate_hz: float) -> int:
@@ -701,9 +734,11 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
     beam = estimate.beam
-    for deviation, size in _DEVIATIONS.items():
-        if name.startswith(deviation):
-            return size * estimate.uniformity
+    kind = name.rpartition("_")[0]
+    if kind == "background":
+        return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
+    if kind in _MODAL:
+        return _TOLERATED.get(kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":
