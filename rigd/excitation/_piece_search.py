@@ -601,7 +601,7 @@ def least_deviations(
     angle_rad: Real,
     duration_s: float,
 ) -> Real:
-    """Standard deviation of each quantity if the best mixture of steady sines is for it alone.
+    """Compute the deviation of each quantity if the best mixture of sines is for it alone.
 
     Parameters
     ----------
