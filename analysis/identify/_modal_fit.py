@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._free_decay import Pole, mode_poles
+from analysis.identify._free_decay import Pole
 from analysis.identify._modal_model import BACKGROUND, CONSTANTS, ModalModel
 from analysis.identify._noise import smooth_power
 from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.optimizer import Box, NormalEquations, descend
+from rigd.beam import LoadedBeam
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,19 +138,12 @@ class ModalFit:
         if not visible or any(plant.extras.values()) or len(visible) != visible[-1]:
             return plant
         poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
-        bare = replace(plant, stiffness_offsets=())
-        stiffer = [
-            (poles[pole.mode].imag / pole.at_rad_s.imag) ** 2
-            for pole in mode_poles(bare, visible[-1], ())
-            if pole.oscillates
-        ]
-        if len(stiffer) < visible[-1]:
+        frequency_hz = [poles[number].imag / (2 * math.pi) for number in visible]
+        try:
+            like = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
+        except ValueError:
             return plant
-        density = plant.beam.density_kg_per_m / stiffer[0]
-        offsets = tuple(each / stiffer[0] - 1 for each in stiffer[1:])
-        return replace(
-            plant, beam=replace(plant.beam, density_kg_per_m=density), stiffness_offsets=offsets
-        )
+        return replace(plant, beam=like.beam, stiffness_offsets=like.stiffness_offsets)
 
     def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
         """Places of the constants of some modes, shape (4 m,).

@@ -224,6 +224,36 @@ class LoadedBeam:
             self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         )
 
+    def with_frequencies(self, frequency_hz: Sequence[float]) -> "LoadedBeam":
+        """Give the bare beam the frequencies of some modes, each by a stiffness of its own.
+
+        Parameters
+        ----------
+        frequency_hz
+            Of the free decay of modes 1, 2, …; the density follows from the first.
+
+        Raises
+        ------
+        ValueError
+            If one of these modes of the beam does not oscillate.
+        """
+        z = clamped_free_eigenvalues(len(frequency_hz))
+        wanted_rad_s = 2 * math.pi * np.array(frequency_hz)
+        found = LoadedBeam(self.beam, self.damping)
+        stiffness = np.ones(z.size)
+        for _ in range(2):  # damping moves them a little
+            own_rad_s = found.poles(z)[:, 0].imag
+            if not bool((own_rad_s > 0).all()):
+                raise ValueError("A mode of the beam does not oscillate.")
+            stiffness *= (wanted_rad_s / own_rad_s) ** 2
+            density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
+            found = LoadedBeam(
+                replace(self.beam, density_kg_per_m=density_kg_per_m),
+                self.damping,
+                stiffness_offsets=tuple((stiffness[1:] / stiffness[0] - 1).tolist()),
+            )
+        return found
+
     def transfer(self, s: Complex) -> Complex:
         """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
         response = self.at(s).response
