@@ -193,7 +193,8 @@ def fit_modes(
         tuple(number for number, _, _ in inside),
         np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
     )
-    return search.settled().with_further_resonances().without_idle_modes().fit()
+    search = search.without_unexcited_modes().settled()
+    return search.with_further_resonances().without_idle_modes().fit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,6 +261,15 @@ class _Search:
             if at.cost() - more.cost() < _EVIDENCE:
                 break
             search = more
+        return search
+
+    def without_unexcited_modes(self) -> _Search:
+        """Leave out modes that save nothing at first and then follow a line of the noise."""
+        saved = self.evidence()
+        undamped = self.descended().x[1::2] < 2 * _NARROWEST
+        search = self
+        for place in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
+            search = search._without(place)
         return search
 
     def without_idle_modes(self) -> _Search:
