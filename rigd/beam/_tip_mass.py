@@ -230,7 +230,7 @@ class LoadedBeam:
         Parameters
         ----------
         frequency_hz
-            Of the free decay of modes 1, 2, …; the density follows from the first.
+            Frequencies of the free decay of modes 1, 2, …; the density follows from the first.
 
         Raises
         ------
