@@ -220,13 +220,7 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
     parameters = source.get("parameters")
     if not isinstance(parameters, dict):
         raise IdentifiedBeamError(f"{where}.parameters is missing; {_REMEDY}.")
-    values = {name: _value(where, name, entry) for name, entry in parameters.items()}
-    for name in _NEEDED:
-        if name not in values:
-            raise IdentifiedBeamError(
-                f"{where}.parameters.{name} is missing; take the document of an analysis that "
-                "found it (analyze session.mcap --json model.json)."
-            )
+    values = parameter_values(where, parameters)
     if refused:
         # Effective values of a beam that the rig has not: the modes take their place.
         values = {n: v for n, v in values.items() if _of(n) not in (_OFFSET, *_AT_ENDS)}
@@ -303,10 +297,52 @@ def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) 
 
 def _headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     """Return the headline of a document, what messages call it, and why no uniform beam is it."""
+    document: Any = read_document(path)
+    where, headline = select_headline(path, document)
+    # Of a campaign one record that refuses it is enough.
+    pooled = headline.get("file", "") is None
+    counting = filter(_is_object, document["headlines"]) if pooled else [headline]
+    return where, headline, next(filter(None, map(_refusal, counting)), "")
+
+
+def _is_object(entry: object) -> bool:
+    """Whether a value of a document is an object."""
+    return isinstance(entry, dict)
+
+
+def read_document(path: Path) -> object:
+    """Read a document of ``analyze --json``.
+
+    Parameters
+    ----------
+    path
+
+    Raises
+    ------
+    IdentifiedBeamError
+        If it cannot be read, or is not JSON.
+    """
     try:
-        document = read_json(path)
+        return read_json(path)
     except DocumentError as error:
         raise IdentifiedBeamError(f"{path}: {error}; {_REMEDY}.") from error
+
+
+def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any]]:
+    """Return a document's first headline, of a campaign the pooled one, and its name in messages.
+
+    Parameters
+    ----------
+    path
+        File of the document, for messages.
+    document
+        As `read_document` returns it.
+
+    Raises
+    ------
+    IdentifiedBeamError
+        If there is none.
+    """
     headlines = document.get("headlines") if isinstance(document, dict) else None
     if not isinstance(headlines, list):
         headlines = []
@@ -315,10 +351,7 @@ def _headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     index, headline = next(iter(pooled + found), (0, {}))
     if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_REMEDY}.")
-    # Of a campaign one record that refuses it is enough.
-    counting = [each for _, each in found] if pooled else [headline]
-    refused = next(filter(None, map(_refusal, counting)), "")
-    return f"{path}: headlines[{index}]", headline, refused
+    return f"{path}: headlines[{index}]", headline
 
 
 def _refusal(headline: Mapping[str, Any]) -> str:
@@ -332,6 +365,50 @@ def _refusal(headline: Mapping[str, Any]) -> str:
     return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
+def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Return the values of a headline's parameters, each within its range.
+
+    Parameters
+    ----------
+    where
+        Name of the headline in messages.
+    parameters
+        ``parameters`` of the headline.
+
+    Raises
+    ------
+    IdentifiedBeamError
+        If a parameter is not known, out of its range, or one that every beam has is missing.
+    """
+    values = {name: _value(where, name, entry) for name, entry in parameters.items()}
+    for name in _NEEDED:
+        if name not in values:
+            raise IdentifiedBeamError(
+                f"{where}.parameters.{name} is missing; take the document of an analysis that "
+                "found it (analyze session.mcap --json model.json)."
+            )
+    return values
+
+
+def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
+    """Return index, kind and sentence of the findings whose effect no parameter describes.
+
+    Findings on the one record, which do not concern the antenna, are left out.
+
+    Parameters
+    ----------
+    named
+        ``named`` of a headline.
+    """
+    found = []
+    for number, entry in enumerate(named if isinstance(named, list) else []):
+        given = entry if isinstance(entry, dict) else {}
+        what = given.get("what")
+        if what not in _WITHOUT_EFFECT and what not in _IN_PARAMETERS:
+            found.append((number, str(what)[:60], str(given.get("sentence"))[:200]))
+    return found
+
+
 def _of(name: str) -> str:
     """Return the name in `_PARAMETERS` of a parameter: that of a mode's offset without its mode."""
     return _OFFSET if name.startswith(_OFFSET) and name[len(_OFFSET) :].isdecimal() else name
@@ -343,7 +420,7 @@ def _value(where: str, name: str, entry: object) -> float:
     if known is None or name == _OFFSET:
         raise IdentifiedBeamError(
             f"{where}.parameters.{name[:60]!r} is not known to this version, so what it changes "
-            "cannot be taken into account; update rigd, or leave out --model."
+            "cannot be taken into account; update rigd, or do without this document."
         )
     given = entry.get("value") if isinstance(entry, dict) else None
     value = finite_number(given)
@@ -386,14 +463,10 @@ def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
 
 def _refuse_findings(where: str, named: object, use: Use) -> None:
     """Refuse findings that no parameter carries and that change the beam or doubt the record."""
-    for number, entry in enumerate(named if isinstance(named, list) else []):
-        what = entry.get("what") if isinstance(entry, dict) else None
-        if what in _WITHOUT_EFFECT or what in _IN_PARAMETERS:
-            continue
-        sentence = entry.get("sentence") if isinstance(entry, dict) else None
+    for number, what, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
-            f"{where}.named[{number}]: {str(what)[:60]}, which {use.name} does not take into "
-            f"account ({str(sentence)[:200]}); remove its cause, and record and analyze again, or "
+            f"{where}.named[{number}]: {what}, which {use.name} does not take into "
+            f"account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
 
