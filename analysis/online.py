@@ -120,9 +120,7 @@ class OnlineEstimate:
         """The fit to predict the next excitation's answer with; None if there was no fit.
 
         It has both dampings. One that does not show, or whose order is not identifiable and which
-        may thus be a stiffness or an inertia in truth, has order 1. Modes with stiffnesses of their
-        own are stood for by the likeliest tip mass or clamp, if one was tried: by a few parameters
-        the torque between the modes is known as well.
+        may thus be a stiffness or an inertia in truth, has order 1.
         """
         from analysis.identify import INTEGER
         from analysis.models import COEFFICIENT_OF
@@ -131,13 +129,6 @@ class OnlineEstimate:
         if told is None or analysis is None:
             return None
         fit = told.with_both
-        if fit.plant.stiffness_offsets:
-            others = [
-                each
-                for each in analysis.fits
-                if any(each.plant.extras.values()) and not each.plant.stiffness_offsets
-            ]
-            return min(others, key=lambda each: each.cost, default=fit)
         untold = {name for name in COEFFICIENT_OF if name in told.flags}
         if not untold or fit is not told.fit:
             return fit
@@ -150,6 +141,21 @@ class OnlineEstimate:
             and _named(each.plant) == at_ends
         )
         return next(simple, fit)
+
+    @property
+    def plant(self) -> Plant | None:
+        """That of `predicting`, its modes where the record shows them; None if there was no fit.
+
+        Where a uniform beam does not predict the modal constants, each mode has a stiffness of its
+        own.
+        """
+        told, fit = self.headline, self.predicting
+        if told is None or fit is None:
+            return None
+        test = told.uniform_beam
+        if told.modal is None or test is None or test.status == "passed":
+            return fit.plant
+        return told.modal.plant_like(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it (docs/online_fit.md)."""
@@ -167,15 +173,12 @@ class OnlineEstimate:
             "findings": [each.sentence for each in self.findings],
             "modes": [],
         }
-        told, fit = self.headline, self.predicting
-        if told is not None and fit is not None and self.analysis is not None:
+        told, fit, plant = self.headline, self.predicting, self.plant
+        if told and fit and plant and self.analysis:
             content |= headline_json(None, told, self.orders, self.findings, self.validity)
             content |= {
-                "uniform_beam": not (
-                    told.fit.plant.stiffness_offsets or "tip_mass_kg" in told.fit.parameters
-                ),
                 "predicting": fit.structure.name,
-                "plant": asdict(fit.plant),
+                "plant": asdict(plant),
                 "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
                 "noise": _noise(self.analysis),
             }
@@ -235,7 +238,6 @@ class OnlineFit:
         self._path = Path(name)
         self._blocks: list[NDArray[np.void]] = []
         self._count = 0
-        self._found: Plant | None = None
         self._judged: Selection | None = None
 
     def feed(self, samples: NDArray[np.void]) -> None:
@@ -334,7 +336,7 @@ class OnlineFit:
                 found = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                told, found, analysis = freest_alone(measurement, band_hz, self._found)
+                told, found, analysis = freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session is told, and goes on; later samples may do.
             foreseen = isinstance(error, SessionError | RecordError | MeasurementError)
@@ -344,7 +346,7 @@ class OnlineFit:
             return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
         shows = bool(told.visible_modes)
         plant = told.fit.plant
-        estimate = OnlineEstimate(
+        return OnlineEstimate(
             tick=tick,
             duration_s=duration_s,
             whole=whole,
@@ -361,10 +363,6 @@ class OnlineFit:
                 record.metadata, record.angle_rad, record.rate_hz, (plant.beam, plant.damping)
             ),
         )
-        if whole:
-            fit = estimate.predicting
-            self._found = fit.plant if fit is not None and _named(fit.plant) else None
-        return estimate
 
 
 # The program

@@ -6,12 +6,12 @@ refused by name: nothing is dropped.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot, inf, pi
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.beam import Beam, Damping, LoadedBeam
+from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, participation
 from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
 from rigd.units import finite_number, is_usable_size
@@ -35,6 +35,7 @@ class _Parameter:
 
 
 _OFFSET: Final = "stiffness_offset_"
+_AT_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
 _STATE_FILTER: Final = (
     "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), "
     "record again and analyze that session"
@@ -112,12 +113,16 @@ class Use:
     """Parameters beyond the uniform beam and its channels that are taken into account."""
     certain: frozenset[str]
     """Parameters that must not be flagged, unless another standard deviation covers the doubt."""
+    modes: bool = False
+    """Whether the modes that the record shows will do where they are not those of a uniform beam:
+    each then has a stiffness of its own."""
 
 
 MOVE: Final = Use(
     "a move",
     frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
     frozenset({*_NEEDED, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
+    modes=True,
 )
 """A move without vibration depends on the modes, hardly on how their damping is made up."""
 
@@ -178,13 +183,17 @@ class IdentifiedBeam:
 
 
 def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
-    """Read the parameters that an analysis headlines: of a campaign the pooled ones.
+    """Read the beam that an analysis headlines: of a campaign the pooled one.
+
+    Where a uniform beam predicts the modes, its parameters are those of an exactly uniform one,
+    which predict the record best. Where it does not, no parameter of it describes the rig: the
+    modes themselves are taken, if the use admits that.
 
     Parameters
     ----------
     path
-        Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes`` and
-        ``named``.
+        Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
+        ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     length_m
         Length of the beam, which no session shows.
     use
@@ -197,18 +206,36 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         this use does not take into account, or if a number that it relies on is flagged.
     """
     path = Path(path)
-    where, headline = _headline(path)
-    parameters = headline["parameters"]
-    values = parameter_values(where, parameters)
-    _refuse_effects(where, values, use)
+    where, headline, refused = _headline(path)
+    if refused and not use.modes:
+        raise IdentifiedBeamError(
+            f"{where}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
+            "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
+            "record and analyze again, or leave out --model."
+        )
     _refuse_findings(where, headline.get("named"), use)
+    source = headline
+    if not refused and isinstance(exact := headline.get("exact_geometry"), dict):
+        where, source = f"{where}.exact_geometry", exact
+    parameters = source.get("parameters")
+    if not isinstance(parameters, dict):
+        raise IdentifiedBeamError(f"{where}.parameters is missing; {_REMEDY}.")
+    values = parameter_values(where, parameters)
+    if refused:
+        # Effective values of a beam that the rig has not: the modes take their place.
+        values = {n: v for n, v in values.items() if _of(n) not in (_OFFSET, *_AT_ENDS)}
+    _refuse_effects(where, values, use)
     std = {}
-    for name, entry in parameters.items():
-        deviation = _deviation_for(where, name, entry, use)
+    for name in values:
+        deviation = (
+            _deviation(parameters[name])
+            if refused
+            else _deviation_for(where, name, parameters[name], use)
+        )
         if deviation is not None:
             std[name] = deviation
     density_over_stiffness, stiffness = (values[name] for name in _NEEDED)
-    return IdentifiedBeam(
+    found = IdentifiedBeam(
         beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
         damping=Damping(
             zeta=values.get("zeta", 0.0),
@@ -222,13 +249,65 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         tip_mass_kg=values.get("tip_mass_kg", 0.0),
         root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
         stiffness_offsets=_offsets(where, values),
-        mode_uncertainty=_mode_uncertainty(where, headline.get("modes")),
+        mode_uncertainty=_mode_uncertainty(where, source.get("modes")),
     )
+    return _with_modes(where, found, headline.get("modes"), refused) if refused else found
 
 
-def _headline(path: Path) -> tuple[str, Mapping[str, Any]]:
-    """Return the headline of a document, and what messages call it."""
-    return select_headline(path, read_document(path))
+def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) -> IdentifiedBeam:
+    """Give a beam the modes that a record shows: frequencies and the size of the first."""
+    shown: list[tuple[float, float, float | None]] = []
+    for entry in modes if isinstance(modes, list) else []:
+        if not isinstance(entry, dict) or not entry.get("shown", True):
+            break
+        told = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
+        hz, ratio, inertia = (
+            finite_number(each.get("value")) if isinstance(each, dict) else None for each in told
+        )
+        flags = [each.get("flag") for each in told if isinstance(each, dict)]
+        if not hz or not ratio or hz < 0 or any(flags):
+            break
+        shown.append((hz, ratio, inertia))
+    if not shown:
+        raise IdentifiedBeamError(
+            f"{where}.modes: {refused}, and no mode is shown without a flag that could take its "
+            "place; record a session that shows more modes and analyze it, or leave out --model."
+        )
+    try:
+        like = found.loaded_beam.with_frequencies([hz for hz, _, _ in shown])
+    except ValueError as error:
+        raise IdentifiedBeamError(f"{where}.parameters: {error} Leave out --model.") from None
+    beam, inertia = like.beam, shown[0][2]
+    if inertia and inertia > 0:
+        size = inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
+        beam = replace(
+            beam,
+            density_kg_per_m=size * beam.density_kg_per_m,
+            bending_stiffness_n_m2=size * beam.bending_stiffness_n_m2,
+        )
+    found = replace(found, beam=beam, stiffness_offsets=like.stiffness_offsets)
+    poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(shown)))[:, 0]
+    # What the damping of the beam found differs by from that of the modes counts as uncertainty.
+    uncertainty = (
+        hypot(own, abs(ratio + pole.real / abs(pole)))
+        for own, (_, ratio, _), pole in zip(found.mode_uncertainty, shown, poles, strict=False)
+    )
+    return replace(found, mode_uncertainty=tuple(uncertainty))
+
+
+def _headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
+    """Return the headline of a document, what messages call it, and why no uniform beam is it."""
+    document: Any = read_document(path)
+    where, headline = select_headline(path, document)
+    # Of a campaign one record that refuses it is enough.
+    pooled = headline.get("file", "") is None
+    counting = filter(_is_object, document["headlines"]) if pooled else [headline]
+    return where, headline, next(filter(None, map(_refusal, counting)), "")
+
+
+def _is_object(entry: object) -> bool:
+    """Whether a value of a document is an object."""
+    return isinstance(entry, dict)
 
 
 def read_document(path: Path) -> object:
@@ -273,6 +352,17 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
     if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_REMEDY}.")
     return f"{path}: headlines[{index}]", headline
+
+
+def _refusal(headline: Mapping[str, Any]) -> str:
+    """Say that a uniform beam does not predict the modes of a record; empty if it may."""
+    validity = headline.get("validity")
+    test = validity.get("uniform_beam") if isinstance(validity, dict) else None
+    if not isinstance(test, dict) or test.get("status") != "refused":
+        return ""
+    p_value = finite_number(test.get("p_value"))
+    p = "" if p_value is None else f" (p = {p_value:.1g})"
+    return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
 def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, float]:

@@ -1,9 +1,12 @@
 """The beam of an analysis, from its JSON document: what is used, and what is refused by name."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from rigd.beam import LoadedBeam, clamped_free_eigenvalues, participation
 from rigd.identified_beam import MOVE, TOUCH, IdentifiedBeamError, read_identified_beam
 from rigd.profile import load_profile
 
@@ -167,3 +170,77 @@ def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
     found = read_identified_beam(changed(analysed(), modes=modes), LENGTH_M, MOVE)
     assert found.pole_uncertainty(3) == pytest.approx((0.005, 0.01, 0.01))
     assert "modes[0] is not mode 1" in refusal(changed(analysed(), modes=[mode(2, 0, 0)]), MOVE)
+
+
+def quantity(value, std=0.0, flag=None):
+    return {"value": value, "std": std, "flag": flag}
+
+
+def shown(beam, *, flag=None):
+    """Modes of an antenna as the modal model has them, with the effective inertias."""
+    poles = beam.poles(clamped_free_eigenvalues(3))[:, 0]
+    inertias = beam.beam.density_kg_per_m * participation(beam.beam, 3)
+    return [
+        {
+            "mode": number,
+            "shown": True,
+            "source": "modal",
+            "frequency_hz": quantity(pole.imag / (2 * np.pi), 1e-3, flag),
+            "damping_ratio": quantity(-pole.real / abs(pole), 1e-5, flag),
+            "participation": quantity(float(inertia)),
+        }
+        for number, (pole, inertia) in enumerate(zip(poles, inertias, strict=True), start=1)
+    ]
+
+
+REFUSED = {"uniform_beam": {"status": "refused", "p_value": 3e-7}}
+PASSED = {"uniform_beam": {"status": "passed", "p_value": 0.4}}
+
+
+def test_of_a_uniform_beam_the_exact_parameters_are_read(analysed, profile):
+    """They predict the record best; those with a tolerance of the geometry hold for its modes."""
+    exact = json.loads(analysed().read_text())["headlines"][0]["parameters"]
+    exact = {name: entry | {"flag": None} for name, entry in exact.items()}
+    loaded = LoadedBeam(profile.rig.beam, profile.rig.damping)
+    changes = {"validity": PASSED, "exact_geometry": {"parameters": exact, "modes": shown(loaded)}}
+    path = analysed(density_over_stiffness={"value": 0.06, "std": 1e-4}, alpha=flagged(1.2))
+    for use in (MOVE, TOUCH):
+        found = read_identified_beam(changed(path, **changes), LENGTH_M, use)
+        assert found.damping == profile.rig.damping
+        assert found.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
+    assert found.pole_uncertainty(1)[0] == pytest.approx(1e-3 / 2.57, rel=0.02)
+
+
+def test_of_a_beam_that_is_not_uniform_a_move_takes_the_modes_and_a_touch_refuses(
+    analysed, profile
+):
+    """No effective beam: frequencies and inertia are those of the modes."""
+    beam = replace(profile.rig.beam, density_kg_per_m=5.1e-3, bending_stiffness_n_m2=0.1)
+    true = LoadedBeam(beam, profile.rig.damping, stiffness_offsets=(0.02, -0.03))
+    effective = {name: flagged(value) for name, value in (
+        ("density_over_stiffness", 0.0523), ("bending_stiffness_n_m2", 0.0907),
+        ("tip_mass_kg", 1e-4),
+    )}  # fmt: skip
+    path = changed(analysed(**effective), validity=REFUSED, modes=shown(true))
+    assert "validity.uniform_beam: a uniform beam does not predict" in refusal(path, TOUCH)
+    found = read_identified_beam(path, LENGTH_M, MOVE)
+    assert found.stiffness_offsets == pytest.approx((0.02, -0.03), abs=1e-5)
+    assert found.beam.density_kg_per_m == pytest.approx(5.1e-3)
+    assert found.beam.bending_stiffness_n_m2 == pytest.approx(0.1)
+    assert found.tip_mass_kg == 0.0
+    assert max(found.pole_uncertainty(3)) < 1e-3
+    doubtful = changed(path, modes=shown(true, flag="part of the record is unexplained"))
+    assert "modes: a uniform beam does not predict" in refusal(doubtful, MOVE)
+    # Of a campaign one such record is enough.
+    document = json.loads(changed(path, modes=shown(true)).read_text())
+    pooled = {**document["headlines"][0], "file": None, "validity": {"uniform_beam": None}}
+    path.write_text(json.dumps({"headlines": [*document["headlines"], pooled]}))
+    with pytest.raises(IdentifiedBeamError, match="does not predict the modes"):
+        read_identified_beam(path, LENGTH_M, TOUCH)
+
+
+def test_damping_that_is_not_that_of_the_modes_counts_as_uncertainty(analysed, profile):
+    modes = shown(LoadedBeam(profile.rig.beam, profile.rig.damping))
+    modes[0]["damping_ratio"]["value"] += 0.002
+    found = read_identified_beam(changed(analysed(), validity=REFUSED, modes=modes), LENGTH_M, MOVE)
+    assert found.pole_uncertainty(2) == pytest.approx((0.002, 7e-5), rel=0.1)

@@ -491,22 +491,6 @@ class CandidateSet:
         field = self.ranked((*self.candidates, *found)).cross_checked()
         return field.led_by(field.freest)
 
-    def with_kind_of(self, plant: Plant) -> CandidateSet:
-        """Fit the freest structure on the kind of rig of a plant as well, from there.
-
-        Parameters
-        ----------
-        plant : Plant
-            As the judgement of an earlier part of the record has found it.
-        """
-        extras = tuple(name for name, size in plant.extras.items() if size)
-        refit = self.descent_from(plant, _FREEST, (not plant.stiffness_offsets, extras))
-        field = self.ranked((*self.candidates, refit.candidate()))
-        if field.best.kind != PLAIN and field.best.bic < self.best.bic - _DISMISSED:
-            # What the plain beam does not explain counted as noise.
-            field = field.under(refit.noise_here())._renewed()
-        return field.led_by(field.freest)
-
     def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
         """Fit a candidate with the damping that it lacks, so that its modes count that as unknown.
 

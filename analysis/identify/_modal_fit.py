@@ -28,6 +28,7 @@ from analysis.identify._noise import smooth_power, with_peaks
 from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.identify._result import Ringing
 from analysis.optimizer import Box, NormalEquations, descend
+from rigd.beam import LoadedBeam
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._noise import Noise
+    from analysis.identify._plant import Plant
     from analysis.identify._residual_tests import InputRelation, Whiteness
 
 _TOLERANCE: Final = 1e-8
@@ -129,6 +131,25 @@ class ModalFit(ModalEstimate):
         shown = zip(self.numbers, self.evidence, strict=True)
         return tuple(sorted(number for number, saved in shown if number and saved > _VISIBLE))
 
+    def plant_like(self, plant: Plant) -> Plant:
+        """Give a plant the frequencies of the visible modes, each by a stiffness of its own.
+
+        Parameters
+        ----------
+        plant : Plant
+            Without anything at its ends.
+        """
+        visible = self.visible
+        if not visible or any(plant.extras.values()) or len(visible) != visible[-1]:
+            return plant
+        poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
+        frequency_hz = [poles[number].imag / (2 * math.pi) for number in visible]
+        try:
+            like = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
+        except ValueError:
+            return plant
+        return replace(plant, beam=like.beam, stiffness_offsets=like.stiffness_offsets)
+
 
 def fit_modes(
     comparison: Comparison,
@@ -167,7 +188,7 @@ def fit_modes(
         tuple(number for number, _, _ in inside),
         np.array([[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in inside]).ravel(),
     )
-    return search.settled().with_further_resonances().fit()
+    return search.without_unexcited_modes().settled().with_further_resonances().fit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +265,17 @@ class _Search:
             if at.cost() - more.cost() < _EVIDENCE:
                 break
             search = more
+        return search
+
+    def without_unexcited_modes(self) -> _Search:
+        """Leave out modes that save nothing at first and then follow a line of the noise."""
+        saved = self.evidence()
+        if saved.min() >= _EVIDENCE:
+            return self
+        undamped = self.descended().x[1::2] < 2 * _NARROWEST
+        search = self
+        for place in np.flatnonzero((saved < _EVIDENCE) & undamped)[::-1].tolist():
+            search = search._without(place)
         return search
 
     def _without(self, place: int) -> _Search:

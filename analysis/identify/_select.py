@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._plant import Plant, Setting
+    from analysis.identify._plant import Setting
     from analysis.identify._profile_likelihood import Order
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
@@ -435,7 +435,7 @@ def _with_effects(
 
 
 def freest_alone(
-    measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ, like: Plant | None = None
+    measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
     """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
 
@@ -448,9 +448,6 @@ def freest_alone(
     ----------
     measurement : Measurement
     band_hz : tuple of float
-    like : Plant, optional
-        Plant that `select` found of an earlier part of the record: its kind of rig is fitted as
-        well.
 
     Returns
     -------
@@ -465,11 +462,11 @@ def freest_alone(
     MeasurementError
         The record cannot be used.
     """
-    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz, like)).said
+    return _with_knocks(measurement, lambda each: _freest_alone(each, band_hz)).said
 
 
 def _freest_alone(
-    measurement: Measurement, band_hz: tuple[float, float], like: Plant | None
+    measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Told[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
     """Fit the freest structure alone with what is known to have struck the beam."""
     misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
@@ -477,7 +474,6 @@ def _freest_alone(
     field = replace(CandidateSet.of_freest(measurement, (), band_hz, beside), misread=misread)
     if not misread:
         field = field.with_special_cases()
-        field = field if like is None else field.with_kind_of(like)
     modal = _modal(field)
     visible = _visible(field, modal)
     white, related, multiples = _tests(field, modal, band_hz)

@@ -28,7 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
-from rigd.beam._modes import CLOSE_BY, clamped_free_eigenvalues, poles_for_eigenvalues
+from rigd.beam._modes import (
+    CLOSE_BY,
+    clamped_free_eigenvalues,
+    poles_for_eigenvalues,
+    root_shear_ratio,
+)
 from rigd.beam._point_force import PointForceGrid
 
 Real = NDArray[np.float64]
@@ -110,12 +115,44 @@ def loaded_response(
     )
 
 
+def _with_offsets(
+    found: LoadedResponse,
+    elastic: Complex,
+    inertial: Complex,
+    beam: Beam,
+    stiffness_offsets: tuple[float, ...],
+) -> LoadedResponse:
+    """Give modes 2, 3, … of a beam on a rigid clamp a stiffness of their own."""
+    length, stiffness = beam.length_m, beam.bending_stiffness_n_m2
+    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic)), dtype=np.complex128)
+    z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
+    for k4, offset in zip((z / length) ** 4, stiffness_offsets, strict=True):
+        # a² EI k⁴, with the participation a² = 4 L³ / z⁴
+        weight, stiffer = 4 * stiffness / length, 1 + offset
+        before = 1 / (elastic * k4 + inertial)
+        after = 1 / (elastic * k4 * stiffer + inertial)
+        total += weight * inertial**2 * elastic * offset * before * after
+        by_elastic += weight * inertial**2 * (stiffer * after**2 - before**2)
+        by_inertial += weight * elastic**2 * k4 * ((stiffer * after) ** 2 - before**2)
+    return replace(
+        found,
+        response=found.response + total,
+        by_elastic=found.by_elastic + by_elastic,
+        by_inertial=found.by_inertial + by_inertial,
+    )
+
+
 Slopes = dict[str, Callable[[], Complex]]
 """Derivatives of a response by the names of parameters, each computed when it is asked for."""
 
 
 def differentiated_response(
-    log_s: Complex, s_squared: Complex, beam: Beam, damping: Damping, tip_mass_kg: float
+    log_s: Complex,
+    s_squared: Complex,
+    beam: Beam,
+    damping: Damping,
+    tip_mass_kg: float,
+    stiffness_offsets: tuple[float, ...] = (),
 ) -> tuple[LoadedResponse, Slopes]:
     """Evaluate G with a tip mass on a rigid clamp, to be differentiated by any parameter.
 
@@ -127,6 +164,8 @@ def differentiated_response(
         Parameters of the exact model.
     tip_mass_kg
         Point mass at the tip.
+    stiffness_offsets
+        As `LoadedBeam` has them, held.
 
     Returns
     -------
@@ -139,6 +178,8 @@ def differentiated_response(
     inertia = beam.density_over_stiffness * s_squared
     elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
     found = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
+    if stiffness_offsets:
+        found = _with_offsets(found, elastic, inertial, beam, stiffness_offsets)
     return found, {
         "zeta": lambda: found.by_elastic * s_alpha,
         "alpha": lambda: found.by_elastic * (damping.zeta * log_s * s_alpha),
@@ -162,8 +203,8 @@ class LoadedBeam:
     root_compliance_rad_per_nm : float
     stiffness_offsets : tuple of float
         Relative differences of the stiffness of modes 2, 3, … from the uniform beam's. With them
-        the coupling torque is defined (`transfer`, `poles`, `zeros`), but not what lies along the
-        beam, and not together with a tip mass.
+        the coupling torque (`transfer`, `poles`, `zeros`) and the motion of the tip are defined,
+        but not the shear, and not together with a tip mass.
     """
 
     beam: Beam
@@ -182,6 +223,36 @@ class LoadedBeam:
         return not (
             self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         )
+
+    def with_frequencies(self, frequency_hz: Sequence[float]) -> "LoadedBeam":
+        """Give the bare beam the frequencies of some modes, each by a stiffness of its own.
+
+        Parameters
+        ----------
+        frequency_hz
+            Frequencies of the free decay of modes 1, 2, …; the density follows from the first.
+
+        Raises
+        ------
+        ValueError
+            If one of these modes of the beam does not oscillate.
+        """
+        z = clamped_free_eigenvalues(len(frequency_hz))
+        wanted_rad_s = 2 * math.pi * np.array(frequency_hz)
+        found = LoadedBeam(self.beam, self.damping)
+        stiffness = np.ones(z.size)
+        for _ in range(2):  # damping moves them a little
+            own_rad_s = found.poles(z)[:, 0].imag
+            if not bool((own_rad_s > 0).all()):
+                raise ValueError("A mode of the beam does not oscillate.")
+            stiffness *= (wanted_rad_s / own_rad_s) ** 2
+            density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
+            found = LoadedBeam(
+                replace(self.beam, density_kg_per_m=density_kg_per_m),
+                self.damping,
+                stiffness_offsets=tuple((stiffness[1:] / stiffness[0] - 1).tolist()),
+            )
+        return found
 
     def transfer(self, s: Complex) -> Complex:
         """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
@@ -234,13 +305,17 @@ class LoadedBeam:
     def _uniform(self) -> None:
         """Refuse what only a uniform beam defines."""
         if any(self.stiffness_offsets):
-            raise ValueError("Of modes of their own stiffness only the coupling torque is known.")
+            raise ValueError("Of modes of their own stiffness the shear is not known.")
 
     def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
         """Give `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
-        self._uniform()
         at, by = differentiated_response(
-            np.log(s), s * s, self.beam, self.damping, self.tip_mass_kg
+            np.log(s),
+            s * s,
+            self.beam,
+            self.damping,
+            self.tip_mass_kg,
+            self.stiffness_offsets,
         )
         return at, by | {"root_compliance_rad_per_nm": lambda: -at.response * at.response}
 
@@ -256,9 +331,18 @@ class LoadedBeam:
         s
             As for `transfer`.
         """
-        self._uniform()
         grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
         displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
+        elastic, inertial = self.factors(s)
+        z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
+        tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
+        for place, offset in enumerate(self.stiffness_offsets, start=1):
+            # Mode i takes part by -p b / (c k⁴ (1 + d) + p); of a rigid turn b is its share.
+            k4, turn = (z[place] / tip) ** 4, 2 * (-1) ** place * tip / z[place] ** 2
+            more = inertial * turn * elastic * k4 * offset
+            more = more / ((elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial))
+            displacement = displacement + 2 * more
+            slope = slope + tip_slopes[place] * more
         if self.tip_mass_kg:
             push = self._push(s, grid)
             displacement = displacement + grid.per_force(tip, tip) * push
@@ -289,23 +373,7 @@ class LoadedBeam:
         found = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
         if not any(self.stiffness_offsets):
             return found
-        length, stiffness = self.beam.length_m, self.beam.bending_stiffness_n_m2
-        total, by_elastic, by_inertial = np.zeros((3, *np.shape(s)), dtype=np.complex128)
-        z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))[1:]
-        for k4, offset in zip((z / length) ** 4, self.stiffness_offsets, strict=True):
-            # a² EI k⁴, with the participation a² = 4 L³ / z⁴
-            weight, stiffer = 4 * stiffness / length, 1 + offset
-            before = 1 / (elastic * k4 + inertial)
-            after = 1 / (elastic * k4 * stiffer + inertial)
-            total += weight * inertial**2 * elastic * offset * before * after
-            by_elastic += weight * inertial**2 * (stiffer * after**2 - before**2)
-            by_inertial += weight * elastic**2 * k4 * ((stiffer * after) ** 2 - before**2)
-        return replace(
-            found,
-            response=found.response + total,
-            by_elastic=found.by_elastic + by_elastic,
-            by_inertial=found.by_inertial + by_inertial,
-        )
+        return _with_offsets(found, elastic, inertial, self.beam, self.stiffness_offsets)
 
     def residues(self, poles_rad_s: Complex) -> Complex:
         """Residues of the coupling torque per angular acceleration, ``G(s) / s²``, at poles of it.

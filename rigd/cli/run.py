@@ -388,16 +388,16 @@ def until(
         ),
     ] = None,
     zeta: Annotated[
-        str | None, typer.Option("--zeta", metavar="STD", help="Of zeta, such as 5%.")
+        str | None, typer.Option("--zeta", metavar="STD", help="Of zeta, such as 20%.")
     ] = None,
     alpha: Annotated[
-        str | None, typer.Option("--alpha", metavar="STD", help="Of alpha, such as 0.01.")
+        str | None, typer.Option("--alpha", metavar="STD", help="Of alpha, such as 0.03.")
     ] = None,
     gamma: Annotated[
-        str | None, typer.Option("--gamma", metavar="STD", help="Of gamma, such as 5%.")
+        str | None, typer.Option("--gamma", metavar="STD", help="Of gamma, such as 30%.")
     ] = None,
     lambda_: Annotated[
-        str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.01.")
+        str | None, typer.Option("--lambda", metavar="STD", help="Of lambda, such as 0.1.")
     ] = None,
     at_most_s: Annotated[float, typer.Option("--at-most", help="Longest record (s).")] = 120.0,
     amplitude_rad: Annotated[

@@ -16,19 +16,34 @@ closed-loop system identification, Communications in Information and Systems 11 
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, LoadedBeam
-from rigd.excitation._fisher_information import BeamEstimate, RecordSoFar
-from rigd.excitation._piece_search import LOOK_AHEAD_S, SHORTEST_S, Piece, PieceSearch
+from rigd.excitation._fisher_information import (
+    BeamEstimate,
+    RecordSoFar,
+    covariance_of,
+    information,
+)
+from rigd.excitation._piece_search import (
+    LOOK_AHEAD_S,
+    SHORTEST_S,
+    Piece,
+    PieceSearch,
+    least_deviations,
+)
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
-from rigd.excitation._targets import Precision, Quantities, Target
+from rigd.excitation._targets import OF_MODES, Precision, Quantities, Target
 
 Real = NDArray[np.float64]
+
+
+_BY_GEOMETRY: Final = 1.5
+"""Factor by which the tolerance of the geometry widens a deviation, from which it is the cause."""
 
 
 class DesignRig(Protocol):
@@ -112,6 +127,107 @@ def next_piece(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
     return decision.piece(decision.best(time_left_s, driven), time_left_s)
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryFloor:
+    """Least standard deviation of a quantity that the tolerance of the geometry leaves."""
+
+    target: Target
+    """What is asked."""
+    value: float
+    """Value of the quantity."""
+    std: float
+    """With the tolerance."""
+    exact_std: float
+    """If the beam were exactly uniform."""
+
+    @property
+    def below(self) -> bool:
+        """Whether less than the floor is asked for, and the geometry is why it is out of reach."""
+        asked = self.target.std * (abs(self.value) if self.target.relative else 1.0)
+        return asked < self.std and self.std > _BY_GEOMETRY * self.exact_std
+
+
+def geometry_floors(
+    estimate: BeamEstimate,
+    rig: DesignRig,
+    targets: Iterable[Target],
+    uniformity: float,
+    duration_s: float,
+    tip_slope_rad: float = SMALL_SLOPE_RAD,
+) -> tuple[GeometryFloor, ...]:
+    """Compute how precisely the parameters asked for can be known of a nearly uniform beam.
+
+    Each is that of the best mixture of steady sines for it alone, at the largest amplitudes that
+    the rig and the linear model allow. Modes have no floor: they are those of the antenna, uniform
+    or not.
+
+    Parameters
+    ----------
+    estimate
+        Beam, damping and noise as they are known beforehand.
+    rig
+        Closed loop and limits.
+    targets
+        What is asked.
+    uniformity
+        Relative standard deviation of each mode's frequency from that of a uniform beam.
+    duration_s
+        Longest record.
+    tip_slope_rad
+        Slope of the tip up to which the linear model is trusted.
+
+    Raises
+    ------
+    ExcitationError
+        If no mode can be driven.
+    """
+    targets = [target for target in targets if target.quantity not in OF_MODES]
+    if not targets or not uniformity:
+        return ()
+    plant = rig.plant_with(estimate.loaded_beam)
+    rest = RecordSoFar.of(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    quantities = Quantities.of(targets, estimate)
+    decision = PieceSearch(estimate, quantities, plant, rig.start_rad, rest, tip_slope_rad)
+    tolerant = estimate.with_tolerance(uniformity)
+    floors = [
+        least_deviations(
+            np.zeros((len(each.names), len(each.names))),
+            each,
+            Quantities.of(targets, each),
+            *decision.lines(),
+            duration_s,
+        )
+        for each in (tolerant, estimate)
+    ]
+    return tuple(
+        GeometryFloor(item.target, item.value, std, exact_std)
+        for item, std, exact_std in zip(
+            quantities.items, floors[0].tolist(), floors[1].tolist(), strict=True
+        )
+        if not item.impossible
+    )
+
+
+def expected_precisions(
+    angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
+) -> tuple[Precision, ...]:
+    """Compute how precisely a record is expected to determine what is asked.
+
+    Parameters
+    ----------
+    angle_rad
+        Shape (n,): motor angle; the beam rested at the first.
+    estimate
+        Beam, damping and noise.
+    targets
+        What is asked.
+    rate_hz
+        Rate of the angle.
+    """
+    covariance = covariance_of(information(angle_rad, estimate, rate_hz), estimate)
+    return Quantities.of(targets, estimate).precisions(covariance)
 
 
 def design_excitation(

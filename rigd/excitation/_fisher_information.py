@@ -16,8 +16,8 @@ M. B. Zarrop, Optimal experiment design for dynamic system identification, Sprin
 L. Pronzato and A. Pázman, Design of experiments in nonlinear models, Springer (2013).
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from math import isfinite, pi
 from typing import Any, Final
 
@@ -84,6 +84,16 @@ _PRIOR_STD: Final = {
 }
 """What is known without any record: coefficients within a factor of 20, orders within (0, 2)."""
 
+_TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
+"""By what a mode of an antenna differs from that of the beam, with its standard deviation over the
+uniformity, as the analyser has it. The number of the mode follows the name."""
+
+_MODAL: Final = (*_TOLERATED, "ln_damping_ratio", "residue_phase_rad")
+"""What a mode of the modal model is free in."""
+
+_BACKGROUND: Final = 5
+"""Terms of the modal model's background."""
+
 _RATE_OVER_BAND: Final = 2.4
 _TAPER: Final = 1.1
 _DECAY: Final = 5.0
@@ -102,7 +112,7 @@ class BeamEstimate:
     damping: Damping
     """Damping as estimated; a coefficient of 0 is a kind of damping that the structure has not."""
     names: tuple[str, ...]
-    """Parameters that the fit leaves free, of `PARAMETERS`."""
+    """Parameters that the fit leaves free, of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: Real
     """Shape (m,), increasing: where the spectrum of the noise is given."""
     noise_nm2_per_hz: Real
@@ -115,6 +125,10 @@ class BeamEstimate:
     """Point mass at the tip."""
     root_compliance_rad_per_nm: float = 0.0
     """By how much the clamp turns for a torque."""
+    stiffness_offsets: tuple[float, ...] = ()
+    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
+    uniformity: float = 0.0
+    """Relative standard deviation of each mode's frequency from that of the beam."""
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
@@ -125,8 +139,8 @@ class BeamEstimate:
         document
             ``beam`` with the keys of `Beam`; ``damping`` with zeta, alpha, gamma and lambda;
             ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and perhaps
-            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg`` and
-            ``root_compliance_rad_per_nm``. Other keys are ignored.
+            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg``, ``root_compliance_rad_per_nm``
+            and ``stiffness_offsets``. Other keys are ignored.
 
         Raises
         ------
@@ -152,6 +166,7 @@ class BeamEstimate:
                 noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
                 **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
+                stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
             )
         except KeyError as error:
             raise ExcitationError(f"The estimate of the beam has no key {error}.") from None
@@ -159,6 +174,34 @@ class BeamEstimate:
             raise ExcitationError(f"The estimate of the beam cannot be read: {error}.") from None
         estimate.check()
         return estimate
+
+    @classmethod
+    def stated(
+        cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
+    ) -> "BeamEstimate":
+        """Return a beam that is known beforehand, all parameters of a uniform one free.
+
+        Parameters
+        ----------
+        beam, damping
+            As stated.
+        noise_nm2_per_hz
+            One-sided power spectral density of the torque's noise, white.
+        tip_mass_kg
+            Point mass at the tip, held.
+        """
+        absent = {
+            *(() if damping.zeta else ("zeta", "alpha")),
+            *(() if damping.gamma else ("gamma", "lambda")),
+        }
+        return cls(
+            beam,
+            damping,
+            tuple(name for name in OF_UNIFORM if name not in absent),
+            np.array([1.0]),
+            np.array([noise_nm2_per_hz]),
+            tip_mass_kg=tip_mass_kg,
+        )
 
     def check(self) -> None:
         """Refuse what no record can be predicted from.
@@ -178,6 +221,7 @@ class BeamEstimate:
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
             *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
+            *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
         ):
             if not (isfinite(value) and least <= value < below):
                 raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
@@ -195,6 +239,30 @@ class BeamEstimate:
             )
         if not self.names:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
+
+    def with_tolerance(self, uniformity: float) -> "BeamEstimate":
+        """Leave the modes free within a tolerance of the geometry, and the orders of the damping.
+
+        Parameters
+        ----------
+        uniformity
+            Relative standard deviation of each mode's frequency; 0 changes nothing.
+        """
+        if not uniformity:
+            return self
+        orders = [name for name in ("alpha", "lambda") if name not in self.names]
+        present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
+        modes = [mode.number for mode in self.modes()]
+        deviations = [f"{name}_{number}" for number in modes for name in _TOLERATED]
+        free = (*self.names, *(name for name in orders if present[name]), *deviations)
+        return replace(self, names=free, uniformity=uniformity)
+
+    def modal(self) -> "BeamEstimate":
+        """Leave the constants of each mode free and a background, and nothing of the beam."""
+        modes = [mode.number for mode in self.modes()]
+        constants = [f"{name}_{number}" for number in modes for name in _MODAL]
+        background = [f"background_{power}" for power in range(_BACKGROUND)]
+        return replace(self, names=(*constants, *background), uniformity=1.0)
 
     @property
     def values(self) -> dict[str, float]:
@@ -215,7 +283,7 @@ class BeamEstimate:
     @property
     def loaded(self) -> LoadedBeam | None:
         """The beam with what is at its ends; None if nothing is, and nothing of it is free."""
-        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm
+        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
             return None
         return self.loaded_beam
@@ -224,7 +292,11 @@ class BeamEstimate:
     def loaded_beam(self) -> LoadedBeam:
         """The beam with what is at its ends."""
         return LoadedBeam(
-            self.beam, self.damping, self.tip_mass_kg, self.root_compliance_rad_per_nm
+            self.beam,
+            self.damping,
+            self.tip_mass_kg,
+            self.root_compliance_rad_per_nm,
+            self.stiffness_offsets,
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
@@ -248,7 +320,8 @@ class BeamEstimate:
         pairs = (
             poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
         )
-        names = [_BY_PARAMETER.get(name, name) for name in self.names]
+        parameters = [name for name in self.names if name in PARAMETERS]
+        names = [_BY_PARAMETER.get(name, name) for name in parameters]
         shown = {
             number: pole
             for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
@@ -263,10 +336,25 @@ class BeamEstimate:
         else:
             moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
         scales = _scales(self)
-        return tuple(
-            EstimatedMode(number, pole, (row * scales).astype(np.complex128))
-            for (number, pole), row in zip(shown.items(), moved, strict=True)
-        )
+        found = []
+        for (number, pole), row in zip(shown.items(), moved, strict=True):
+            gradient = np.zeros(len(self.names), dtype=np.complex128)
+            gradient[: len(parameters)] = row * scales
+            for place, name in enumerate(self.names):
+                if name.endswith(f"_{number}"):
+                    gradient[place] = _CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
+            found.append(EstimatedMode(number, pole, gradient))
+        return tuple(found)
+
+
+_CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]] = {
+    "ln_frequency": lambda pole, _: (pole, 0j),
+    "ln_damping_ratio": lambda pole, _: (complex(pole.real), 0j),
+    "ln_residue": lambda _, residue: (0j, residue),
+    "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
+    "background": lambda *_: (0j, 0j),
+}
+"""Derivatives of the pole and the residue of a mode by its constants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +395,8 @@ class EstimatedMode:
 def _scales(estimate: BeamEstimate) -> Real:
     """Return factors from derivatives of the exact model to those by the free parameters."""
     values = estimate.values
-    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in estimate.names])
+    names = [name for name in estimate.names if name in PARAMETERS]
+    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])
 
 
 # Whitened derivatives of the torque
@@ -428,18 +517,21 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     sample_hz
         Rate of the samples whose noise is to have variance 1.
     """
-    names = estimate.names
+    names = [name for name in estimate.names if name in PARAMETERS]
     wrt = [_BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
     loaded = estimate.loaded
-    g, of_beam = (
-        transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
-        if loaded is None
-        else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
-    )
+    g = of_beam = np.zeros((0, s.size), dtype=np.complex128)
+    if names:
+        g, of_beam = (
+            transfer_and_gradient(s, estimate.beam, estimate.damping, wrt)
+            if loaded is None
+            else loaded.transfer_and_gradient(s.astype(np.complex128), wrt)
+        )
     late = np.exp(-s * estimate.delay_s)
-    kernels: Complex = np.empty((len(names), s.size), dtype=np.complex128)
+    kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
+    kernels[len(names) :] = _by_constants(estimate, s) * late
     rows = iter(of_beam)
-    for out, name, scale in zip(kernels, names, _scales(estimate), strict=True):
+    for out, name, scale in zip(kernels[: len(names)], names, _scales(estimate), strict=True):
         if name == "delay_s":
             out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * late
         elif name == "tool_inertia_kg_m2":
@@ -448,6 +540,27 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
             out[:] = scale * next(rows) * late
     kernels *= _whitening(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
+
+
+def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
+    """Differentiate the response by the constants of modes that are free and the background."""
+    poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
+    rows = []
+    for name in estimate.names:
+        if name in PARAMETERS:
+            continue
+        kind, _, number = name.rpartition("_")
+        if kind == "background":
+            rows.append((s / (2 * pi * BAND_HZ)) ** int(number))
+            continue
+        pole = poles[int(number)]
+        residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
+        by_pole, by_residue = _CHANGES[kind](pole, residue)
+        upper, lower = s - pole, s - pole.conjugate()
+        row = residue * by_pole / upper**2 + by_residue / upper
+        other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
+        rows.append(row + other)
+    return np.array(rows, dtype=np.complex128).reshape(-1, s.size)
 
 
 def reduction(rate_hz: float) -> int:
@@ -621,6 +734,11 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
     beam = estimate.beam
+    kind = name.rpartition("_")[0]
+    if kind == "background":
+        return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
+    if kind in _MODAL:
+        return _TOLERATED.get(kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":

@@ -76,11 +76,47 @@ class _Entry(BaseModel):
         return bool(self.frequency_hz) and self.damping_ratio is not None
 
 
+class _Number(BaseModel):
+    """A number of a headline."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    value: _NotNegative | None
+    std: _NotNegative | None = None
+
+
+class _HeadlineMode(BaseModel):
+    """A mode of a headline: of the modal model where the record shows it."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    frequency_hz: _Number
+    damping_ratio: _Number
+
+    @property
+    def entry(self) -> _Entry:
+        """The same as one fit has it."""
+        return _Entry(
+            frequency_hz=self.frequency_hz.value,
+            damping_ratio=self.damping_ratio.value or None,
+            frequency_std_hz=self.frequency_hz.std,
+        )
+
+
+class _Headline(BaseModel):
+    """Results that an analysis reports first of one record, or of a campaign."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    modes: Annotated[list[_HeadlineMode], FailFast()] = []
+
+
 class _Document(BaseModel):
     """What is needed of the analyser's document."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
+    headlines: Annotated[list[_Headline], FailFast()] = []
     modes: Annotated[list[_Entry], FailFast()]  # the errors of a million take gigabytes
 
 
@@ -103,7 +139,8 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
         JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
         and ``damping_ratio``, and perhaps ``frequency_std_hz``. More keys are ignored. Where
         several fits found a mode, their medians are taken; where some of them are of the
-        estimator ``record``, only these.
+        estimator ``record``, only these. Modes of ``headlines``, those of the modal model, take
+        their place.
 
     Raises
     ------
@@ -116,7 +153,8 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
     except ValidationError as error:
         complaint = _complaint(error.errors(include_url=False, include_context=False)[0])
         raise ExcitationError(f"{path}: {complaint}") from None
-    entries = [entry for entry in document.modes if entry.oscillates]
+    reported = [mode.entry for headline in document.headlines for mode in headline.modes]
+    entries = [entry for entry in reported or document.modes if entry.oscillates]
     of_records = [entry for entry in entries if entry.estimator == "record"]
     modes = tuple(_merged(group) for group in _groups(of_records or entries))
     if not modes:

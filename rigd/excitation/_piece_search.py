@@ -563,9 +563,7 @@ def best_mixture(
     missed
         Factor by which all deviations may be larger than asked.
     """
-    kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0)
-    kernels = kernels * (angle_rad / 2.0**0.5)
-    rates = np.einsum("if,jf->fij", kernels, kernels.conj()).real
+    rates = _information_rates(estimate, frequency_hz, angle_rad)
     asked = np.array([inf if each.impossible else each.asked_std for each in quantities.items])
     wanted = quantities.gradients / (missed * asked[:, None])
     if not wanted.any():
@@ -586,6 +584,48 @@ def best_mixture(
             break
     worth = np.sqrt(multipliers / max(float(times_s @ telling / times_s.sum()), 1e-300))
     return Mixture(times_s, worth[:, None] * lines)
+
+
+def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
+    """Information of steady sines per second of each, shape (m, k, k)."""
+    kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
+    rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
+    return rates
+
+
+def least_deviations(
+    information: Real,
+    estimate: BeamEstimate,
+    quantities: Quantities,
+    frequency_hz: Real,
+    angle_rad: Real,
+    duration_s: float,
+) -> Real:
+    """Compute the deviation of each quantity if the best mixture of sines is for it alone.
+
+    Parameters
+    ----------
+    information, estimate, quantities, frequency_hz, angle_rad
+        As for `best_mixture`.
+    duration_s
+        Time of all sines together.
+
+    Returns
+    -------
+    ndarray, shape (q,)
+        No record of that length is expected to have less.
+    """
+    rates = _information_rates(estimate, frequency_hz, angle_rad)
+    found = np.empty(len(quantities.gradients))
+    for row, gradient in enumerate(quantities.gradients):
+        times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
+        for _ in range(_ROUNDS):
+            total = information + np.tensordot(times_s, rates, axes=1)
+            line = gradient @ covariance_of(total, estimate)
+            found[row] = np.sqrt(max(float(line @ gradient), 0.0))
+            times_s = times_s * np.sqrt(np.einsum("i,fij,j->f", line, rates, line))
+            times_s *= duration_s / max(float(times_s.sum()), 1e-300)
+    return found
 
 
 def largest_factor(before: Real, unit: Real) -> float:

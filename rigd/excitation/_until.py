@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, Beam, undamped_frequencies_rad_s
+from rigd.excitation._experiment_design import DesignRig, geometry_floors
+from rigd.excitation._fisher_information import BeamEstimate
 from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
     Excitation,
@@ -23,6 +25,7 @@ from rigd.excitation._signals import (
     within_a_turn,
 )
 from rigd.excitation._targets import QUANTITIES, Target, parse_target
+from rigd.units import with_share
 
 Real = NDArray[np.float64]
 
@@ -46,7 +49,7 @@ _MAX_UNIFORMITY_PERCENT: Final = 10.0
 _EXAMPLE: Final = "--damping 1%"
 
 
-class ScanRig(Protocol):
+class ScanRig(DesignRig, Protocol):
     """What a scan may know of the rig."""
 
     def share_of_limits(self, reference_rad: Real) -> float:
@@ -58,6 +61,14 @@ class ScanRig(Protocol):
     @property
     def beam(self) -> Beam:
         """The specimen as the profile has it."""
+
+    @property
+    def stated_estimate(self) -> BeamEstimate:
+        """The specimen as the profile has it, with the noise of the sensor, all of it free."""
+
+    @property
+    def uniformity(self) -> float:
+        """Relative standard deviation of the modes' frequencies from those of a uniform beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +85,16 @@ class PrecisionSearch:
         First tick of the scan, and its reference, shape (n,).
     tip_slope_rad
         Largest slope of the beam's free end.
+    uniformity_percent
+        Relative standard deviation of each mode's frequency from that of a uniform beam; None: that
+        of the profile.
     """
 
     targets: tuple[Target, ...]
     planned_ticks: int
     scan: tuple[int, Real]
     tip_slope_rad: float
+    uniformity_percent: float | None = None
 
 
 def until(
@@ -128,7 +143,8 @@ def until(
     Raises
     ------
     ExcitationError
-        If an option is not what it should be.
+        If an option is not what it should be, or a precision is below the floor that the tolerance
+        of the geometry sets.
 
     Examples
     --------
@@ -168,6 +184,8 @@ def until(
     beam = None if rig is None else rig.beam
     scan_rad[first:] = amplitude_rad * _scan(end - first, rate_hz, start_hz, stop_hz, beam)
     if rig is not None:
+        uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
+        _refuse_below_floor(rig, asked, uniformity, at_most_s, tip_slope_rad)
         share = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
         if share > _SHARE:
             amplitude_rad *= _SHARE / share
@@ -196,7 +214,37 @@ def until(
             "scan": (first, end),
             "sweep": (first, ticks),
         },
-        search=PrecisionSearch(asked, planned_ticks, (first, scan_rad[first:]), tip_slope_rad),
+        search=PrecisionSearch(
+            asked, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
+        ),
+    )
+
+
+def _refuse_below_floor(
+    rig: ScanRig,
+    targets: tuple[Target, ...],
+    uniformity: float,
+    at_most_s: float,
+    tip_slope_rad: float,
+) -> None:
+    """Raise if the tolerance of the geometry leaves a parameter less precise than requested."""
+    floors = geometry_floors(
+        rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
+    )
+    below = [each for each in floors if each.below]
+    if not below:
+        return
+    said = "; ".join(
+        f"{each.target} (standard deviation) is below the floor of "
+        f"{with_share(each.std, each.value)}, {with_share(each.exact_std, each.value)} if the beam "
+        "is exactly uniform"
+        for each in below
+    )
+    raise ExcitationError(
+        f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
+        f"(uniformity_percent), within {at_most_s:g} s: {said}. Request a larger standard "
+        "deviation, or one of the modes (--damping, --frequency), or state --uniformity 0 if the "
+        "specimen is exactly uniform."
     )
 
 

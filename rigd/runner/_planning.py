@@ -30,6 +30,7 @@ from rigd.engine import Ending
 from rigd.errors import UserError
 from rigd.excitation import (
     KINDS,
+    BeamEstimate,
     Excitation,
     MovePlant,
     Value,
@@ -37,7 +38,13 @@ from rigd.excitation import (
 )
 from rigd.identified_beam import Use, read_identified_beam
 from rigd.profile import Profile
-from rigd.runner._move_plant import loop_model_with, mode_poles, move_plant_of, with_beam
+from rigd.runner._move_plant import (
+    loop_model_with,
+    mode_poles,
+    move_plant_of,
+    torque_noise_nm,
+    with_beam,
+)
 from rigd.runner._tip_slope import (
     NOT_IDENTIFYING,
     is_limited,
@@ -118,6 +125,19 @@ class LoopPreview:
     def beam(self) -> Beam:
         """The specimen as the profile has it."""
         return self._profile.rig.beam
+
+    @property
+    def uniformity(self) -> float:
+        """Relative standard deviation of the modes' frequencies from those of a uniform beam."""
+        return self._profile.uncertainty.uniformity_percent / 100.0
+
+    @property
+    def stated_estimate(self) -> BeamEstimate:
+        """The specimen as the profile has it, with the noise of the sensor, all of it free."""
+        rig = self._profile.rig
+        density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
+        tip_mass_kg = self._profile.loop_model().tip_mass_kg
+        return BeamEstimate.stated(rig.beam, rig.damping, density_nm2_per_hz, tip_mass_kg)
 
     @cached_property
     def _loop(self) -> ClosedLoop:

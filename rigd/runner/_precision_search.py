@@ -21,10 +21,10 @@ from rigd.excitation import (
     PAUSE_S,
     SHORTEST_S,
     BeamEstimate,
-    ExcitationError,
     Piece,
     PrecisionSearch,
     Target,
+    expected_precisions,
     next_piece,
 )
 from rigd.profile import Profile
@@ -48,10 +48,10 @@ _DOUBTED: Final = 4
 _WIDTH: Final = 22
 _SCANS: Final = 2
 """How often the scan is repeated where nothing can be fitted."""
-_MOST_BETWEEN: Final = 3
-"""How often the scan is repeated because rivals differ between the modes alone."""
 _TIGHTER: Final = 0.7
-"""Share of what is asked that is aimed at next because rivals are left: twice the information."""
+"""Factor on the deviations aimed at where a number is flagged: twice the information."""
+_FACTORS: Final = (0.5, 4.0)
+"""Range of the stated over the expected deviation that is allowed for."""
 _OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 
 
@@ -101,23 +101,6 @@ def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[State
     return [each for target in targets for each in _stated(document, target)]
 
 
-def between_modes(document: Mapping[str, Any]) -> str:
-    """Say why what narrow bands tell of a beam is not to be believed; empty if it is uniform.
-
-    Between the modes, where no piece goes, a mass at the tip and modes with stiffnesses of their
-    own differ; at the modes one imitates the other, with other dampings.
-
-    Parameters
-    ----------
-    document
-        Answer of the fit program, which has a fit.
-    """
-    if document["uniform_beam"]:
-        return ""
-    kind = document["type"]
-    return f"the beam is not uniform (type {kind}), of which narrow bands tell too little"
-
-
 def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
     key = _OF_MODES.get(target.quantity)
     if key is None:
@@ -140,36 +123,34 @@ def _read(target: Target, found: Mapping[str, Any] | None) -> Stated:
         return Stated(*of, None, inf, target.std, "it is not part of what was found")
     value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
     asked_std = target.std * (abs(value) if target.relative else 1.0)
-    any_rig = found["std_any_rig"]
-    if doubt and any_rig is not None and any_rig <= asked_std:
-        # Other kinds of rig explain the record as well, and do not differ by what is asked.
-        return Stated(*of, value, float(any_rig), asked_std)
     return Stated(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
 
 
-def beam_found(document: Mapping[str, Any]) -> BeamEstimate | None:
+def beam_found(
+    document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
+) -> BeamEstimate:
     """Return the beam of an answer of the fit program, for the design of excitation.
 
     Parameters
     ----------
     document
         The answer, which has a fit.
-
-    Returns
-    -------
-    BeamEstimate or None
-        None if its modes have stiffnesses of their own, by which the torque is not known.
+    targets
+        What is asked for: modes alone are those of the modal model.
+    uniformity
+        Stated relative standard deviation of each mode's frequency from that of a uniform beam.
 
     Raises
     ------
     ExcitationError
         If it cannot be used.
     """
-    plant = document["plant"]
-    if plant.get("stiffness_offsets"):
-        return None
     names, noise = document["covariance"]["names"], document["noise"]
-    return BeamEstimate.from_dict({**plant, "names": names, "noise": noise})
+    found = BeamEstimate.from_dict({**document["plant"], "names": names, "noise": noise})
+    if uniformity and all(target.quantity in _OF_MODES for target in targets):
+        return found.modal()
+    # A wider one where the modes do not lie within that stated.
+    return found.with_tolerance(max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0))
 
 
 # The search
@@ -232,10 +213,13 @@ class Search:
         self._stretches = [_Stretch("scan", scan_rad, first, first)]
         self._pieces = self._scans = 0
         self._shows_modes = self._judged = False
-        self._hopeless = self._doubtful = self._between = 0
+        self._hopeless = self._doubtful = 0
         self._share = 1.0
         self._course = _Course()
-        self._beam: BeamEstimate | None = None
+        self._factors: dict[str, float] = {}
+        percent = search.uniformity_percent
+        stated = profile.uncertainty.uniformity_percent
+        self._uniformity = (stated if percent is None else percent) / 100.0
         self._columns: list[str] = []
         self.due: int | None = first + scan_rad.size
         self.may_be_last = False
@@ -266,25 +250,20 @@ class Search:
                 yield from self._scan_again(problem, held)
             return
         found = stated(document, self._targets)
-        narrow = "" if self._between else between_modes(document)
-        if narrow:
-            found = [replace(each, std=inf, doubt=narrow) for each in found]
         time_s = document["tick"] / self._rate_hz
         self._course.note(time_s, max(each.ratio for each in found))
-        doubt = document["doubt"] or narrow
-        # Doubts of a uniform beam alone are looked into first.
+        doubt = document["doubt"] or ""
+        # Doubts of the freest structure alone are looked into first.
         yield self._told(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
         if self.may_be_last and all(each.ratio <= 1.0 for each in found):
             yield self._end(f"Reached: {in_words(found)}.", reached=True)
             return
-        rivals = [each.doubt for each in found if each.doubt not in ("", _NOT_SEEN)]
-        open_still = last.name == "pause" and not document["doubt"]
-        if self.may_be_last and rivals and (narrow or open_still):
-            self._share *= _TIGHTER if open_still else 1.0
-            if self._scan_between(held):
-                yield PieceTold("a scan between the modes as well", {"why": rivals[0]})
-                return
         if self.may_be_last:
+            flagged = [each for each in found if each.doubt not in ("", _NOT_SEEN)]
+            if flagged and last.name == "pause" and not doubt:
+                # Precise enough by what was planned, and yet no property of the antenna.
+                doubt = f"{flagged[0].name}: {flagged[0].doubt}"
+                self._share *= _TIGHTER
             self._doubtful = self._doubtful + 1 if doubt else 0
         if self._doubtful >= _DOUBTED:
             findings = " ".join(document["findings"])
@@ -292,8 +271,8 @@ class Search:
             yield self._end(reason.replace("  ", " "), reached=False)
             return
         try:
-            self._beam = beam_found(document) or self._beam
-            yield from self._go_on(self._beam, found, held, doubt)
+            estimate = beam_found(document, self._targets, self._uniformity)
+            yield from self._go_on(estimate, document["tick"], found, held, doubt)
         except (RigdError, ArithmeticError, ValueError) as error:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
@@ -340,7 +319,7 @@ class Search:
         return f"Not reached within {self._most_ticks / self._rate_hz:g} s (--at-most)."
 
     def _go_on(
-        self, estimate: BeamEstimate | None, found: Sequence[Stated], held: int, doubt: str | None
+        self, estimate: BeamEstimate, tick: int, found: Sequence[Stated], held: int, doubt: str
     ) -> Iterator[object]:
         """Append a piece, or a pause where what is planned is expected to suffice."""
         reference_rad = self._reference_rad(held)
@@ -353,14 +332,12 @@ class Search:
             else:
                 self._pause(min(PAUSE_S, left_s))
             return
-        if estimate is None:
-            raise ExcitationError("No beam was found that excitation can be planned for.")
         plant = self._rig.plant_with(estimate.loaded_beam)
         angle_rad = plant.respond(reference_rad).angle_rad
         piece = next_piece(
             estimate,
             angle_rad,
-            [replace(target, std=self._share * target.std) for target in self._targets],
+            self._aims(estimate, angle_rad[:tick], found),
             self._rig,
             left_s - PAUSE_S,
             tip_slope_rad=self._tip_slope_rad,
@@ -384,6 +361,23 @@ class Search:
         self.may_be_last = bool(doubt) and not self.may_be_last
         yield PieceTold(piece.name, self._document(piece, found))
 
+    def _aims(
+        self, estimate: BeamEstimate, angle_rad: Real, found: Sequence[Stated]
+    ) -> list[Target]:
+        """Return the precisions to design for, in terms of what the design expects.
+
+        The design expects the deviations of a beam, and a fit states those of the modal model: its
+        own are those requested times what it expects of the record fitted over what was stated.
+        """
+        by_name = {each.name: each.std for each in found}
+        aims = []
+        for each in expected_precisions(angle_rad, estimate, self._targets, self._rate_hz):
+            factor = by_name.get(each.target.name, inf) / max(each.std, 1e-300)
+            factor = float(np.clip(factor, *_FACTORS)) if isfinite(factor) else 1.0
+            self._factors[each.target.name] = factor
+            aims.append(replace(each.target, std=self._share * each.target.std / factor))
+        return aims
+
     def _through(self, found: Sequence[Stated]) -> list[int]:
         """Return modes that the next piece has to drive, because the record does not show them.
 
@@ -393,20 +387,6 @@ class Search:
         unseen = [each.mode for each in found if each.doubt == _NOT_SEEN and each.mode]
         self._shows_modes = bool(unseen) and self._pieces > 0 and not self._shows_modes
         return unseen if self._shows_modes else []
-
-    def _scan_between(self, held: int) -> bool:
-        """Scan once more, because beams that differ between the modes explain the record alike.
-
-        Returns
-        -------
-        bool
-            Whether there was time for it, and it was not done often enough.
-        """
-        if self._between >= _MOST_BETWEEN or not self._scan(f"between_{self._between + 1}", held):
-            return False
-        self._between += 1
-        self.may_be_last = True
-        return True
 
     def _scan_again(self, why: str, held: int) -> Iterator[object]:
         """Repeat the scan where an estimate is of no use."""
@@ -486,7 +466,11 @@ class Search:
             "duration_s": piece.reference_rad.size / self._rate_hz,
             "stated": {each.name: each.std for each in found if isfinite(each.std)},
             "expected": [
-                {"name": each.target.name, "std": each.std, "asked_std": each.asked_std}
+                {
+                    "name": each.target.name,
+                    "std": self._factors[each.target.name] * each.std,
+                    "asked_std": self._factors[each.target.name] * each.asked_std / self._share,
+                }
                 for each in piece.expected
                 if isfinite(each.std)
             ],

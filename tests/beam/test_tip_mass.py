@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, poles, realise, transfer
+from rigd.beam import (
+    Beam,
+    Damping,
+    LoadedBeam,
+    clamped_free_eigenvalues,
+    poles,
+    realise,
+    root_shear_ratio,
+    transfer,
+)
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 DAMPINGS = {
@@ -104,12 +113,64 @@ def test_their_poles_are_found_and_realised(compliance):
 
 
 def test_what_modes_of_their_own_stiffness_do_not_define_is_refused():
-    s = np.array([1j])
-    for undefined in (offset(0.0).shear, offset(0.0).tip_slope, offset(0.0).tip_response):
-        with pytest.raises(ValueError, match="only the coupling torque is known"):
-            undefined(s)
+    with pytest.raises(ValueError, match="the shear is not known"):
+        offset(0.0).shear(np.array([1j]))
     with pytest.raises(ValueError, match="exclude each other"):
         replace(offset(0.0), tip_mass_kg=1e-4)
+
+
+def test_their_tip_moves_as_the_sum_of_the_modes():
+    s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 40)
+    loaded = offset(0.0)
+    elastic, inertial = loaded.factors(s)
+    z = clamped_free_eigenvalues(400)
+    stiffness = (z / BEAM.length_m) ** 4 * (1 + np.pad(OFFSETS, (1, z.size - 1 - len(OFFSETS))))
+    # A turn of the root is 2 L (-1)^(i-1) / z² of each mode, whose tip moves by 2.
+    turn = 2 * BEAM.length_m * (-1.0) ** np.arange(z.size) / z**2
+    size = -inertial[:, None] * turn / (elastic[:, None] * stiffness + inertial[:, None])
+    displacement, slope = loaded.tip_response(s)
+    assert displacement == pytest.approx(2 * size.sum(axis=1), rel=1e-7, abs=1e-9)
+    slopes = 2 * z * root_shear_ratio(z.size) / BEAM.length_m
+    uniform = LoadedBeam(BEAM, DAMPINGS["fractional"])
+    same = (
+        -inertial[:, None]
+        * turn
+        / (elastic[:, None] * (z / BEAM.length_m) ** 4 + inertial[:, None])
+    )
+    expected = uniform.tip_slope(s) + ((size - same) * slopes).sum(axis=1)
+    assert slope == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("compliance", [0.0, 0.05])
+def test_they_are_differentiated_as_those_of_the_uniform_beam(compliance):
+    loaded = offset(compliance)
+    names = ("zeta", "lambda", "ln_density_over_stiffness", "root_compliance_rad_per_nm")
+    s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 40)
+    poles = loaded.poles(clamped_free_eigenvalues(3))[:, 0]
+    _, gradient = loaded.transfer_and_gradient(s, names)
+    moved = loaded.pole_gradients(poles, names)
+    damping = DAMPINGS["fractional"]
+    for row, (more, step) in enumerate((
+        (replace(loaded, damping=replace(damping, zeta=damping.zeta + 1e-9)), 1e-9),
+        (replace(loaded, damping=replace(damping, lambda_=damping.lambda_ + 1e-6)), 1e-6),
+        (replace(loaded, beam=replace(
+            BEAM, density_kg_per_m=BEAM.density_kg_per_m * np.exp(1e-6))), 1e-6),
+        (replace(loaded, root_compliance_rad_per_nm=compliance + 1e-6), 1e-6),
+    )):  # fmt: skip
+        difference = (more.transfer(s) - loaded.transfer(s)) / step
+        assert np.abs(gradient[row] - difference).max() < 1e-3 * np.abs(difference).max(), row
+        by_step = (more.poles(clamped_free_eigenvalues(3))[:, 0] - poles) / step
+        assert moved[:, row] == pytest.approx(by_step, rel=1e-3, abs=1e-4), row
+
+
+def test_a_beam_is_given_the_frequencies_of_modes():
+    wanted_hz = offset(0.0).poles(clamped_free_eigenvalues(3))[:, 0].imag / (2 * np.pi)
+    heavier = replace(BEAM, density_kg_per_m=1.2 * BEAM.density_kg_per_m)
+    found = LoadedBeam(heavier, DAMPINGS["fractional"]).with_frequencies(wanted_hz)
+    assert found.stiffness_offsets == pytest.approx(OFFSETS[:2], abs=1e-5)
+    assert found.beam.density_kg_per_m == pytest.approx(BEAM.density_kg_per_m, rel=1e-5)
+    with pytest.raises(ValueError, match="does not oscillate"):
+        LoadedBeam(BEAM, Damping(gamma=1e3)).with_frequencies(wanted_hz)
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)

@@ -44,7 +44,7 @@ def test_a_chirp_there_and_back_is_asked_for_by_a_whole_number():
 
 
 def test_a_precision_is_asked_for_in_words():
-    parameters = {"targets": "damping 1%; alpha 0.01", "at_most_s": 60.0}
+    parameters = {"targets": "damping 1%; alpha 0.03", "at_most_s": 60.0}
     assert parse(START | {"excitation": "until", "parameters": parameters}).parameters == parameters
     assert parse(START | {"watch_fit": True}).watch_fit
     parameters |= {"uniformity_percent": 0.0}

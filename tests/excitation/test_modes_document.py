@@ -45,6 +45,25 @@ def test_whole_record_fits_go_before_the_others(document):
     assert read_modes(document(entries)) == (FoundMode(16.0, 0.004, 0.0),)
 
 
+def test_modes_of_the_modal_model_go_before_those_of_fits(document):
+    """Which are of beams, and may be off by more than the width of a mode."""
+    reported = {
+        "frequency_hz": {"value": 16.3, "std": 0.01, "flag": None},
+        "damping_ratio": {"value": 0.004, "std": 1e-5},
+        "source": "modal",
+    }
+    path = document(
+        [{"frequency_hz": 16.0, "damping_ratio": 0.02}], headlines=[{"modes": [reported]}]
+    )
+    assert read_modes(path) == (FoundMode(16.3, 0.004, 0.02),)
+    unknown = reported | {"damping_ratio": {"value": "small"}}
+    path = document([], headlines=[{"modes": [reported, unknown]}])
+    with pytest.raises(
+        ExcitationError, match=r"headlines\[0\]\.modes\[1\]\.damping_ratio\.value = "
+    ):
+        read_modes(path)
+
+
 def test_modes_that_a_fit_does_not_have_are_passed_over(document):
     entries = [
         {"frequency_hz": None, "damping_ratio": None},

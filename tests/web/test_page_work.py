@@ -140,11 +140,11 @@ def test_each_excitation_has_its_own_parameters_with_units(page):
 def test_a_precision_is_asked_for_in_words(server, page):
     page.select_option("#excitation", "until")
     assert not page.is_visible("#watch-fit")  # it is fitted anyway
-    page.fill("#parameter-targets", "damping 1%; alpha 0.01")
+    page.fill("#parameter-targets", "damping 1%; alpha 0.03")
     server.replies["start"] = {"series": 1, "plan": PLAN}
     page.click("#start-button")
     says(page, "#prediction", "Predicted peaks")
-    request = {"targets": "damping 1%; alpha 0.01", "at_most_s": 120}
+    request = {"targets": "damping 1%; alpha 0.03", "at_most_s": 120}
     assert (server.requests[0]["excitation"], server.requests[0]["parameters"]) == (
         "until", request,
     )  # fmt: skip

@@ -8,7 +8,7 @@ const OPERATOR = "rigd-operator";
 const NOTES = ["operator", "specimen", "note"];  // metadata with a field of their own
 const PLACEHOLDERS = {
   path: "/absolute/path, read by the daemon",
-  targets: "damping 1%; frequency 2:0.01%; alpha 0.01",
+  targets: "damping 1%; frequency 2:0.01%; alpha 0.03",
 };
 
 export class StartForm {
