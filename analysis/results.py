@@ -93,6 +93,8 @@ class WholeRecord:
     def __post_init__(self) -> None:
         plant = self.fit.plant
         validity = _validity(self.record, (plant.beam, plant.damping))
+        if (test := self.headline.uniform_beam) is not None:
+            validity = replace(validity, uniform_beam=test.summary)
         object.__setattr__(self, "validity", validity)
 
     @property

@@ -10,6 +10,7 @@ from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record
 from ._free_decay import Pole as Pole
 from ._free_decay import mode_poles as mode_poles
+from ._headline import EXACT_CONDITION as EXACT_CONDITION
 from ._headline import MISREAD as MISREAD
 from ._headline import Damping as Damping
 from ._headline import Headline as Headline
@@ -57,6 +58,9 @@ from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
+from ._uniform_beam import PARAMETERS as PARAMETERS
+from ._uniform_beam import TolerantEstimate as TolerantEstimate
+from ._uniform_beam import UniformBeamTest as UniformBeamTest
 from ._verdict import EVEN as EVEN
 from ._verdict import STRONG as STRONG
 from ._verdict import OrderVerdict as OrderVerdict

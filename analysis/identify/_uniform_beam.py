@@ -24,6 +24,7 @@ from analysis.identify._predictor import ResponseGrid, torque_channel
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -427,11 +428,15 @@ class UniformBeamTest:
     predicted: NDArray[np.float64]
     std: NDArray[np.float64]
 
+    @property
+    def summary(self) -> BeamUniformity:
+        """Status and p-value, with their sentence."""
+        return BeamUniformity(self.status, self.p_value)
+
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it; numbers may be not finite."""
         return {
-            "status": self.status,
-            "p_value": self.p_value,
+            **self.summary.as_json(),
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
