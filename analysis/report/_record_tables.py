@@ -41,6 +41,7 @@ _MARKED: Final = (
 def modes_table(whole: WholeRecord) -> Table:
     """Frequencies, damping ratios and effective inertias; those that are doubtful are marked."""
     told = whole.headline
+    known = any(mode.participation is not None for mode in told.modes)
     rows: list[tuple[Entry, ...]] = []
     for mode in told.modes:
         cells = *_mode_cells(mode), *_inertia(mode.participation)
@@ -53,14 +54,14 @@ def modes_table(whole: WholeRecord) -> Table:
         f"Modes with locked hub (clamped–free): {_modes_source(told)}",
         (
             *_MODE,
-            Column("Inertia (kg·mm²)", "participation_kg_m2"),
-            Column("std", "participation_std_kg_m2"),
-            Column("Source", "source", WORDS),
+            Column("Inertia (kg·mm²)" if known else "", "participation_kg_m2"),
+            Column("std" if known else "", "participation_std_kg_m2"),
+            Column("Source" if known else "", "source", WORDS),
         ),
         rows,
         (
-            "Inertia: effective inertia about the motor axis that takes part in the mode. "
-            "Intervals are statistical only; the torque scale acts on the inertia alone.",
+            "Intervals are statistical only; no torque scale, length or density acts on "
+            "frequencies and damping ratios.",
             *_modal_notes(whole),
             *_reasons(mode.damping_ratio for mode in told.modes),
         ),
@@ -121,6 +122,10 @@ def _modal_notes(whole: WholeRecord) -> Iterator[str]:
     modal = whole.headline.modal
     if modal is None:
         return
+    yield (
+        "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
+        "proportional to the torque scale."
+    )
     yield f"Fit of the modal model {ShownModel.of(whole).fit_percent:.2f} % (NRMSE)."
     found = [
         f"{frequency_hz:.4g}"
@@ -152,7 +157,7 @@ def parameters_table(whole: WholeRecord) -> Table:
         fit = f" Fit {whole.analysis.fit_percent(told.fit):.2f} % (NRMSE)."
     return Table.of(
         "parameters",
-        f"Parameters {_condition(told)}",
+        f"Parameters{_condition(told)}",
         (*_PARAMETER, *(including_scales if combined else ()), _REMARK),
         (
             _parameter_row(name, told.parameters[name], combined, fixed=_fixed(told, name))
@@ -189,14 +194,13 @@ def _condition(told: Headline) -> str:
     """Say on which condition parameters are what a table has."""
     found = told.tolerant
     if found is None:
-        uniform = " if the beam is uniform to 1e-5" if told.modal is not None else ""
-        return f"of type {told.name}{uniform}"
+        return f", type {told.name}{f' {EXACT_CONDITION}' if told.modal is not None else ''}"
     if found.basis == "geometry":
         percent = 100 * found.uniformity
-        return f"if each mode lies where that of a uniform beam does, to {percent:g} %"
+        return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
     if found.basis == "losses":
-        return "by damping ratios and residue phases alone, whatever the positions of the modes"
-    return "of the beam that fits the losses best: it does not explain them"
+        return " by damping ratios and residue phases alone, whatever the positions of the modes"
+    return " of the beam that fits the losses best: it does not explain them"
 
 
 def exact_geometry_table(whole: WholeRecord) -> Table | None:
