@@ -212,7 +212,7 @@ def _curves(whole: WholeRecord) -> dict[str, Any]:
     """Tabulate the response of the model shown first, and loss factors, over the band."""
     first_hz, last_hz = whole.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    model, beam = ShownModel.of(whole), loss_estimate(whole)
+    model, beam = ShownModel.of(whole.headline, whole.record), loss_estimate(whole)
     band = model.band(frequency_hz)
     low, high = band.magnitude_limits()
     factors = None if beam is None else loss_factors(beam, frequency_hz)

@@ -287,25 +287,26 @@ _STRETCHES: Final = 120
 """At most: a short record has fewer independent values."""
 
 
-def residual_figure(model: ShownModel) -> Figure:
+def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
     """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
 
     Parameters
     ----------
     model : ShownModel
+    analysis : RecordAnalysis
+        With the noise and the bins of its residual.
     """
     figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
         2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
     )  # fmt: skip
-    _spectrum(figure.add_subplot(grid[0, :]), model)
-    _cumulative(figure.add_subplot(grid[1, 0]), model)
-    _in_time(figure.add_subplot(grid[1, 1]), model)
+    _spectrum(figure.add_subplot(grid[0, :]), model, analysis)
+    _cumulative(figure.add_subplot(grid[1, 0]), model, analysis)
+    _in_time(figure.add_subplot(grid[1, 1]), model, analysis)
     return figure
 
 
-def _spectrum(axes: Axes, model: ShownModel) -> None:
-    analysis = model.analysis
+def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     frequency_hz = analysis.frequency_hz
     density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
     counted = analysis.compared
@@ -339,8 +340,7 @@ def _spectrum(axes: Axes, model: ShownModel) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
 
 
-def _cumulative(axes: Axes, model: ShownModel) -> None:
-    analysis = model.analysis
+def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     counted = analysis.compared
     power = np.abs(model.residual[counted]) ** 2
     share = np.cumsum(power) / power.sum()
@@ -362,9 +362,9 @@ def _cumulative(axes: Axes, model: ShownModel) -> None:
     axes.legend(loc="lower right", borderaxespad=0.1)
 
 
-def _in_time(axes: Axes, model: ShownModel) -> None:
-    times_s, power = residual_power(model.analysis, model.residual)
-    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(model.analysis.compared))
+def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    times_s, power = residual_power(analysis, model.residual)
+    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
         max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
         label="95 % of white noise",
@@ -421,7 +421,8 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, told = whole.band_hz[1], whole.headline
-    model = ShownModel.of(whole)
+    model = ShownModel.of(told, whole.record)
+    analysis = model.compared(whole.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss, residual, signals = FIGURES
     measured = measured_response(whole)
@@ -451,10 +452,10 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
         ),
         _loss_description(whole, drawn=beam is not None),
     )
-    power = float(np.mean(np.abs(model.residual[model.analysis.compared]) ** 2)) / 2
+    power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
         residual,
-        residual_figure(model),
+        residual_figure(model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
         "records or more if only noise is left; and its power through the record. Excess at a "
@@ -465,8 +466,8 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
         signals,
         signals_figure(whole.record, model, highest_hz),
         f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
-        f"predicts it from the measured angle (fit {model.fit_percent:.2f} % NRMSE); residual; "
-        "below, where each mode rings most.",
+        f"predicts it from the measured angle (fit {model.fit_percent(whole.analysis):.2f} % "
+        "NRMSE); residual; below, where each mode rings most.",
     )
 
 

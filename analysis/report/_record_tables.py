@@ -126,7 +126,8 @@ def _modal_notes(whole: WholeRecord) -> Iterator[str]:
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
         "proportional to the torque scale."
     )
-    yield f"Fit of the modal model {ShownModel.of(whole).fit_percent:.2f} % (NRMSE)."
+    percent = ShownModel.of(whole.headline, whole.record).fit_percent(whole.analysis)
+    yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
     found = [
         f"{frequency_hz:.4g}"
         for mode, frequency_hz in zip(modal.numbers, modal.model.frequencies_hz, strict=True)

@@ -378,7 +378,7 @@ def record_page(whole: WholeRecord) -> Page:
     """
     from analysis.report._record_figures import measured_response
 
-    found, shown = measured_response(whole), ShownModel.of(whole)
+    found, shown = measured_response(whole), ShownModel.of(whole.headline, whole.record)
     grid_hz = found.frequency_hz
     turned = np.exp(2j * np.pi * shown.delay_s * grid_hz)
     measured, model = found.response * turned, shown.band(grid_hz).response
@@ -535,7 +535,9 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     if whole is not None:
         from analysis.report._signal_figures import torque_in_band
 
-        torque = torque_in_band(whole.record, ShownModel.of(whole).transfer, whole.band_hz[1])
+        torque = torque_in_band(
+            whole.record, ShownModel.of(whole.headline, whole.record).transfer, whole.band_hz[1]
+        )
         tabs.append(record_tab(whole, torque))
     if welch is not None:
         tabs.append(tab(welch))

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from analysis.identify import Headline, ModalFit, ModalModel, Plant, RecordFit
     from analysis.record import Record
     from analysis.report._bands import ResponseBand
-    from analysis.results import WholeRecord
 
     Real = NDArray[np.float64]
 
@@ -33,8 +32,6 @@ class ShownModel:
         Shown where there is no modal model.
     modes : tuple of ModeEstimate
         Those that the record shows.
-    analysis : RecordAnalysis
-        Noise and bins of its residual.
     stated_delay_s : float
         Delay of the torque against the angle, by the file.
     """
@@ -43,26 +40,23 @@ class ShownModel:
     modal: ModalFit | None
     beam: RecordFit
     modes: tuple[ModeEstimate, ...]
-    analysis: RecordAnalysis
     stated_delay_s: float
 
     @classmethod
-    def of(cls, whole: WholeRecord) -> ShownModel:
-        """Choose it for a record."""
-        told, analysis = whole.headline, whole.analysis
-        if told.modal is not None:
-            analysis = RecordAnalysis.of(analysis.fits, told.modal.noise, analysis.comparison)
-        return cls.of_headline(told, whole.record, analysis)
+    def of(cls, told: Headline, record: Record) -> ShownModel:
+        """Choose it for a record.
 
-    @classmethod
-    def of_headline(cls, told: Headline, record: Record, analysis: RecordAnalysis) -> ShownModel:
-        """Choose it for the headline of a record."""
+        Parameters
+        ----------
+        told : Headline
+            Headline of the record.
+        record : Record
+        """
         return cls(
             name=f"the model (type {told.name})" if told.modal is None else "the modal model",
             modal=told.modal,
             beam=told.fit,
             modes=shown_modes(told),
-            analysis=analysis,
             stated_delay_s=record.torque_delay_s - record.angle_delay_s,
         )
 
@@ -93,10 +87,28 @@ class ShownModel:
             return response_band(self.beam, frequency_hz)
         return modal_response_band(self.modal, frequency_hz, self.delay_s)
 
-    @property
-    def fit_percent(self) -> float:
-        """Fit to the measured torque in the band (NRMSE)."""
-        return self.analysis.fit_percent(self.beam if self.modal is None else self.modal)
+    def compared(self, analysis: RecordAnalysis) -> RecordAnalysis:
+        """Return an analysis with the noise and the bins of the residual.
+
+        Parameters
+        ----------
+        analysis : RecordAnalysis
+            That of the record.
+        """
+        if self.modal is None:
+            return analysis
+        return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
+
+    def fit_percent(self, analysis: RecordAnalysis) -> float:
+        """Fit to the measured torque in the band (NRMSE).
+
+        Parameters
+        ----------
+        analysis : RecordAnalysis
+            That of the record.
+        """
+        fit = self.beam if self.modal is None else self.modal
+        return self.compared(analysis).fit_percent(fit)
 
 
 def shown_modes(told: Headline) -> tuple[ModeEstimate, ...]:
