@@ -268,13 +268,17 @@ def condition_table(whole: WholeRecord) -> Table | None:
     rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
-        free = told.parameters[name]
+        free = told.parameters.get(name)
         rows.append(
             (
                 Cell(name, symbol),
                 _unit_cell(unit),
                 *estimate((each.value, *_ends(each)), each.std, factor),
-                *estimate((free.value, *_ends(free)), free.std, factor),
+                *(
+                    [number(None)] * 3
+                    if free is None
+                    else estimate((free.value, *_ends(free)), free.std, factor)
+                ),
             )
         )
     return Table.of(
