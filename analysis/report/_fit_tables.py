@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
+from analysis.identify import EXACT_CONDITION
 from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._document import response_fit_percent
@@ -86,10 +87,16 @@ def structures_table(whole: WholeRecord) -> Table:
             "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
             "over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
-            "searched. The marked row is the one reported. What the record excludes "
+            f"searched. The marked row is {_marked_row(whole)}. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
         selected=list(whole.fits).index(whole.headline.name),
+    )
+
+
+def _marked_row(whole: WholeRecord) -> str:
+    return (
+        "the one reported" if whole.headline.exact is None else f"of the values {EXACT_CONDITION}"
     )
 
 

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import CONSTANTS
 from analysis.report import _style as style
-from analysis.report._table import WORDS, Column, Table, estimate, number
+from analysis.report._table import WORDS, Cell, Column, Table, estimate, number
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -124,11 +124,12 @@ def uniformity_table(test: UniformBeamTest) -> Table:
         )
     ):  # fmt: skip
         name = CONSTANTS[place % len(CONSTANTS)]
+        words = Cell(name, name.removesuffix("_rad").replace("_", " "))
         shown = estimate((measured, std, predicted), std)
         rows.append(
             (
-                test.modes[place // len(CONSTANTS)], name, *shown,
-                number(off / std, "+.1f"), number(off, "+.2g", _PER_CENT),
+                test.modes[place // len(CONSTANTS)], words, *shown,
+                number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
             )
         )  # fmt: skip
     return Table.of(

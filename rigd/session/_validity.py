@@ -64,8 +64,8 @@ class BeamUniformity:
             return f"A uniform beam predicts the modes ({self._p})."
         if self.status == "refused":
             return (
-                f"A uniform beam does not predict the modes ({self._p}): orders are not properties "
-                "of the material."
+                f"A uniform beam does not predict the modes ({self._p}): orders that assume one "
+                "are not properties of the material."
             )
         return "Whether a uniform beam predicts the modes was not tested: too few modes show."
 

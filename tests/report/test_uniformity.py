@@ -1,5 +1,6 @@
 """Report of a record: modal model first, whether the beam is uniform, conditions of parameters."""
 
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -10,6 +11,7 @@ from analysis.identify import CONSTANTS, Measurement, ModalModel, select
 from analysis.report import _style as style
 from analysis.report._bands import loss_estimate, modal_response_band
 from analysis.report._document import document
+from analysis.report._equation import definitions, equations, mathml
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_report import record_page, report_tables, uniformity_tables
 from analysis.report._shown_model import ShownModel
@@ -129,7 +131,7 @@ def test_constants_are_compared_with_those_of_a_uniform_beam(modal_result):
     assert len(axes) == 2 * len(CONSTANTS)
     for column, name in enumerate(CONSTANTS):
         (points,) = [line for line in axes[2 * column].get_lines() if line.get_marker() == "o"]
-        of_name = [row for row in constants.rows if row["constant"] == name]
+        of_name = [row for row in constants.rows if row["constant"].value == name]
         np.testing.assert_allclose(
             points.get_ydata(), [row["deviation_std"].value for row in of_name]
         )
@@ -163,7 +165,7 @@ def test_losses_that_no_beam_explains_are_points_alone(unexplained_losses):
     labels = [handle.get_label() for handle in figures["loss_factor"].figure.axes[0].get_lines()]
     assert not {"total", "internal (material)", "external (surroundings)"} & set(labels)
     assert "There is no curve" in figures["loss_factor"].description
-    assert "orders are not properties of the material" in figures["uniform_beam"].description
+    assert "not properties of the material" in figures["uniform_beam"].description
     content = document([unexplained_losses])
     assert content["records"][0]["curves"]["loss_factor"] is None
     assert uniformity_tables(unexplained_losses.whole)[1:] == ()
@@ -189,3 +191,13 @@ def test_the_document_has_source_participation_and_the_test(modal_result):
     (curves,) = [record["curves"] for record in document([modal_result])["records"]]
     assert curves["model"] == "modal"
     assert curves["loss_factor"] is not None
+
+
+def test_the_modal_model_is_written_as_an_equation(modal_result):
+    first, *others = equations(modal_result.whole)
+    assert r"\sum_{k}" in first.tex
+    assert r"\frac{\bar{R}_{k}}{s - \bar{p}_{k}}" in first.tex
+    assert r"\sum_{n = 0}^{4} b_{n} s^{n}" in first.tex
+    ET.fromstring(mathml(first))
+    assert len(others) == 3
+    assert "modal model with a pole p and a residue R" in definitions(modal_result.whole)

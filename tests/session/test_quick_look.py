@@ -84,9 +84,9 @@ def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):
         (BeamUniformity("passed", 0.4), "A uniform beam predicts the modes (p = 0.4).",
          "yes (p = 0.4)"),
         (BeamUniformity("refused", 2e-18), "A uniform beam does not predict the modes (p = 2e-18): "
-         "orders are not properties of the material.", "no (p = 2e-18)"),
+         "orders that assume one are not properties of the material.", "no (p = 2e-18)"),
         (BeamUniformity("refused", 0.0), "A uniform beam does not predict the modes (p < 1e-300): "
-         "orders are not properties of the material.", "no (p < 1e-300)"),
+         "orders that assume one are not properties of the material.", "no (p < 1e-300)"),
         (BeamUniformity("not tested"), "Whether a uniform beam predicts the modes was not tested: "
          "too few modes show.", "not tested"),
     ],
