@@ -41,7 +41,7 @@ class ModalModel:
     Attributes
     ----------
     poles_rad_s : tuple of complex
-        Of each conjugate pair the upper, by rising frequency.
+        Upper pole of each conjugate pair, by rising frequency.
     residues : tuple of complex
         Residue at each, in N·m/s.
     background : tuple of float
@@ -82,7 +82,7 @@ class ModalModel:
     def effective_inertias_kg_m2(self) -> tuple[float, ...]:
         """Inertia about the motor axis that takes part in each mode.
 
-        Of an undamped beam they add up to its moment of inertia.
+        Those of an undamped beam add up to its moment of inertia.
         """
         return tuple(
             2 * abs(residue) / abs(pole) ** 3

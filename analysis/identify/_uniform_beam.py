@@ -49,7 +49,8 @@ PARAMETERS: Final = (
 _ORDERS: Final = (0.4, 1.0, 1.6)
 _ORDER_RANGE: Final = (0.02, 1.98)
 _LN_LOSS_RANGE: Final = (-18.0, 2.0)
-"""Of the logarithm of what a damping adds to stiffness or inertia at its reference frequency."""
+"""Range of the logarithm of what a damping adds to stiffness or inertia at its reference
+frequency."""
 
 _LN_RANGE: Final = 2.0
 """How far ratio and stiffness may be from where the search begins, in logarithms."""
@@ -61,7 +62,7 @@ _RENEWALS: Final = 4
 
 _CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS: Final = 0.2
-"""Of the circle round a pole, relative to the decay rate."""
+"""Radius of the circle round a pole, relative to the decay rate."""
 
 _FAR: Final = 1e6
 """Deviation of a constant that a beam does not have."""
@@ -355,7 +356,7 @@ class ConstantsProblem:
         Parameters
         ----------
         place : int
-            Of its coefficient among `PARAMETERS`.
+            Position of its coefficient among `PARAMETERS`.
         x : ndarray, shape (7,)
             Unknowns from which the search begins.
         """
@@ -482,7 +483,7 @@ class TolerantEstimate:
         95 %, by the profile of chi-square; an end is infinite, or the edge of the range, where the
         modes do not bound it.
     covariance : ndarray, shape (7, 7)
-        Of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
+        Covariance of `PARAMETERS`; `LOGARITHMIC` ones by their logarithms.
     first_rad_s : float
         Frequency of the first visible mode.
     deviance_of_one : mapping of str to float

@@ -32,7 +32,7 @@ class BeamUniformity:
     Examples
     --------
     >>> from rigd.session import BeamUniformity
-    >>> print(BeamUniformity("passed", 0.435).sentence)
+    >>> print(BeamUniformity("passed", 0.44).sentence)
     A uniform beam predicts the modes (p = 0.44).
     >>> print(BeamUniformity("refused", 0.0).short)
     no (p < 1e-300)
