@@ -195,7 +195,8 @@ def _condition(told: Headline) -> str:
     """Say on which condition parameters are what a table has."""
     found = told.tolerant
     if found is None:
-        return f", type {told.name}{f' {EXACT_CONDITION}' if told.modal is not None else ''}"
+        exact = "" if told.modal is None else f", {EXACT_CONDITION}"
+        return f", type {told.name}{exact}"
     if found.basis == "geometry":
         percent = 100 * found.uniformity
         return f" if each mode lies where that of a uniform beam does, to {percent:g} %"

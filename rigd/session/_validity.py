@@ -61,11 +61,11 @@ class BeamUniformity:
     def sentence(self) -> str:
         """The same as a sentence."""
         if self.status == "passed":
-            return f"A uniform beam predicts the modes ({self._p})."
+            return f"A uniform beam predicts the modes ({self.chance})."
         if self.status == "refused":
             return (
-                f"A uniform beam does not predict the modes ({self._p}): orders that assume one "
-                "are not properties of the material."
+                f"A uniform beam does not predict the modes ({self.chance}): orders that assume "
+                "one are not properties of the material."
             )
         return "Whether a uniform beam predicts the modes was not tested: too few modes show."
 
@@ -73,10 +73,11 @@ class BeamUniformity:
     def short(self) -> str:
         """The same for a cell of a table."""
         word = _SHORT[self.status]
-        return word if self.p_value is None else f"{word} ({self._p})"
+        return word if self.p_value is None else f"{word} ({self.chance})"
 
     @property
-    def _p(self) -> str:
+    def chance(self) -> str:
+        """The p-value as text."""
         p_value = self.p_value or 0.0
         return f"p = {p_value:.2g}" if p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
 
