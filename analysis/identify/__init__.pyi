@@ -22,7 +22,9 @@ from ._headline import Size as Size
 from ._headline import StructureStatus as StructureStatus
 from ._headline import headline_json as headline_json
 from ._headline import of_fit as of_fit
+from ._modal_fit import ModalFit as ModalFit
 from ._modal_model import BACKGROUND as BACKGROUND
+from ._modal_model import CONSTANTS as CONSTANTS
 from ._modal_model import ModalModel as ModalModel
 from ._noise import Line as Line
 from ._parametrization import Steps as Steps

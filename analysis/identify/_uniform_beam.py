@@ -64,9 +64,6 @@ _CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS: Final = 0.2
 """Radius of the circle round a pole, relative to the decay rate."""
 
-_FAR: Final = 1e6
-"""Deviation of a constant that a beam does not have."""
-
 _STEP: Final = 1e-5
 _NEWTON_STEPS: Final = 6
 _EXACT: Final = 1e-13
