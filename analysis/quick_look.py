@@ -115,7 +115,8 @@ def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
         flags += more
         response, coherence, more = _response(record)
         flags += more
-        model = None if told is None or response is None else _model(told, response["frequency_hz"])
+        if told is not None and response is not None:
+            model = _model(told, record, response["frequency_hz"])
     before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
     if before is not None and any(mode["shown"] for mode in modes):
         compared = _against(modes, before)
@@ -167,6 +168,8 @@ def _headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
     except MeasurementError as error:
         no_modes = f"No modes: {_without_name(str(error), record.path)}"
         return None, stated_validity(record.metadata), [no_modes]
+    if told.uniform_beam is not None:
+        validity = replace(validity, uniform_beam=told.uniform_beam.summary)
     said += [each.sentence for each in found]
     if not told.modes:
         said.append("No modes: none lies in the excited band.")
@@ -178,25 +181,28 @@ def _mode(mode: Mode) -> dict[str, Any]:
         "mode": mode.number,
         "frequency_hz": mode.frequency_hz.as_json(),
         "damping_ratio": mode.damping_ratio.as_json(),
+        "participation": None if mode.participation is None else mode.participation.as_json(),
+        "source": mode.source,
         "shown": mode.shown,
     }
 
 
-def _model(told: Headline, shown_hz: Sequence[float]) -> dict[str, Any] | None:
-    """Return the response of the fitted model with its 95 % band, where the beam was excited.
+def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[str, Any] | None:
+    """Return the response of the model shown first with its 95 % band, where it was excited.
 
     None if it does not explain the record, or depends on the amplitude, as with drag: there is no
     band for it then.
     """
     import numpy as np
 
-    from analysis.report import dense_grid, response_band
+    from analysis.report import ShownModel, dense_grid
     from rigd.view import response_thinning
 
     if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    peaks_hz = [mode.frequency_hz.value for mode in told.modes]
-    band = response_band(told.fit, dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
+    shown = ShownModel.of(told, record)
+    peaks_hz = [mode.frequency_hz for mode in shown.modes]
+    band = shown.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, limits = np.abs(band.response), band.magnitude_limits()
     kept = response_thinning(band.frequency_hz).extremes(magnitude)
     return {
@@ -384,7 +390,10 @@ def _text(document: Mapping[str, Any]) -> Iterator[str]:
     for mode in shown:
         yield f"  {mode_line(mode)}"
     if shown:
-        yield f"  {Validity.of_document(document.get('validity')).sentence}"
+        validity = Validity.of_document(document.get("validity"))
+        yield f"  {validity.sentence}"
+        if validity.uniform_beam is not None:
+            yield f"  {validity.uniform_beam.sentence}"
     doubts = dict.fromkeys(
         flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
     )

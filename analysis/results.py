@@ -93,6 +93,8 @@ class WholeRecord:
     def __post_init__(self) -> None:
         plant = self.fit.plant
         validity = _validity(self.record, (plant.beam, plant.damping))
+        if (test := self.headline.uniform_beam) is not None:
+            validity = replace(validity, uniform_beam=test.summary)
         object.__setattr__(self, "validity", validity)
 
     @property
@@ -188,8 +190,10 @@ class WholeRecord:
 
     @property
     def unsupported(self) -> frozenset[str]:
-        """Orders that no fit of this record can tell: those withheld, and of absent damping."""
-        return self.withheld | {each.order for each in self.orders if each.value is None}
+        """Orders flagged on an exactly uniform beam, or of absent damping."""
+        exact = (self.headline.exact or self.headline).parameters
+        flagged = {name for name in _ORDERS & exact.keys() if exact[name].flag is not None}
+        return frozenset(flagged | {each.order for each in self.orders if each.value is None})
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from ._headline import Size as Size
 from ._headline import StructureStatus as StructureStatus
 from ._headline import headline_json as headline_json
 from ._headline import of_fit as of_fit
+from ._modal_fit import ModalFit as ModalFit
 from ._modal_headline import refused_reason as refused_reason
 from ._modal_headline import tolerant_sizes as tolerant_sizes
 from ._modal_headline import tolerant_status as tolerant_status
@@ -64,6 +65,7 @@ from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
+from ._uniform_beam import PARAMETERS as PARAMETERS
 from ._uniform_beam import TolerantEstimate as TolerantEstimate
 from ._uniform_beam import UniformBeamTest as UniformBeamTest
 from ._uniform_beam import tolerant_estimate as tolerant_estimate

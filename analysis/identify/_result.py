@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
+    from analysis.identify._modal_fit import ModalFit
     from analysis.identify._noise import Line
     from analysis.identify._plant import Plant
     from analysis.models import Structure
@@ -209,7 +210,7 @@ class RecordAnalysis:
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
         return Noise(self.noise_nm2_per_hz * scale, self.compared, self.lines)
 
-    def fit_percent(self, fit: RecordFit) -> float:
+    def fit_percent(self, fit: RecordFit | ModalFit) -> float:
         """Fit of one of the models to the measured torque in the band (`nrmse_percent`).
 
         Narrow-band disturbances are not part of it, and nothing is compared at their lines; a
@@ -217,7 +218,7 @@ class RecordAnalysis:
 
         Parameters
         ----------
-        fit : RecordFit
+        fit : RecordFit or ModalFit
             One of `fits`, or one under the same noise.
         """
         comparison, noise = self.comparison, self.noise

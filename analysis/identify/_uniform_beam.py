@@ -24,6 +24,7 @@ from analysis.identify._predictor import ResponseGrid, torque_channel
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,7 +49,8 @@ PARAMETERS: Final = (
 _ORDERS: Final = (0.4, 1.0, 1.6)
 _ORDER_RANGE: Final = (0.02, 1.98)
 _LN_LOSS_RANGE: Final = (-18.0, 2.0)
-"""Of the logarithm of what a damping adds to stiffness or inertia at its reference frequency."""
+"""Range of the logarithm of what a damping adds to stiffness or inertia at its reference
+frequency."""
 
 _LN_RANGE: Final = 2.0
 """How far ratio and stiffness may be from where the search begins, in logarithms."""
@@ -60,7 +62,7 @@ _RENEWALS: Final = 4
 
 _CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS: Final = 0.2
-"""Of the circle round a pole, relative to the decay rate."""
+"""Radius of the circle round a pole, relative to the decay rate."""
 
 _STEP: Final = 1e-5
 _NEWTON_STEPS: Final = 6
@@ -351,7 +353,7 @@ class ConstantsProblem:
         Parameters
         ----------
         place : int
-            Place of its coefficient among `PARAMETERS`.
+            Position of its coefficient among `PARAMETERS`.
         x : ndarray, shape (7,)
             Unknowns from which the search begins.
         """
@@ -427,11 +429,15 @@ class UniformBeamTest:
     predicted: NDArray[np.float64]
     std: NDArray[np.float64]
 
+    @property
+    def summary(self) -> BeamUniformity:
+        """Status and p-value, with their sentence."""
+        return BeamUniformity(self.status, self.p_value)
+
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it; numbers may be not finite."""
         return {
-            "status": self.status,
-            "p_value": self.p_value,
+            **self.summary.as_json(),
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [

@@ -19,6 +19,7 @@ from ._record_report import figures_of_paper as figures_of_paper
 from ._record_report import write_report as write_report
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
+from ._shown_model import ShownModel as ShownModel
 from ._table import terminal_table as terminal_table
 from ._text import analysis_tables as analysis_tables
 from ._text import record_text as record_text

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, ResponseGrid
+from analysis.identify import LOGARITHMIC, PARAMETERS, ResponseGrid
+from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant, RecordAnalysis
+    from analysis.identify import ModalFit, Plant, RecordAnalysis, TolerantEstimate
     from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord
@@ -43,8 +44,7 @@ def supported_band_hz(whole: WholeRecord) -> Band | None:
     """
     if not whole.withheld:
         return excited_band_hz(whole.record, whole.analysis)
-    shown = whole.visible_modes
-    frequencies = [mode.frequency_hz for mode in whole.fit.modes if mode.number in shown]
+    frequencies = [mode.frequency_hz.value for mode in whole.headline.modes if mode.shown]
     if len(frequencies) < 2:
         return None
     return min(frequencies), max(frequencies)
@@ -106,6 +106,40 @@ class Estimate(Protocol):
         """Covariance of these; of positive ones that of the logarithms."""
 
 
+@dataclass(frozen=True, slots=True)
+class NearlyUniformBeam:
+    """Beam estimated with a tolerance of the geometry, as an `Estimate`.
+
+    Attributes
+    ----------
+    structure : Structure
+    plant : Plant
+    parameters : mapping of str to float
+    determined : tuple of str
+    covariance : ndarray, shape (7, 7)
+    """
+
+    structure: Structure
+    plant: Plant
+    parameters: Mapping[str, float]
+    determined: tuple[str, ...]
+    covariance: Real
+
+    @classmethod
+    def of(cls, found: TolerantEstimate) -> NearlyUniformBeam:
+        """Take it from an estimate with both orders free."""
+        return cls(STRUCTURES["VI"], found.plant, found.values, PARAMETERS, found.covariance)
+
+
+def loss_estimate(whole: WholeRecord) -> Estimate | None:
+    """Choose the beam whose loss factors are drawn over frequency; None if none explains them."""
+    told = whole.headline
+    if told.tolerant is not None:
+        return None if told.tolerant.basis == "none" else NearlyUniformBeam.of(told.tolerant)
+    refused = told.uniform_beam is not None and told.uniform_beam.status == "refused"
+    return None if refused else whole.fit
+
+
 _GRID_POINTS: Final = 900
 
 
@@ -146,7 +180,7 @@ class ResponseBand:
     ----------
     frequency_hz : ndarray, shape (n,)
     response : ndarray of complex, shape (n,)
-        Torque per angle in N·m/rad of beam and clamp, without the delay between the channels.
+        Torque per angle in N·m/rad, without a delay between the channels.
     log_magnitude_std : ndarray, shape (n,)
         Standard deviation of ln |response|: the relative one of the magnitude.
     phase_std_rad : ndarray, shape (n,)
@@ -194,6 +228,40 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
         response=response,
         log_magnitude_std=_std(gradient.real, covariance),
         phase_std_rad=_std(gradient.imag, covariance),
+    )
+
+
+def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0) -> ResponseBand:
+    """Propagate the covariance of a modal model to its frequency response.
+
+    Parameters
+    ----------
+    fit : ModalFit
+    frequency_hz : ndarray, shape (n,)
+        Positive.
+    delay_s : float
+        Delay of the torque against the angle that is taken out: the one that the file states.
+    """
+    s = 2j * np.pi * frequency_hz
+    response = fit.model.response(s)
+    rows = []
+    for pole, residue in zip(fit.model.poles_rad_s, fit.model.residues, strict=True):
+        ratio = -pole.real / abs(pole)
+        # By ln frequency and ln damping ratio; those of the residue are residue and j residue
+        by_pole = (pole, -ratio * pole.imag / (1 - ratio * ratio) ** 1.5)
+        first, second = 1 / (s - pole), 1 / (s - pole.conjugate())
+        rows += [
+            residue * slope * first**2 + (residue * slope).conjugate() * second**2
+            for slope in by_pole
+        ]
+        rows += [slope * first + slope.conjugate() * second for slope in (residue, 1j * residue)]
+    rows += [s**power for power in range(len(fit.model.background))]
+    gradient = np.array(rows) / response
+    return ResponseBand(
+        frequency_hz=frequency_hz,
+        response=response * np.exp(s * delay_s),
+        log_magnitude_std=_std(gradient.real, fit.joint_covariance),
+        phase_std_rad=_std(gradient.imag, fit.joint_covariance),
     )
 
 

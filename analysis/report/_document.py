@@ -20,7 +20,8 @@ import rigd
 from analysis.identify import ResponseGrid
 from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
-from analysis.report._bands import loss_factors, response_band, supported_band_hz
+from analysis.report._bands import loss_estimate, loss_factors, supported_band_hz
+from analysis.report._shown_model import ShownModel
 from analysis.report._table import unreported
 from analysis.results import finite
 from analysis.statistics import nrmse_percent
@@ -111,8 +112,8 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
     dict
         ``headline``: what the record says, with flags; ``fits`` and ``modes``: lists of objects as
         the document has them of the Welch fits,
-        with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
-        selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
+        with ``estimator`` "record"; ``records``: one object with verdict, noise, hum, and response
+        and loss factors with their 95 % bands. Numbers may be numpy's or
         not finite, as `finite` takes them. What is not reported is flagged, not
         left out: ``withheld`` of a fit names its parameters that the data do not support,
         ``visible`` of a mode says whether the record shows it. ``indices`` are against Welch's
@@ -167,16 +168,17 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
             {
                 **name,
                 "mode": mode.number,
-                "visible": mode.number in whole.visible_modes,
-                "frequency_hz": mode.frequency_hz,
-                "frequency_std_hz": mode.frequency_std_hz,
-                "damping_ratio": mode.damping_ratio,
-                "damping_ratio_std": mode.damping_ratio_std,
+                "visible": mode.shown,
+                "source": mode.source,
+                "frequency_hz": mode.frequency_hz.value,
+                "frequency_std_hz": mode.frequency_hz.std,
+                "damping_ratio": mode.damping_ratio.value,
+                "damping_ratio_std": mode.damping_ratio.std,
             }
-            # Of the fit that is believed: they are what narrow sweeps are planned by.
-            for name, fit in names
+            # Those reported first: they are what narrow sweeps are planned by.
+            for name, _ in names
             if name["selected"]
-            for mode in fit.modes
+            for mode in whole.headline.modes
         ],
         "records": [
             {
@@ -207,14 +209,16 @@ def _size(size: DampingSize | None) -> dict[str, Any] | None:
 
 
 def _curves(whole: WholeRecord) -> dict[str, Any]:
-    """Tabulate the selected fit's response and loss factors over the band."""
+    """Tabulate the response of the model shown first, and loss factors, over the band."""
     first_hz, last_hz = whole.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    band = response_band(whole.fit, frequency_hz)
+    model, beam = ShownModel.of(whole.headline, whole.record), loss_estimate(whole)
+    band = model.band(frequency_hz)
     low, high = band.magnitude_limits()
-    factors = loss_factors(whole.fit, frequency_hz)
+    factors = None if beam is None else loss_factors(beam, frequency_hz)
     supported_hz = supported_band_hz(whole)
     return {
+        "model": "beam" if model.modal is None else "modal",
         "frequency_hz": frequency_hz.tolist(),
         "magnitude_nm_per_rad": np.abs(band.response).tolist(),
         "magnitude_low_nm_per_rad": low.tolist(),
@@ -222,9 +226,9 @@ def _curves(whole: WholeRecord) -> dict[str, Any]:
         "phase_rad": np.angle(band.response).tolist(),
         "phase_std_rad": band.phase_std_rad.tolist(),
         "loss_factor_supported_hz": None if supported_hz is None else list(supported_hz),
-        "loss_factor": _factor(factors.total),
-        "internal_loss_factor": _factor(factors.internal),
-        "external_loss_factor": _factor(factors.external),
+        "loss_factor": None if factors is None else _factor(factors.total),
+        "internal_loss_factor": None if factors is None else _factor(factors.internal),
+        "external_loss_factor": None if factors is None else _factor(factors.external),
     }
 
 

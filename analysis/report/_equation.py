@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import reduce
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from analysis.identify import BACKGROUND
 from analysis.models import STRUCTURES
 from analysis.report._table import ABSENT, WORDS, Column, Table
 
@@ -84,6 +85,12 @@ _ONE, _TWO = _number("1"), _number("2")
 _OF_S: Final = _OPEN + _S + _CLOSE
 
 
+_TORQUE_OVER_ANGLE: Final = _over(
+    _indexed(_name("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}")) + _OF_S,
+    _indexed(_name("Θ", r"\Theta"), _name("m")) + _OF_S,
+)
+
+
 def _term(coefficient: Formula, order: Formula, *, integer: bool) -> Formula:
     return coefficient + (_S if integer else _power(_S, order))
 
@@ -140,20 +147,49 @@ def _measured(fit: RecordFit) -> Formula:
         root = Formula(f"<msqrt>{_TWO.mathml}</msqrt>", r"\sqrt{2}")
         square = _power(_name("T"), _TWO) + _power(_S, _TWO)
         found += _over(_ONE, _joined(_ONE, _PLUS, root, time, _PLUS, square))
-    torque = _indexed(_name("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}"))
-    angle = _indexed(_name("Θ", r"\Theta"), _name("m"))
-    return _joined(_over(torque + _OF_S, angle + _OF_S), _IS, found)
+    return _joined(_TORQUE_OVER_ANGLE, _IS, found)
+
+
+def _modal() -> Formula:
+    """Modal model: poles and residues, and a background."""
+    k, n, background = _name("k"), _name("n"), BACKGROUND - 1
+    over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
+    limit = _number(str(background))
+    from_zero = _joined(n, _IS, _number("0"))
+    over_powers = Formula(
+        f"<munderover><mo>∑</mo>{from_zero.row.mathml}{limit.row.mathml}</munderover>",
+        rf"\sum_{from_zero.row.tex}^{limit.row.tex}",
+    )
+    terms = []
+    for residue, pole in ((_name("R"), _name("p")), (_conjugate("R"), _conjugate("p"))):
+        terms.append(_over(_indexed(residue, k), _joined(_S, _MINUS, _indexed(pole, k))))
+    first, second = terms
+    return _joined(
+        _TORQUE_OVER_ANGLE, _IS, over_modes, _OPEN, first, _PLUS, second, _CLOSE, _PLUS,
+        over_powers, _indexed(_name("b"), n), _power(_S, n),
+    )  # fmt: skip
+
+
+def _conjugate(letter: str) -> Formula:
+    return Formula(f"<mover><mi>{letter}</mi><mo>¯</mo></mover>", rf"\bar{{{letter}}}")
 
 
 def equations(whole: WholeRecord) -> tuple[Formula, ...]:
-    """Write the model of the fit that the headline is of.
+    """Write the models of a record: the modal one if there is one, and the beam's.
 
     Returns
     -------
     tuple of Formula
-        What was measured, Eq. 25 of the paper, and its beta: with the terms that the structure has.
+        Modal model; what was measured of a beam, Eq. 25 of the paper, and its beta: with the terms
+        that the structure has.
     """
-    return _measured(whole.fit), *_of_beam(whole.fit.structure)
+    modal = () if whole.headline.modal is None else (_modal(),)
+    return *modal, _measured(whole.fit), *_of_beam(_structure(whole))
+
+
+def _structure(whole: WholeRecord) -> Structure:
+    """Structure of the parameters reported: with a tolerance of the geometry both orders."""
+    return whole.fit.structure if whole.headline.tolerant is None else STRUCTURES["VI"]
 
 
 _EXTRAS: Final = {
@@ -175,6 +211,11 @@ def definitions(whole: WholeRecord) -> str:
         f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]
+    if whole.headline.modal is not None:
+        parts[1:1] = [
+            "first the modal model with a pole p and a residue R of each mode, which the modes are "
+            "of, below it the beam's, which the parameters are of",
+        ]
     names = whole.headline.parameters
     parts += [
         words
@@ -218,7 +259,7 @@ def types_table(whole: WholeRecord) -> Table:
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
             "mode with its own stiffness. The marked type is that of the numbers reported.",
         ),
-        selected=list(STRUCTURES).index(whole.fit.structure.name),
+        selected=list(STRUCTURES).index(_structure(whole).name),
     )
 
 

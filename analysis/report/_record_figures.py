@@ -1,4 +1,4 @@
-"""Figures of a whole-record fit: frequency response, loss factor, residual.
+"""Figures of a whole record: frequency response, uniformity, loss factor, residual.
 
 Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
 
@@ -22,21 +22,23 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from analysis.identify import fast_length
 from analysis.report import _style as style
-from analysis.report._bands import dense_grid, loss_factors, response_band, supported_band_hz
+from analysis.report._bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
+from analysis.report._shown_model import ShownModel
+from analysis.report._uniformity import UNIFORMITY, uniformity_description, uniformity_figure
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
 from rigd.view import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import ModeEstimate, RecordAnalysis, RecordFit
-    from analysis.report._bands import ResponseBand
+    from analysis.identify import Headline, ModeEstimate, RecordAnalysis
+    from analysis.report._bands import Estimate, ResponseBand
     from analysis.results import WholeRecord
     from rigd.spectral import FrequencyResponse
 
@@ -73,22 +75,20 @@ _NARROWEST: Final = 0.006
 """Least half of a detail, relative to the mode's frequency."""
 
 
-def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
+def frf_figure(measured: FrequencyResponse, model: ShownModel) -> Figure:
     """Draw magnitude, phase, the band's width, and a detail of every mode.
 
     Parameters
     ----------
     measured : FrequencyResponse
         Empirical transfer function estimate, with the delay between the channels in it.
-    fit : RecordFit
+    model : ShownModel
     """
     first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
-    shown = [mode for mode in fit.modes if first_hz < mode.frequency_hz < last_hz]
+    shown = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
     grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
-    band = response_band(fit, grid_hz)
-    seen = measured.response * np.exp(
-        2j * np.pi * fit.parameters["delay_s"] * measured.frequency_hz
-    )
+    band = model.band(grid_hz)
+    seen = measured.response * np.exp(2j * np.pi * model.delay_s * measured.frequency_hz)
     figure = style.new_figure(9.0, 6.4)
     count = max(len(shown), 1)
     grid = figure.add_gridspec(
@@ -120,7 +120,7 @@ def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
         detail = figure.add_subplot(grid[1, column])
         limits = _detail(mode, measured.frequency_hz)
         near = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
-        close = response_band(fit, np.linspace(*limits, _DETAIL_POINTS))
+        close = model.band(np.linspace(*limits, _DETAIL_POINTS))
         _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
         detail.set_xlim(limits)
         detail.set_ylim(style.limits(magnitude_db(seen[near]), magnitude_db(close.response)))
@@ -179,37 +179,46 @@ _SPAN: Final = 300.0
 
 
 def loss_figure(
-    fit: RecordFit,
+    modes: Sequence[ModeEstimate],
+    beam: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     *,
     withheld: Collection[str] = (),
+    doubtful: Collection[int] = (),
 ) -> Figure:
     """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
 
     Parameters
     ----------
-    fit : RecordFit
-        With the modes that are drawn.
+    modes : sequence of ModeEstimate
+        Those that are drawn.
+    beam : Estimate or None
+        Beam of the curves; None: no beam explains the losses.
     axis_hz : tuple of float
         First and last frequency of the axis, positive.
     supported_hz : tuple of float or None
         Band in which the data support the curves: there are none beyond. None: nowhere.
     withheld : collection of str
         Orders that the data do not support: then the total is not split into its parts.
+    doubtful : collection of int
+        Modes whose damping ratio carries a flag: their points are hollow.
     """
-    modes = fit.modes
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn = _curves(axes, fit, axis_hz, supported_hz, withheld)
-    if modes:
-        axes.errorbar(
-            [mode.frequency_hz for mode in modes], [2 * mode.damping_ratio for mode in modes],
-            [2 * NORMAL_95 * mode.damping_ratio_std for mode in modes],
-            fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
-            label="modes", zorder=5,
-        )  # fmt: skip
-    for edge_hz, end_hz in _beyond(axis_hz, supported_hz, [mode.frequency_hz for mode in modes]):
+    drawn = _curves(axes, beam, axis_hz, supported_hz, withheld)
+    for label, filled in (("modes", True), ("modes, doubtful", False)):
+        few = [mode for mode in modes if (mode.number not in doubtful) is filled]
+        if few:
+            axes.errorbar(
+                [mode.frequency_hz for mode in few], [2 * mode.damping_ratio for mode in few],
+                [2 * NORMAL_95 * mode.damping_ratio_std for mode in few],
+                fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
+                markerfacecolor=style.INK if filled else "white", label=label, zorder=5,
+            )  # fmt: skip
+    modes_hz = [mode.frequency_hz for mode in modes]
+    beyond = [] if beam is None else _beyond(axis_hz, supported_hz, modes_hz)
+    for edge_hz, end_hz in beyond:
         axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
     points = [2 * mode.damping_ratio for mode in modes]
@@ -230,18 +239,18 @@ def loss_figure(
 
 def _curves(
     axes: Axes,
-    fit: RecordFit,
+    beam: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     withheld: Collection[str],
 ) -> list[NDArray[np.float64]]:
     """Draw the loss factors where the data support them; return the values drawn."""
-    if supported_hz is None:
+    if supported_hz is None or beam is None:
         return []
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
     if first_hz >= last_hz:
         return []
-    factors = loss_factors(fit, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
+    factors = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
     curves = dict(zip(_LOOKS, (factors.internal, factors.external, factors.total), strict=True))
     both = None not in curves.values()
     drawn = []
@@ -278,28 +287,28 @@ _STRETCHES: Final = 120
 """At most: a short record has fewer independent values."""
 
 
-def residual_figure(analysis: RecordAnalysis, fit: RecordFit) -> Figure:
+def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
     """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
 
     Parameters
     ----------
+    model : ShownModel
     analysis : RecordAnalysis
-        That the fit belongs to.
-    fit : RecordFit
+        With the noise and the bins of its residual.
     """
     figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
         2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
     )  # fmt: skip
-    _spectrum(figure.add_subplot(grid[0, :]), analysis, fit)
-    _cumulative(figure.add_subplot(grid[1, 0]), analysis, fit)
-    _in_time(figure.add_subplot(grid[1, 1]), analysis, fit)
+    _spectrum(figure.add_subplot(grid[0, :]), model, analysis)
+    _cumulative(figure.add_subplot(grid[1, 0]), model, analysis)
+    _in_time(figure.add_subplot(grid[1, 1]), model, analysis)
     return figure
 
 
-def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
+def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     frequency_hz = analysis.frequency_hz
-    density = analysis.noise_nm2_per_hz * np.abs(fit.residual) ** 2 / 2
+    density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
     counted = analysis.compared
     bins = np.flatnonzero(counted)
     blocks = np.array_split(bins, max(bins.size // _BINS_A_POINT, 1))
@@ -314,7 +323,7 @@ def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
         frequency_hz[few], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[few]), color=style.BLUE,
         label="noise model",
     )  # fmt: skip
-    for mode in fit.modes:
+    for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
     for line in analysis.lines:
         axes.annotate(
@@ -331,9 +340,9 @@ def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
 
 
-def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
+def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     counted = analysis.compared
-    power = np.abs(fit.residual[counted]) ** 2
+    power = np.abs(model.residual[counted]) ** 2
     share = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[counted]
@@ -342,7 +351,7 @@ def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     difference = 100 * (share - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
-    for mode in fit.modes:
+    for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
     reach = 1.25 * max(half, float(np.abs(difference).max()))
     axes.set_ylim(-reach, reach)
@@ -353,8 +362,8 @@ def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     axes.legend(loc="lower right", borderaxespad=0.1)
 
 
-def _in_time(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
-    times_s, power = residual_power(analysis, fit)
+def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
+    times_s, power = residual_power(analysis, model.residual)
     half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
         max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
@@ -370,7 +379,7 @@ def _in_time(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
 
 
 def residual_power(
-    analysis: RecordAnalysis, fit: RecordFit
+    analysis: RecordAnalysis, residual: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Power of the whitened residual in stretches of the record, 1 if chance is all that remains.
 
@@ -383,8 +392,8 @@ def residual_power(
         Middles of the stretches from the first sample compared on, and mean power in them.
     """
     spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
-    bins = fit.residual.size
-    envelope = np.abs(np.fft.ifft(fit.residual)) ** 2 * bins / 2
+    bins = residual.size
+    envelope = np.abs(np.fft.ifft(residual)) ** 2 * bins / 2
     envelope *= bins / np.count_nonzero(analysis.compared)
     stretches = min(_STRETCHES, bins)
     power: NDArray[np.float64] = np.array(
@@ -403,73 +412,104 @@ class Illustration:
     description: str
 
 
-FIGURES: Final = ("record_frf", "loss_factor", "residual", "record_signals")
+FIGURES: Final = ("record_frf", UNIFORMITY, "loss_factor", "residual", "record_signals")
+"""Names of the figures; the second is left out where too few modes show for the test."""
 
 
 def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     """Draw the figures one after the other; within `style.styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    highest_hz, shown = whole.band_hz[1], whole.visible_modes
-    # Details and lines are of modes that the record shows, not of what the model adds.
-    fit = replace(whole.fit, modes=tuple(m for m in whole.fit.modes if m.number in shown))
-    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in whole.fit.modes)
-    frf, loss, residual, signals = FIGURES
+    highest_hz, told = whole.band_hz[1], whole.headline
+    model = ShownModel.of(told, whole.record)
+    analysis = model.compared(whole.analysis)
+    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
+    frf, _, loss, residual, signals = FIGURES
     measured = measured_response(whole)
-    model = f"the model (type {whole.headline.name})"
+    delay = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
-        frf_figure(measured, whole.fit),
+        frf_figure(measured, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
-        f"(empirical transfer function estimate, delay removed) and of {model}; half-width of the "
-        f"model's 95 % band; details of the modes ({modes} Hz). The band is narrower than the line "
-        "where it is not seen.",
+        f"(empirical transfer function estimate, {delay} removed) and of {model.name}; half-width "
+        f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
+        "the line where it is not seen.",
     )
+    test = told.uniform_beam
+    if test is not None and test.p_value is not None:
+        yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
+    beam = loss_estimate(whole)
+    doubtful = [mode.number for mode in told.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss,
         loss_figure(
-            fit,
+            model.modes,
+            beam,
             (float(measured.frequency_hz[0]), highest_hz),
             supported_band_hz(whole),
             withheld=whole.withheld,
+            doubtful=doubtful,
         ),
-        _loss_description(whole),
+        _loss_description(whole, drawn=beam is not None),
     )
+    power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
         residual,
-        residual_figure(whole.analysis, fit),
-        f"Residual of the torque, measured minus that of {model}: its spectrum beside the noise "
-        "model; its cumulative periodogram, which stays in the shaded range in 95 of 100 records "
-        "or more if only noise is left; and its power through the record. Excess at a mode or at "
-        f"one time is what the model lacks. Sum of squares {fit.cost:.6g} for "
-        f"{fit.degrees_of_freedom} degrees of freedom.",
+        residual_figure(model, analysis),
+        f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
+        "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
+        "records or more if only noise is left; and its power through the record. Excess at a "
+        f"mode or at one time is what the model lacks. Mean power {power:.4g} times that of the "
+        "noise.",
     )
     yield Illustration(
         signals,
-        signals_figure(whole.record, fit, highest_hz),
-        f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model} "
-        f"predicts it from the measured angle (fit {whole.analysis.fit_percent(whole.fit):.2f} % "
+        signals_figure(whole.record, model, highest_hz),
+        f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model.name} "
+        f"predicts it from the measured angle (fit {model.fit_percent(whole.analysis):.2f} % "
         "NRMSE); residual; below, where each mode rings most.",
     )
 
 
-def _loss_description(whole: WholeRecord) -> str:
-    shown = (
-        "Loss factor against frequency with 95 % bands, type "
-        f"{whole.headline.name}; points: twice the damping ratio of each mode with its 95 % "
-        "interval. "
-    )
+def _loss_description(whole: WholeRecord, *, drawn: bool) -> str:
+    points = "twice the damping ratio of each mode with its 95 % interval"
+    reasons = _reasons(whole.headline)
+    if not drawn:
+        return (
+            f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
+            f"internal and one external order explains the losses.{reasons}"
+        )
+    shown = f"Loss factor over frequency with 95 % bands, {_curve(whole)}; points: {points}. "
     if whole.withheld:
         return shown + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "
-            "do not support would decide."
+            f"do not support would decide.{reasons}"
         )
     return shown + (
         "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
         "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
-        "the noise nothing is drawn."
+        f"the noise nothing is drawn.{reasons}"
     )
+
+
+def _curve(whole: WholeRecord) -> str:
+    """Name the beam of the loss factors."""
+    tolerant = whole.headline.tolerant
+    if tolerant is None:
+        return f"type {whole.headline.name}"
+    if tolerant.basis == "losses":
+        return "of both dampings by damping ratios and residue phases alone"
+    percent = 100 * tolerant.uniformity
+    return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
+
+
+def _reasons(told: Headline) -> str:
+    """Say why points are hollow."""
+    reasons = dict.fromkeys(
+        mode.damping_ratio.flag for mode in told.modes if mode.shown and mode.damping_ratio.flag
+    )
+    return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
 
 
 def measured_response(whole: WholeRecord) -> FrequencyResponse:

@@ -7,12 +7,14 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import ESTIMATOR_WORDS
+from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._folder import write_new
 from analysis.report._table import Table, csv_text, latex_table, with_validity
 from analysis.report._text import damping_sentences, tables_text
+from analysis.report._uniformity import UNIFORMITY, uniformity_table
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
@@ -63,6 +65,8 @@ def record_page(
 
     whole = result.whole
     assert whole is not None
+    figures = [each for each in pictures if each.name != UNIFORMITY]
+    test = whole.headline.uniform_beam
     return page(
         "record.html",
         title=result.name,
@@ -72,7 +76,14 @@ def record_page(
         sentences=whole.verdict.sentences,
         experiments=whole.verdict.experiments,
         warnings=result.warnings,
-        pictures=pictures,
+        pictures=figures,
+        uniformity=None
+        if test is None
+        else {
+            "sentence": test.summary.sentence,
+            "pictures": [each for each in pictures if each.name == UNIFORMITY],
+            "tables": uniformity_tables(whole),
+        },
         equations=[mathml(each) for each in equations(whole)],
         definitions=definitions(whole),
         types=types_table(whole),
@@ -173,9 +184,9 @@ def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
     return [
         (
             "estimator",
-            "output error on the whole record: the torque that the exact model (Eq. 25) gives for "
-            "the measured angle minus the measured torque, whitened by the noise model; maximum "
-            "likelihood for noise in the torque",
+            "output error on the whole record: the torque that a model (modal model; Eq. 25) gives "
+            "for the measured angle minus the measured torque, whitened by the noise model; "
+            "maximum likelihood for noise in the torque",
         ),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole.analysis.frequency_hz.size} bins"),
         ("types", ", ".join(whole.fits)),
@@ -241,7 +252,7 @@ def _write_page(
             pictures.append(style.save_picture(shown.figure, stem, shown.description, formats))
             on_step(f"figure {shown.name}")
     modes, of_record, of_paper = report_tables(result)
-    for each in (modes, *of_record, *of_paper):
+    for each in (modes, *uniformity_tables(whole), *of_record, *of_paper):
         table = with_validity(each, result.validity)
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
         if table.name in _FOR_PAPERS:
@@ -252,23 +263,32 @@ def _write_page(
     write_new(folder / "report.html", text)
 
 
+def uniformity_tables(whole: WholeRecord) -> tuple[Table, ...]:
+    """Make the tables on the uniformity of the beam."""
+    test = whole.headline.uniform_beam
+    if test is None or test.p_value is None:
+        return ()
+    modes = tables.exact_modes_table(whole)
+    return (uniformity_table(test), *(() if modes is None else (modes,)))
+
+
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Make the table of modes, those of the whole-record fits, and those of the Welch method."""
     whole, welch = result.whole, result.welch
     assert whole is not None
-    condition = tables.condition_table(whole)
+    conditions = tables.exact_geometry_table(whole), tables.condition_table(whole)
     of_record = (
         tables.sizes_table(whole),
         tables.parameters_table(whole),
-        *(() if condition is None else (condition,)),
+        *(each for each in conditions if each is not None),
         tables.correlations_table(whole),
         *tables.amplitude_tables(whole),
-        tables.structures_table(whole),
+        fit_tables.structures_table(whole),
     )
     of_paper = (
         ()
         if welch is None
-        else (tables.welch_fits_table(welch, whole.unsupported), tables.peaks_table(welch))
+        else (fit_tables.welch_fits_table(welch, whole.unsupported), fit_tables.peaks_table(welch))
     )
     return tables.modes_table(whole), of_record, of_paper
 

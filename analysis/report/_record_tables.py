@@ -1,18 +1,15 @@
-"""Tables of a record: whole-record fits, structures, damping by amplitude; Welch fits."""
+"""Tables of a record: modes, parameters, loss factors, damping by amplitude."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, replace
-from statistics import fmean, stdev
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from analysis.identify import EXACT_CONDITION
 from analysis.models import QUANTITIES
-from analysis.paper import LARGEST_SHIFT
-from analysis.report._document import response_fit_percent
 from analysis.report._scales import scale_notes
+from analysis.report._shown_model import ShownModel
 from analysis.report._table import (
-    ABSENT,
     MARK,
     WORDS,
     Cell,
@@ -21,20 +18,17 @@ from analysis.report._table import (
     Table,
     count,
     estimate,
-    footnotes,
     greyed,
     marked,
     number,
-    unreported,
 )
 from analysis.statistics import NORMAL_95
+from rigd.printable import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping
 
-    from analysis.identify import Headline, Quantity, Size
-    from analysis.models import Structure
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.identify import Headline, Mode, Numbers, Quantity, Size
     from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9
@@ -45,35 +39,105 @@ _MARKED: Final = (
 
 
 def modes_table(whole: WholeRecord) -> Table:
-    """Frequencies and damping ratios; modes that do not show, or are doubtful, are marked."""
+    """Frequencies, damping ratios and effective inertias; those that are doubtful are marked."""
     told = whole.headline
+    known = any(mode.participation is not None for mode in told.modes)
     rows: list[tuple[Entry, ...]] = []
     for mode in told.modes:
-        f, ratio = mode.frequency_hz, mode.damping_ratio
-        cells = (*estimate((f.value, f.std), f.std), *_told(ratio, 100.0))
-        if ratio.flag is None:
-            rows.append((mode.number, *cells))
+        cells = *_mode_cells(mode), *_inertia(mode.participation)
+        if mode.damping_ratio.flag is None:
+            rows.append((mode.number, *cells, mode.source))
         else:
-            rows.append((marked(count(mode.number)), *map(greyed, cells)))
+            rows.append((marked(count(mode.number)), *map(greyed, cells), mode.source))
     return Table.of(
         "modes",
-        f"Modes with locked hub (clamped–free): type {told.name}",
+        f"Modes with locked hub (clamped–free): {_modes_source(told)}",
         (
-            Column("Mode", "mode"),
-            Column("Frequency (Hz)", "frequency_hz"),
-            Column("std (Hz)", "frequency_std_hz"),
-            Column("Damping ratio (%)", "damping_ratio"),
-            Column("std (%)", "damping_ratio_std"),
-            Column("95 % from (%)", "damping_ratio_low_95"),
-            Column("to (%)", "damping_ratio_high_95"),
+            *_MODE,
+            Column("Inertia (kg·mm²)" if known else "", "participation_kg_m2"),
+            Column("std" if known else "", "participation_std_kg_m2"),
+            Column("Source" if known else "", "source", WORDS),
         ),
         rows,
         (
             "Intervals are statistical only; no torque scale, length or density acts on "
             "frequencies and damping ratios.",
+            *_modal_notes(whole),
             *_reasons(mode.damping_ratio for mode in told.modes),
         ),
     )
+
+
+def exact_modes_table(whole: WholeRecord) -> Table | None:
+    """Modes of a uniform beam that predicts the modal constants; None without one."""
+    told = whole.headline
+    test, exact = told.uniform_beam, told.exact
+    if test is None or exact is None or test.status != "passed":
+        return None
+    modes = [mode for mode in exact.modes if mode.shown and mode.damping_ratio.flag is None]
+    if not modes:
+        return None
+    return Table.of(
+        "exact_geometry_modes",
+        f"Modes {EXACT_CONDITION}: type {exact.name}",
+        _MODE,
+        ((mode.number, *_mode_cells(mode)) for mode in modes),
+        ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
+    )
+
+
+_MODE: Final = (
+    Column("Mode", "mode"),
+    Column("Frequency (Hz)", "frequency_hz"),
+    Column("std (Hz)", "frequency_std_hz"),
+    Column("Damping ratio (%)", "damping_ratio"),
+    Column("std (%)", "damping_ratio_std"),
+    Column("95 % from (%)", "damping_ratio_low_95"),
+    Column("to (%)", "damping_ratio_high_95"),
+)
+
+
+def _mode_cells(mode: Mode) -> tuple[Cell, ...]:
+    """Fill the columns of `_MODE` but for the number."""
+    return *_told(mode.frequency_hz)[:2], *_told(mode.damping_ratio, 100.0)
+
+
+_SQUARE_MM: Final = 1e6
+
+
+def _modes_source(told: Headline) -> str:
+    """Name the model that the modes of a headline are of."""
+    return "modal model" if any(m.source == "modal" for m in told.modes) else f"type {told.name}"
+
+
+def _inertia(participation: Quantity | None) -> tuple[Cell, Cell]:
+    if participation is None:
+        return number(None), number(None)
+    value, std, *_ = _told(participation, _SQUARE_MM)
+    return value, std
+
+
+def _modal_notes(whole: WholeRecord) -> Iterator[str]:
+    """Say how well the modal model fits, and which of its resonances are not the beam's."""
+    modal = whole.headline.modal
+    if modal is None:
+        return
+    yield (
+        "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
+        "proportional to the torque scale."
+    )
+    percent = ShownModel.of(whole.headline, whole.record).fit_percent(whole.analysis)
+    yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
+    found = [
+        f"{frequency_hz:.4g}"
+        for mode, frequency_hz in zip(modal.numbers, modal.model.frequencies_hz, strict=True)
+        if mode == 0
+    ]
+    if found:
+        yield (
+            f"The modal model has a further resonance at {listed(found)} Hz, which is not one of "
+            "the beam's (sensor, mount)."
+        )
 
 
 def parameters_table(whole: WholeRecord) -> Table:
@@ -89,29 +153,85 @@ def parameters_table(whole: WholeRecord) -> Table:
         Column("with scales: from", "combined_low_95"),
         Column("to", "combined_high_95"),
     )
+    fit = ""
+    if told.tolerant is None:
+        fit = f" Fit {whole.analysis.fit_percent(told.fit):.2f} % (NRMSE)."
     return Table.of(
         "parameters",
-        f"Parameters, type {told.name}",
+        f"Parameters{_condition(told)}",
+        (*_PARAMETER, *(including_scales if combined else ()), _REMARK),
         (
-            Column("Parameter", "parameter", WORDS),
-            Column("Meaning", "meaning", WORDS),
-            Column("Unit", "unit", WORDS),
-            Column("Value", "value"),
-            Column("std", "std"),
-            Column("95 % from", "low_95"),
-            Column("to", "high_95"),
-            *(including_scales if combined else ()),
-            Column("Remark", "remark", WORDS),
+            _parameter_row(name, told.parameters[name], combined, fixed=_fixed(told, name))
+            for name in parameter_names(told)
         ),
-        (_parameter_row(told, name, each, combined) for name, each in told.parameters.items()),
+        (f"{_STD}{fit}", *scale_notes(whole), *((_MARKED,) if told.flags else ())),
+    )
+
+
+_PARAMETER: Final = (
+    Column("Parameter", "parameter", WORDS),
+    Column("Meaning", "meaning", WORDS),
+    Column("Unit", "unit", WORDS),
+    Column("Value", "value"),
+    Column("std", "std"),
+    Column("95 % from", "low_95"),
+    Column("to", "high_95"),
+)
+_REMARK: Final = Column("Remark", "remark", WORDS)
+_STD: Final = (
+    "std is one standard deviation; intervals of ρ/EI and EI, and on an exactly uniform beam those "
+    "of ζ and γ, are symmetric in the logarithm. The CSV file has SI units."
+)
+
+
+def parameter_names(told: Headline) -> tuple[str, ...]:
+    """Return the names of a headline's parameters: damping, beam, rig."""
+    first = () if told.exact is None else told.exact.parameters
+    return tuple(dict.fromkeys((*(name for name in first if name in told.parameters),
+                                *told.parameters)))  # fmt: skip
+
+
+def _condition(told: Headline) -> str:
+    """Say on which condition parameters are what a table has."""
+    found = told.tolerant
+    if found is None:
+        exact = "" if told.modal is None else f", {EXACT_CONDITION}"
+        return f", type {told.name}{exact}"
+    if found.basis == "geometry":
+        percent = 100 * found.uniformity
+        return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
+    if found.basis == "losses":
+        return " by damping ratios and residue phases alone, whatever the positions of the modes"
+    return " of the beam that fits the losses best: it does not explain them"
+
+
+def exact_geometry_table(whole: WholeRecord) -> Table | None:
+    """Parameters on condition that the beam is exactly uniform; None where these are reported."""
+    exact = whole.headline.exact
+    if exact is None:
+        return None
+    flags = [each.flag for each in exact.parameters.values() if each.flag]
+    return Table.of(
+        "exact_geometry",
+        f"Parameters {EXACT_CONDITION}: type {exact.name}",
+        (*_PARAMETER, _REMARK),
         (
-            "std is one standard deviation; intervals of ζ, γ, ρ/EI and EI are symmetric in the "
-            f"logarithm. The CSV file has SI units. Fit {whole.analysis.fit_percent(told.fit):.2f} "
-            "% (NRMSE).",
-            *scale_notes(whole),
-            *((_MARKED,) if told.flags else ()),
+            _parameter_row(name, each, {}, fixed=_fixed(whole.headline, name, exact=True))
+            for name, each in exact.parameters.items()
+        ),
+        (
+            "A condition, not a result: no antenna is known to be uniform to 1e-5. "
+            f"Fit {whole.analysis.fit_percent(whole.fit):.2f} % (NRMSE).",
+            *((_MARKED,) if flags else ()),
         ),
     )
+
+
+def _fixed(told: Headline, name: str, *, exact: bool = False) -> bool:
+    """Whether a parameter was held at a value in the fit that it is of."""
+    if told.tolerant is not None and not exact and name in told.tolerant.values:
+        return False
+    return name not in told.fit.interval and name != "drag"
 
 
 def sizes_table(whole: WholeRecord) -> Table:
@@ -141,20 +261,25 @@ def sizes_table(whole: WholeRecord) -> Table:
 
 def condition_table(whole: WholeRecord) -> Table | None:
     """Set what a simpler structure would give beside what is told; None if none would do."""
-    told, simpler = whole.headline, whole.headline.simpler
+    told: Numbers = whole.headline.exact or whole.headline
+    simpler = told.simpler
     if simpler is None:
         return None
     taken = " and ".join(f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items())
     rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
-        free = told.parameters[name]
+        free = told.parameters.get(name)
         rows.append(
             (
                 Cell(name, symbol),
                 _unit_cell(unit),
                 *estimate((each.value, *_ends(each)), each.std, factor),
-                *estimate((free.value, *_ends(free)), free.std, factor),
+                *(
+                    [number(None)] * 3
+                    if free is None
+                    else estimate((free.value, *_ends(free)), free.std, factor)
+                ),
             )
         )
     return Table.of(
@@ -171,7 +296,10 @@ def condition_table(whole: WholeRecord) -> Table | None:
             Column("to", "free_high_95"),
         ),
         rows,
-        ("The intervals on the left hold only if the assumption is true.",),
+        (
+            "The intervals on the left hold only if the assumption is true"
+            + (f", and both {EXACT_CONDITION}." if whole.headline.exact else "."),
+        ),
     )
 
 
@@ -181,7 +309,7 @@ def correlations_table(whole: WholeRecord) -> Table:
     symbols = [_symbol(name) for name in fit.determined]
     return Table.of(
         "correlations",
-        f"Correlations of the parameters, type {whole.headline.name}",
+        f"Correlations of the parameters on an exactly uniform beam, type {whole.headline.name}",
         (
             Column("Parameter", "parameter", WORDS),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
@@ -197,7 +325,7 @@ def correlations_table(whole: WholeRecord) -> Table:
 
 
 def _parameter_row(
-    told: Headline, name: str, each: Quantity, combined: Mapping[str, Quantity]
+    name: str, each: Quantity, combined: Mapping[str, Quantity], *, fixed: bool
 ) -> tuple[Entry, ...]:
     symbol, meaning, unit, factor = _described(name)
     shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
@@ -207,7 +335,6 @@ def _parameter_row(
         shown += estimate((both.std or None, *_ends(both)), both.std, factor)
     if each.flag is not None:
         shown = (marked(shown[0]), *map(greyed, shown[1:]))
-    fixed = name not in told.fit.interval and name != "drag"
     return (
         Cell(name, symbol),
         meaning,
@@ -273,300 +400,6 @@ def _correlation(own: bool, value: float) -> Cell:
     if own or abs(value) < _STRONG_CORRELATION:
         return shown
     return replace(shown, strong=True)
-
-
-_DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
-_ON_THE_EDGE: Final = "* at the limit of the search range: not determined by the data."
-
-
-def structures_table(whole: WholeRecord) -> Table:
-    """All fits beside each other; orders that the data do not support are marked in each."""
-    lowest = min(fit.cost for fit in whole.fits.values())
-    withheld = whole.unsupported
-    delta_bic = whole.delta_bic
-    status = dict(whole.headline.structures)
-    rows: list[tuple[Entry, ...]] = []
-    for name, fit in whole.fits.items():
-        its = status.get(name, "")
-        damping = _damping_cells(
-            fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
-        )
-        rows.append(
-            (
-                name,
-                its,
-                *(map(_left_out, damping) if its == "excluded" else damping),
-                *([delta_bic[name]] if delta_bic else []),
-                whole.analysis.fit_percent(fit),
-                fit.cost / fit.degrees_of_freedom,
-                fit.free_parameters,
-                fit.cost,
-                fit.cost - lowest,
-                fit.degrees_of_freedom,
-                " ".join(sorted(unreported(fit.structure, withheld))),
-            )
-        )
-    return Table.of(
-        "structures",
-        "All structures on the whole record",
-        (
-            Column("Type", "type", WORDS),
-            Column("", "status", WORDS),
-            *_damping_columns(),
-            *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
-            Column("Fit (%)", "nrmse_percent", ".2f"),
-            Column("Residual", "cost_per_degree_of_freedom"),
-            Column("Free", "free_parameters"),
-            Column("", "cost"),
-            Column("", "cost_above_lowest"),
-            Column("", "degrees_of_freedom"),
-            Column("", "not_reported", WORDS),
-        ),
-        rows,
-        (
-            *footnotes(withheld),
-            "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
-            "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
-            "over that of the noise, 1 if nothing but noise is left. Free: number of free "
-            "parameters, those of rig and beam included. * rests on the edge of the range "
-            "searched. The marked row is the one reported. What the record excludes "
-            "has numbers in the CSV file only, beside the sums of squares.",
-        ),
-        selected=list(whole.fits).index(whole.headline.name),
-    )
-
-
-def _left_out(cell: Cell) -> Cell:
-    """Keep a number for programs only."""
-    return cell if cell.value is None else replace(cell, text=ABSENT, doubtful=True)
-
-
-def _damping_columns() -> list[Column]:
-    """Value and standard deviation of each parameter of the damping."""
-    return [
-        column
-        for name in _DAMPING
-        for column in (
-            Column(_heading(name), name), Column("std", f"{name}_std", spread=True),
-        )
-    ]  # fmt: skip
-
-
-def _damping_cells(
-    structure: Structure,
-    parameters: Mapping[str, float],
-    std: Mapping[str, float | None] | None,
-    *,
-    withheld: Collection[str] = (),
-    at_bounds: Collection[str] = (),
-) -> list[Cell]:
-    """Fill these columns: what is fixed has no standard deviation, what is absent has a dash."""
-    doubtful = unreported(structure, withheld)
-    shown: list[Cell] = []
-    for name in _DAMPING:
-        if not structure.has(name):
-            shown += [number(None), number(None)]
-            continue
-        its_std = std[name] if std is not None and name in structure.free else None
-        value, spread = estimate((parameters[name], its_std), its_std, QUANTITIES[name][3])
-        if name in at_bounds:
-            value = replace(value, text=f"{value.text}*")
-        shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
-    return shown
-
-
-def _heading(name: str) -> str:
-    """Symbol with its power of ten; the units, which depend on the orders, would be too long."""
-    symbol, _meaning, unit, factor = QUANTITIES[name]
-    return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
-
-
-_NAMES: Final = (Column("Type", "type", WORDS), Column("Weights", "weighting", WORDS))
-_INDICES: Final = ("mse", "wmse", "md")
-_INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
-
-
-def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
-    """Parameters and indices of every Welch fit.
-
-    Parameters
-    ----------
-    analysis : WelchAnalysis
-    withheld : collection of str
-        Orders that the whole record does not support: they are marked.
-    """
-    fits = [model.fit for model in analysis.models]
-    return Table.of(
-        "welch_fits",
-        "Fits to Welch's estimate, as in the paper",
-        (
-            *_NAMES,
-            *_damping_columns(),
-            Column("Fit (%)", "nrmse_percent", ".2f"),
-            *(Column(name.upper(), name) for name in _INDICES),
-        ),
-        (
-            (
-                *_names(model),
-                *_damping_cells(
-                    fit.structure, fit.parameters, fit.std, withheld=withheld,
-                    at_bounds=fit.at_bounds,
-                ),
-                response_fit_percent(analysis, model),
-                *(getattr(model.indices, name) for name in _INDICES),
-            )
-            for fit, model in zip(fits, analysis.models, strict=True)
-        ),
-        (
-            *footnotes(withheld),
-            f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
-            "deviation, from the scatter of the response about the model. The bias of Welch's "
-            "estimate on a chirp, which the window smears at the resonances, is not in it and is "
-            "often larger: whole-record fits do not have it.",
-            *([_ON_THE_EDGE] if any(fit.at_bounds for fit in fits) else []),
-        ),
-        grouped=True,
-    )  # fmt: skip
-
-
-def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
-    """Mean and standard deviation over the files of each fit's parameters and indices."""
-    rows: list[tuple[Entry, ...]] = []
-    for models in zip(*(analysis.models for analysis in analyses), strict=True):
-        fits = [model.fit for model in models]
-        parameters, indices = (
-            {key: [values[key] for values in of_files] for key in keys}
-            for keys, of_files in (
-                (_DAMPING, [fit.parameters for fit in fits]),
-                (_INDICES, [asdict(model.indices) for model in models]),
-            )
-        )
-        rows.append(
-            (
-                *_names(models[0]),
-                *_damping_cells(
-                    fits[0].structure,
-                    {name: fmean(values) for name, values in parameters.items()},
-                    {name: _stdev(values) for name, values in parameters.items()},
-                ),
-                *(
-                    cell
-                    for values in indices.values()
-                    for cell in estimate((fmean(values), _stdev(values)), _stdev(values))
-                ),
-            )
-        )
-    return Table.of(
-        "welch_summary",
-        f"Mean ± standard deviation over {len(analyses)} files",
-        (
-            *_NAMES,
-            *_damping_columns(),
-            *(
-                column
-                for name in _INDICES
-                for column in (
-                    Column(name.upper(), name), Column("std", f"{name}_std", spread=True),
-                )
-            ),
-        ),
-        rows,
-        (_INDEX_UNITS,),
-        grouped=True,
-    )  # fmt: skip
-
-
-def _stdev(values: list[float]) -> float:
-    return stdev(values) if len(values) > 1 else math.nan
-
-
-def _names(model: FittedModel) -> tuple[str, str]:
-    return model.fit.structure.name, model.fit.weighting
-
-
-def peaks_table(analysis: WelchAnalysis) -> Table:
-    """Measured resonant peaks, and by how much those of each model lie off them."""
-    modes = range(1, len(analysis.peaks) + 1)
-    measured = (
-        *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
-        *(p.magnitude_db if p else None for p in analysis.peaks),
-    )
-    return Table.of(
-        "welch_peaks",
-        "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
-        (
-            *_NAMES,
-            *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s", ".3f") for n in modes),
-            *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in modes),
-        ),
-        (
-            ("measured", "", *measured),
-            *(
-                (
-                    *_names(model),
-                    *(d.frequency_rad_s if d else None for d in model.deviations),
-                    *(d.magnitude_db if d else None for d in model.deviations),
-                )
-                for model in analysis.models
-            ),
-        ),
-        ("First row: the peaks; below: absolute deviations, as in the paper's Table 4.",),
-        selected=0,
-        grouped=True,
-    )
-
-
-_LEFT: Final = "‡"
-
-
-def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
-    """Frequencies and damping ratios of the modes from each model's poles; None without any.
-
-    What is not the antenna's is marked, or left out.
-    """
-    models = analysis.models
-    modes = max((len(model.modes) for model in models), default=0)
-    if not modes:
-        return None
-
-    def cells(model: FittedModel, name: str, form: str, factor: float = 1.0) -> list[Cell]:
-        made = []
-        for mode, followed in zip(model.modes, model.followed, strict=True):
-            cell = number(getattr(mode, name) if mode.damping_ratio < 1 else None, form, factor)
-            if cell.value is not None and not followed:
-                cell = greyed(replace(cell, text=cell.text + _LEFT))
-            made.append(cell)
-        return made or [number(None)] * modes
-
-    shown = [each for model in models for each in zip(model.modes, model.followed, strict=True)]
-    vibrates = [mode.damping_ratio < 1 for mode, _ in shown]
-    notes = ["From the poles of the fitted model; ξ is the damping ratio."]
-    if any(not followed and mode.damping_ratio < 1 for mode, followed in shown):
-        notes.append(
-            f"{_LEFT} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the fit does "
-            "not follow this resonance. The number only describes the fitted curve."
-        )
-    if not all(vibrates) or not all(model.modes for model in models):
-        notes.append(f"{ABSENT} overdamped in this fit.")
-    return Table.of(
-        "welch_modes",
-        "Modes of the fits to Welch's estimate",
-        (
-            *_NAMES,
-            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, modes + 1)),
-            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, modes + 1)),
-        ),
-        (
-            (
-                *_names(model),
-                *cells(model, "frequency_hz", ".4f"),
-                *cells(model, "damping_ratio", ".4g", 100.0),
-            )
-            for model in models
-        ),
-        notes,
-        grouped=True,
-    )
 
 
 def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:

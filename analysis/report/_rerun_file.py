@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.report._bands import response_band
 from analysis.report._folder import OutputError, OutputExistsError
+from analysis.report._shown_model import ShownModel
 from analysis.report._text import analysis_tables, as_text, damping_sentences, record_tables
 from rigd.session import read_session, read_timings
 from rigd.view import (
@@ -374,24 +374,24 @@ _OVER_TIME: Final = (
 def record_page(whole: WholeRecord) -> Page:
     """Return response and residual of the fit that the numbers are of.
 
-    Measured is the ratio of the whole record's transforms, without the delay that was found.
+    Measured is the ratio of the whole record's transforms, without the model's delay.
     """
     from analysis.report._record_figures import measured_response
 
-    found = measured_response(whole)
+    found, shown = measured_response(whole), ShownModel.of(whole.headline, whole.record)
     grid_hz = found.frequency_hz
-    turned = np.exp(2j * np.pi * whole.fit.parameters["delay_s"] * grid_hz)
-    measured, model = found.response * turned, response_band(whole.fit, grid_hz).response
+    turned = np.exp(2j * np.pi * shown.delay_s * grid_hz)
+    measured, model = found.response * turned, shown.band(grid_hz).response
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
     magnitude = _axis_of(measured, [model])
-    key, name = Key(f"model, type {whole.headline.name}", ORANGE, 2.0), "model"
+    key, name = Key(shown.name.removeprefix("the "), ORANGE, 2.0), "model"
     short = replace(key, label="model")
     entity = f"{RECORD}/response"
     return Page(
         "Response",
         (
             Graph(
-                f"Magnitude of torque over angle, whole record, type {whole.headline.name}",
+                f"Magnitude of torque over angle, whole record, {shown.name.removeprefix('the ')}",
                 response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, key),
                 (
                     Curve("measured", MEASURED_KEY, magnitude_db(measured)),
@@ -535,7 +535,9 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     if whole is not None:
         from analysis.report._signal_figures import torque_in_band
 
-        torque = torque_in_band(whole.record, whole.fit.plant, whole.band_hz[1])
+        torque = torque_in_band(
+            whole.record, ShownModel.of(whole.headline, whole.record).transfer, whole.band_hz[1]
+        )
         tabs.append(record_tab(whole, torque))
     if welch is not None:
         tabs.append(tab(welch))

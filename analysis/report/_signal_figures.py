@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant, RecordFit
+    from analysis.identify import ModalModel, Plant
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
+    from analysis.report._shown_model import ShownModel
 
     Look = dict[str, Any]
     Line = tuple[NDArray[np.float64], Look]
@@ -111,8 +112,8 @@ class TorqueInBand:
         return self.measured - self.modelled
 
 
-def torque_in_band(record: Record, plant: Plant, highest_hz: float) -> TorqueInBand:
-    """Measured torque, and that of a plant for the measured angle, up to `highest_hz`.
+def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float) -> TorqueInBand:
+    """Measured torque, and that of a model for the measured angle, up to `highest_hz`.
 
     Beyond it the measured torque is noise and the modelled one the encoder's quantisation.
     """
@@ -129,20 +130,20 @@ def torque_in_band(record: Record, plant: Plant, highest_hz: float) -> TorqueInB
     )
 
 
-def signals_figure(record: Record, fit: RecordFit, highest_hz: float) -> Figure:
+def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figure:
     """Draw angle, torque (measured and modelled) and residual, with a detail of every mode.
 
     Parameters
     ----------
     record : Record
-    fit : RecordFit
+    model : ShownModel
         With the modes that are enlarged.
     highest_hz : float
         End of the band that was compared.
     """
-    torque = torque_in_band(record, fit.plant, highest_hz)
-    found = replace(record, beam=fit.plant.beam)
-    modes = {mode.number: mode for mode in fit.modes}
+    torque = torque_in_band(record, model.transfer, highest_hz)
+    found = replace(record, beam=model.beam.plant.beam)
+    modes = {mode.number: mode for mode in model.modes}
     moments = tuple(
         replace(moment, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
         for number, moment in enumerate(resonance_moments(found, max(modes, default=0)), start=1)

@@ -10,7 +10,7 @@ import io
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import COEFFICIENT_OF
@@ -183,7 +183,10 @@ def with_validity(table: Table, validity: Validity) -> Table:
 
     People read it under the table; programs have it in each row.
     """
-    stated = asdict(validity)
+    stated = {
+        "predicted_peak_tip_slope_rad": validity.predicted_peak_tip_slope_rad,
+        "linear_model_error": validity.linear_model_error,
+    }
     rows = tuple({**row, **stated} for row in table.rows)
     return replace(table, rows=rows, notes=(*table.notes, validity.sentence))
 

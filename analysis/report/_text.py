@@ -10,7 +10,8 @@ from rich.console import Console, Group
 from rich.padding import Padding
 from rich.text import Text
 
-from analysis.identify import MISREAD
+from analysis.identify import EXACT_CONDITION, MISREAD
+from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report._table import MARK, estimate, terminal_table
 from analysis.suited import LEFT_OUT
@@ -55,7 +56,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     elif welch is not None:
         if whole is None:
             shown.append(Text(result.validity.sentence))
-            shown += spaced((tables.welch_fits_table(welch),))
+            shown += spaced((fit_tables.welch_fits_table(welch),))
         shown += _warnings(result.warnings)
     else:
         # Why Welch's fits are left out was told when they were.
@@ -68,32 +69,26 @@ _OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2")
 
 
 def _main_results(whole: WholeRecord) -> RenderableType:
-    """Return the verdict, the modes and the parameters, without captions to save lines."""
+    """Return the verdict, the modes, and the parameters under their condition."""
     parameters = tables.parameters_table(whole)
-    rows = [
-        row
-        for name, row in zip(whole.headline.parameters, parameters.rows, strict=True)
-        if name not in _OF_RIG
-    ]
+    names = tables.parameter_names(whole.headline)
+    rows = [row for name, row in zip(names, parameters.rows, strict=True) if name not in _OF_RIG]
     # Room for one column of words.
     spare = "meaning" if any(row["remark"] for row in rows) else "remark"
     columns = tuple(each for each in parameters.columns if each.key != spare)
+    brief = replace(parameters, columns=columns, rows=tuple(rows))
+    modes = tables.modes_table(whole)
     return Group(
         *map(Text, whole.verdict.sentences),
         "",
-        *spaced(
-            map(
-                _bare,
-                (tables.modes_table(whole), replace(parameters, columns=columns, rows=tuple(rows))),
-            )
-        ),
+        *spaced((_bare(modes), _bare(brief, caption=parameters.caption))),
     )
 
 
-def _bare(table: Table) -> Table:
+def _bare(table: Table, caption: str = "") -> Table:
     """Leave of what stands around a table the reasons for marked numbers."""
     notes = tuple(note for note in table.notes if note.startswith(MARK))
-    return replace(table, caption="", notes=notes)
+    return replace(table, caption=caption, notes=notes)
 
 
 def _warnings(sentences: Iterable[str]) -> list[Text]:
@@ -114,15 +109,15 @@ def analysis_tables(result: RecordResult) -> RenderableType:
     """
     welch = result.welch
     assert welch is not None
-    modes = tables.welch_modes_table(welch)
+    modes = fit_tables.welch_modes_table(welch)
     return Group(
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         Text(result.validity.sentence),
         "",
         *spaced(
             (
-                tables.welch_fits_table(welch, result.unsupported),
-                tables.peaks_table(welch),
+                fit_tables.welch_fits_table(welch, result.unsupported),
+                fit_tables.peaks_table(welch),
                 *(() if modes is None else (modes,)),
             )
         ),
@@ -133,7 +128,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
     """Return the Welch fits of several files in one table: those that were made."""
     found = [each.welch for each in results if each.welch is not None]
-    table = tables.summary_table(found)
+    table = fit_tables.summary_table(found)
     notes = [f"{each.name}: {each.validity.sentence}" for each in results if each.welch is not None]
     return terminal_table(replace(table, notes=(*table.notes, *notes)))
 
@@ -160,8 +155,15 @@ def record_tables(whole: WholeRecord) -> RenderableType:
         *spaced(
             (
                 *(
-                    make(whole)
-                    for make in (tables.modes_table, tables.sizes_table, tables.parameters_table)
+                    table
+                    for make in (
+                        tables.modes_table,
+                        tables.exact_modes_table,
+                        tables.sizes_table,
+                        tables.parameters_table,
+                        tables.exact_geometry_table,
+                    )
+                    if (table := make(whole)) is not None
                 ),
                 *tables.amplitude_tables(whole),
             )
@@ -257,9 +259,14 @@ def _flagged(told: Headline, each: Size) -> bool:
 def _order(told: Headline, each: Size) -> str:
     *_others, name, symbol = _SYMBOLS[each.damping]
     order = told.parameters[name]
-    if name not in told.fit.structure.free:
+    if told.tolerant is None and name not in told.fit.structure.free:
         return f", of the fixed order {symbol}\u00a0=\u00a0{order.value:g}"
     if order.interval_95 is None or order.flag is not None:
         return f"; its order {symbol} is not known"
+    if told.tolerant is not None:
+        return ""  # the verdict has the slope of the loss, with its condition
     value, low, high = estimate((order.value, *order.interval_95), order.std)
-    return f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
+    condition = f", {EXACT_CONDITION}" if told.modal is not None else ""
+    return (
+        f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"
+    )

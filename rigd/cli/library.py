@@ -157,7 +157,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
         return
     heads = (
         *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
-        *("tip slope", "report"),
+        *("tip slope", "uniform beam", "report"),
     )
     yield from _table(
         heads,
@@ -171,6 +171,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
                 ),
                 ", ".join(map(_mode, row.modes)),
                 _validity(row),
+                _uniform_beam(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
@@ -191,6 +192,13 @@ def _validity(row: "SessionRow") -> str:
     from rigd.session import Validity
 
     return Validity.of_document(row.validity).short if row.modes else ""
+
+
+def _uniform_beam(row: "SessionRow") -> str:
+    from rigd.session import Validity
+
+    found = Validity.of_document(row.validity).uniform_beam
+    return "" if found is None or not row.modes else found.short
 
 
 # Trend

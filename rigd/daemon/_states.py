@@ -292,6 +292,9 @@ _OF_A_FIT = (
 )
 """Members of a fit that clients are told; those for computing, such as its covariance, are long."""
 _MOST_ITEMS, _LONGEST_TEXT = 16, 400
+_LONG = frozenset({"pieces", "constants"})
+"""Members within them that are left out: pieces of a search (the file has them), and the modal
+constants of the test of uniformity."""
 
 
 def fit_document(fit: Mapping[str, Any]) -> Document:
@@ -310,8 +313,7 @@ def _bounded(value: Any) -> Any:  # noqa: ANN401 - what JSON has
     if isinstance(value, str):
         return value[:_LONGEST_TEXT]
     if isinstance(value, Mapping):
-        # The pieces of a search are as many as it takes; the file has them.
-        return {key: _bounded(member) for key, member in value.items() if key != "pieces"}
+        return {key: _bounded(member) for key, member in value.items() if key not in _LONG}
     if isinstance(value, list | tuple):
         return [_bounded(item) for item in value[:_MOST_ITEMS]]
     return value

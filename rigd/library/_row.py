@@ -73,7 +73,8 @@ class SessionRow:
     """Samples that were taken and not recorded."""
     modes: tuple[Mode, ...] = ()
     """Modes of the last report, or without one of the quick look: objects ``frequency_hz`` and
-    ``damping_ratio``, each with ``value``, ``std``, ``interval_95`` and ``flag``."""
+    ``damping_ratio`` and ``participation`` (or None), each with ``value``, ``std``, ``interval_95``
+    and ``flag``, and ``source``."""
     validity: Document | None = None
     """How exact the linear model is for them, as `rigd.session.Validity.as_json` has it; None
     without modes."""
@@ -225,7 +226,7 @@ def _list(document: object, key: str) -> list[object]:
 def usable_modes(modes: object) -> tuple[Mode, ...]:
     """Return the modes of a list that the record shows, if their numbers are finite."""
     return tuple(
-        {name: mode[name] for name in ("frequency_hz", "damping_ratio")}
+        {name: mode[name] for name in ("frequency_hz", "damping_ratio", "participation", "source")}
         for mode in modes_of(modes)
         if mode["shown"]
     )

@@ -70,6 +70,7 @@ from ._user_metadata import MetadataError as MetadataError
 from ._user_metadata import added_metadata as added_metadata
 from ._user_metadata import check_name as check_name
 from ._user_metadata import metadata_keys as metadata_keys
+from ._validity import BeamUniformity as BeamUniformity
 from ._validity import Validity as Validity
 from ._writer import PART_SUFFIX as PART_SUFFIX
 from ._writer import SessionWriter as SessionWriter

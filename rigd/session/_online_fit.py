@@ -34,6 +34,7 @@ _VERSION: Final = 1
 _HEAD: Final = struct.Struct("<cI")
 _SAMPLES: Final = b"S"
 _REQUEST: Final = b"R"
+_KG_MM2: Final = 1e6
 _LONGEST_LINE: Final = 1 << 20
 _LONGEST_FRAME: Final = 1 << 26
 
@@ -197,10 +198,15 @@ def mode_line(mode: Mapping[str, Any]) -> str:
     mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
     """
     hz, damping = mode["frequency_hz"], mode["damping_ratio"]
-    return (
+    text = (
         f"mode {mode['mode']}: {with_half_width(hz['value'], hz['interval_95'])} Hz, "
         f"damping {with_half_width(damping['value'], damping['interval_95'], 100.0)} %"
     )
+    inertia = mode.get("participation")
+    if inertia is None:
+        return text
+    shown = with_half_width(inertia["value"], inertia["interval_95"], _KG_MM2)
+    return f"{text}, inertia {shown} kg·mm²"
 
 
 def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> list[str]:
@@ -228,6 +234,8 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     unseen = unseen_modes(answer["modes"])
     if unseen:
         lines.append(f"  not visible so far: {unseen}")
+    if uniform_beam := Validity.of_document(answer.get("validity")).uniform_beam:
+        lines.append(f"  {uniform_beam.sentence}")
     return [*lines, *found]
 
 

@@ -34,6 +34,7 @@ _TEXTS: Final = ("file", "session_id", "specimen", "excitation")
 _TIMES: Final = ("start_utc_ns", "made_utc_ns")
 _LINES: Final = ("flags", "text")
 _UNREADABLE: Final = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError)
+_SOURCES: Final = ("modal", "beam")
 _CURVES: Final = ("frequency_hz", "magnitude", "phase_rad")
 _BAND: Final = ("magnitude_low_95", "magnitude_high_95")
 
@@ -159,9 +160,10 @@ def modes_of(documents: object) -> list[Document]:
     Returns
     -------
     list of dict
-        ``mode`` (its number), ``shown`` (whether the record shows it), and ``frequency_hz`` and
-        ``damping_ratio``, each with ``value``, ``std``, ``interval_95`` and ``flag``; modes
-        without finite numbers or a positive frequency are left out.
+        ``mode`` (its number), ``shown`` (whether the record shows it), ``source`` ("modal", "beam"
+        or None), and ``frequency_hz``, ``damping_ratio`` and ``participation`` (kg m², or None),
+        each with ``value``, ``std``, ``interval_95`` and ``flag``; modes without finite numbers or
+        a positive frequency are left out.
     """
     return list(_modes(documents)) if isinstance(documents, list) else []
 
@@ -177,8 +179,15 @@ def _modes(documents: list[object]) -> Iterator[Document]:
                 and frequency["value"] > 0
                 and damping is not None
             ):
-                known = {"frequency_hz": frequency, "damping_ratio": damping}
-                yield {"mode": number, "shown": shown, **known}
+                source = mode.get("source")
+                yield {
+                    "mode": number,
+                    "shown": shown,
+                    "frequency_hz": frequency,
+                    "damping_ratio": damping,
+                    "participation": _quantity(mode.get("participation")),
+                    "source": source if source in _SOURCES else None,
+                }
 
 
 def fit_of(outcome: Mapping[str, str] | None) -> Document | None:

@@ -169,7 +169,10 @@ def fit_table(fit: Fit | None) -> str:
     if unseen:
         parts.append(f"Not visible so far: {unseen}.")
     if modes:
-        parts.append(Validity.of_document(fit.get("validity")).sentence)
+        validity = Validity.of_document(fit.get("validity"))
+        parts.append(validity.sentence)
+        if validity.uniform_beam is not None:
+            parts.append(validity.uniform_beam.sentence)
     rows = [_parameter_row(*each) for each in fit.get("parameters", {}).items()]
     if rows:
         parts.append(_markdown("parameter", "value", rows=[row for row in rows if row]))

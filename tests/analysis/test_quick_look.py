@@ -222,9 +222,10 @@ def test_the_text_is_for_a_terminal(chirps):
     head, *modes = look["text"]
     assert head == f"Quick look at {paths[1].stem}; ± 95 %, statistical only:"
     assert modes[0].startswith("  mode 1: 2.5")
-    assert modes[2].endswith(" %")
+    assert modes[2].endswith(" kg·mm²")
     assert modes[3].startswith("  Tip slopes up to 0.")
-    assert modes[4].startswith("  mean coherence 0.")
+    assert modes[4].startswith("  A uniform beam predicts the modes (p = 0.")
+    assert modes[5].startswith("  mean coherence 0.")
     assert look["text"][-1] == f"  {look['against_last']['sentence']}"
 
 

@@ -31,7 +31,11 @@ def sessions(record_briefly, write_look, write_report):
         second,
         mode(2.570, 0.002, 0.00905, 0.00008),
         mode(16.3),
-        validity={"predicted_peak_tip_slope_rad": 0.6, "linear_model_error": 0.12},
+        validity={
+            "predicted_peak_tip_slope_rad": 0.6,
+            "linear_model_error": 0.12,
+            "uniform_beam": {"status": "refused", "p_value": 2e-18},
+        },
     )
     record_briefly("third", specimen="antenna 4", day=2)
     second.with_name("text.mcap").write_text("no session")
@@ -45,7 +49,7 @@ def test_the_newest_come_first_with_their_modes_and_problems(listed):
     ]  # fmt: skip
     assert [cell.strip() for cell in told[2].split("  ") if cell.strip()][1:] == [
         "second.mcap", "antenna 3", "chirp", "stopped", "2.57 Hz 0.905 %, 16.3 Hz 0.5 %",
-        "0.6 rad, error ≤ 12 %", "report",
+        "0.6 rad, error ≤ 12 %", "no (p = 2e-18)", "report",
     ]  # fmt: skip
     assert "unknown" in told[3]  # of the look at the first session, which states no slope
     assert "unknown" not in told[1] + told[2]

@@ -61,7 +61,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
     lines = result.stdout.splitlines()
-    assert len(lines) <= 26
+    assert len(lines) <= 30
     (of_record,) = content["records"]
     assert lines[0] in of_record["verdict"][0]
     modes = [line.split() for line in lines if line[:4].strip().isdigit()]

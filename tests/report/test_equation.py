@@ -22,7 +22,7 @@ def told(record_result):
             structure=STRUCTURES[name],
             parameters={**whole.fit.parameters, **extras},
         )
-        headline = SimpleNamespace(parameters=fit.parameters)
+        headline = SimpleNamespace(parameters=fit.parameters, modal=None, tolerant=None)
         return SimpleNamespace(fit=fit, headline=headline, record=whole.record)
 
     return made

@@ -13,7 +13,8 @@ from analysis.report._document import (
     record_entries,
     response_fit_percent,
 )
-from analysis.report._record_tables import modes_table, parameters_table, structures_table
+from analysis.report._fit_tables import structures_table
+from analysis.report._record_tables import modes_table, parameters_table
 from analysis.report._scales import scale_notes
 from analysis.report._signal_figures import torque_in_band
 

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from library_folders import mode, quantity
 from online_fits import online_fit
 
-from rigd.session import Validity, fit_of, last_look, look_path, modes_of, read_look
+from rigd.session import (
+    BeamUniformity,
+    Validity,
+    fit_of,
+    last_look,
+    look_path,
+    modes_of,
+    read_look,
+)
 from rigd.view._fits import fit_table
 
 RESPONSE = {
@@ -27,6 +35,9 @@ MODEL = {
 }
 
 
+OF_MODAL_MODEL = {"participation": quantity(1.4e-3, 2e-6), "source": "modal"}
+
+
 def write(folder, name, **members) -> Path:
     path = look_path(folder / f"{name}.mcap")
     path.write_text(json.dumps({"version": 1} | members))
@@ -37,10 +48,10 @@ def test_what_is_written_is_read(tmp_path):
     written = {
         "version": 1, "file": "a.mcap", "session_id": "a", "specimen": "antenna 3",
         "excitation": "chirp", "start_utc_ns": 5, "made_utc_ns": 6, "took_s": 2.5,
-        "modes": [{"mode": 2, "shown": False, **mode(2.5)}],
+        "modes": [{"mode": 2, "shown": False, **mode(2.5), **OF_MODAL_MODEL}],
         "coherence": {"mean": None, "low_bands": []}, "flags": ["clipped"], "against_last": None,
         "response": RESPONSE, "model": MODEL, "text": ["Quick look"],
-        "validity": Validity(0.6, 0.12).as_json(),
+        "validity": Validity(0.6, 0.12, BeamUniformity("refused", 2e-18)).as_json(),
     }  # fmt: skip
     assert read_look(write(tmp_path, "a", **written)) == written
 
@@ -55,6 +66,34 @@ def test_a_validity_that_is_none_is_unknown_and_not_good(tmp_path, stated):
     look = read_look(write(tmp_path, "a", modes=[mode(2.5)], validity=stated))
     assert look["validity"] == Validity().as_json()
     assert "unknown" in look["validity"]["sentence"]
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [None, 7, {}, {"status": "perhaps", "p_value": 0.5}, {"status": "passed"},
+     {"status": "refused", "p_value": -1.0}, {"status": "passed", "p_value": "0.5"}],
+)  # fmt: skip
+def test_a_test_of_uniformity_that_is_none_is_unknown(tmp_path, stated):
+    look = read_look(write(tmp_path, "a", modes=[mode(2.5)], validity={"uniform_beam": stated}))
+    assert look["validity"]["uniform_beam"] is None
+
+
+@pytest.mark.parametrize(
+    ("found", "sentence", "short"),
+    [
+        (BeamUniformity("passed", 0.4), "A uniform beam predicts the modes (p = 0.4).",
+         "yes (p = 0.4)"),
+        (BeamUniformity("refused", 2e-18), "A uniform beam does not predict the modes (p = 2e-18): "
+         "orders that assume one are not properties of the material.", "no (p = 2e-18)"),
+        (BeamUniformity("refused", 0.0), "A uniform beam does not predict the modes (p < 1e-300): "
+         "orders that assume one are not properties of the material.", "no (p < 1e-300)"),
+        (BeamUniformity("not tested"), "Whether a uniform beam predicts the modes was not tested: "
+         "too few modes show.", "not tested"),
+    ],
+)  # fmt: skip
+def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
+    assert (found.sentence, found.short) == (sentence, short)
+    assert BeamUniformity.of_document(found.as_json()) == found
 
 
 def test_what_is_missing_is_empty(tmp_path):
@@ -87,7 +126,7 @@ def test_a_file_that_is_none_is_not_read(tmp_path, content):
      [mode(2.5) | {"damping_ratio": {"value": 10**400}}]],
 )  # fmt: skip
 def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
-    whole = mode(16.0) | {"mode": 2, "shown": True}
+    whole = mode(16.0) | {"mode": 2, "shown": True} | OF_MODAL_MODEL
     given = [*modes, whole] if isinstance(modes, list) else modes
     found = read_look(write(tmp_path, "a", modes=given))["modes"]
     assert found == ([whole] if isinstance(modes, list) else [])

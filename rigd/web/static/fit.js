@@ -25,8 +25,9 @@ export class Fit {
     setText(byId("fit-search"), searchInWords(fit?.search));
     byId("fit-result").replaceChildren(
       this.#targets(fit?.search?.targets ?? []), this.#modes(fit?.modes ?? []),
-      ...[fit?.modes?.length ? fit.validity?.sentence : "", fit?.problem,
-        ...(fit?.findings ?? [])].filter(Boolean).map((text) =>
+      ...[fit?.modes?.length ? fit.validity?.sentence : "",
+        fit?.modes?.length ? fit.validity?.uniform_beam?.sentence : "", fit?.problem,
+        ...doubts(fit?.modes ?? []), ...(fit?.findings ?? [])].filter(Boolean).map((text) =>
         make("p", { class: "muted" }, text)));
   }
 
@@ -75,6 +76,13 @@ function table(id, heads, rows) {
     make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col" }, text)))),
     make("tbody", {}, ...rows.map((cells) =>
       make("tr", {}, ...cells.map((cell) => make("td", {}, cell))))));
+}
+
+/** Why numbers of modes are doubtful, each reason once. */
+function doubts(modes) {
+  const flags = modes.filter((mode) => mode.shown !== false)
+    .flatMap((mode) => [mode.frequency_hz.flag, mode.damping_ratio.flag]).filter(Boolean);
+  return [...new Set(flags)].map((flag) => `Doubtful: ${flag}.`);
 }
 
 /** A standard deviation as it is and in per cent of its value. */

@@ -6,30 +6,42 @@ import { estimate, level } from "./format.js";
 /** What is said of numbers from a daemon or a look of before an update. */
 const NOT_KNOWN = "The slope of the tip, and with it the error of the linear model, is unknown.";
 
+const KG_MM2 = 1e6;
+
+/** Models that modes are of, in words. */
+const SOURCES = { modal: "modal model", beam: "beam" };
+
+/** What is said of the validity: slope of the tip, and whether a uniform beam predicts the modes. */
+const sentences = (validity) =>
+  [validity?.sentence ?? NOT_KNOWN, validity?.uniform_beam?.sentence].filter(Boolean);
+
+const flagsOf = ({ frequency_hz: frequency, damping_ratio: damping }) =>
+  [...new Set([frequency?.flag, damping?.flag].filter(Boolean))].join(" ");
+
 /** Modes in short, as a cell of the table of sessions has them. */
 export function modesInShort(modes, validity) {
-  const parts = modes.slice(0, 3).map(({ frequency_hz: frequency, damping_ratio: damping }) => {
-    const flagged = frequency?.flag || damping?.flag;
-    return make("span", { class: "line", title: [frequency?.flag, damping?.flag]
-      .filter(Boolean).join(" ") },
-    `${estimate(frequency, 1, 1).value} Hz, ${estimate(damping, 100, 1).value} %${flagged ? " (flagged)" : ""}`);
+  const shown = modes.slice(0, 3);
+  const parts = shown.map((mode) => {
+    const { frequency_hz: frequency, damping_ratio: damping } = mode;
+    return make("span", { class: "line" }, `${estimate(frequency, 1, 1).value} Hz, `
+      + `${estimate(damping, 100, 1).value} %${flagsOf(mode) ? " (flagged)" : ""}`);
   });
-  if (modes.length) {
-    parts.push(make("div", { class: "muted" }, validity?.sentence ?? NOT_KNOWN));
-  }
-  return parts;
+  const reasons = [...new Set(shown.map(flagsOf).filter(Boolean))].map((flag) => `flagged: ${flag}`);
+  const said = modes.length ? [...reasons, ...sentences(validity)] : [];
+  return [...parts, ...said.map((text) => make("div", { class: "muted" }, text))];
 }
 
 function modeTable(modes) {
-  const heads = ["Mode", "Frequency (Hz)", "95 % interval", "Damping ratio (%)", "95 % interval", ""];
+  const heads = ["Mode", "Frequency (Hz)", "95 % interval", "Damping ratio (%)", "95 % interval",
+    "Inertia (kg·mm²)", "Source", ""];
   return make("table", {},
     make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col" }, text)))),
-    make("tbody", {}, ...modes.map(({ frequency_hz: frequency, damping_ratio: damping }, k) => {
-      const hertz = estimate(frequency);
-      const percent = estimate(damping, 100);
-      const flags = [frequency?.flag, damping?.flag].filter(Boolean).join(" ");
-      return make("tr", {}, ...[k + 1, hertz.value, hertz.interval, percent.value, percent.interval,
-        flags].map((text) => make("td", {}, String(text))));
+    make("tbody", {}, ...modes.map((mode, k) => {
+      const hertz = estimate(mode.frequency_hz);
+      const percent = estimate(mode.damping_ratio, 100);
+      return make("tr", {}, ...[mode.mode ?? k + 1, hertz.value, hertz.interval, percent.value,
+        percent.interval, estimate(mode.participation, KG_MM2).value, SOURCES[mode.source] ?? "",
+        flagsOf(mode)].map((text) => make("td", {}, String(text))));
     })));
 }
 
@@ -38,7 +50,8 @@ export function lookElements(look) {
   if (!look) return [make("p", { class: "muted" }, "No quick look at this session.")];
   const parts = [];
   if (look.modes?.length) {
-    parts.push(modeTable(look.modes), make("p", {}, look.validity?.sentence ?? NOT_KNOWN));
+    parts.push(modeTable(look.modes), ...sentences(look.validity).map((text) =>
+      make("p", {}, text)));
   } else parts.push(make("p", {}, "No mode was identified."));
   if (Number.isFinite(look.coherence?.mean)) {
     const bands = (look.coherence.low_bands ?? []).map(([from, to]) =>

@@ -1,0 +1,126 @@
+"""Model of a record that is shown first: the modal model, or the beam where no mode shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from analysis.identify import ModeEstimate, RecordAnalysis
+from analysis.report._bands import modal_response_band, response_band
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from analysis.identify import Headline, ModalFit, ModalModel, Plant, RecordFit
+    from analysis.record import Record
+    from analysis.report._bands import ResponseBand
+
+    Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ShownModel:
+    """Model of a record that figures and curves show.
+
+    Attributes
+    ----------
+    name : str
+        As captions call it.
+    modal : ModalFit or None
+    beam : RecordFit
+        Shown where there is no modal model.
+    modes : tuple of ModeEstimate
+        Those that the record shows.
+    stated_delay_s : float
+        Delay of the torque against the angle, by the file.
+    """
+
+    name: str
+    modal: ModalFit | None
+    beam: RecordFit
+    modes: tuple[ModeEstimate, ...]
+    stated_delay_s: float
+
+    @classmethod
+    def of(cls, told: Headline, record: Record) -> ShownModel:
+        """Choose it for a record.
+
+        Parameters
+        ----------
+        told : Headline
+            Headline of the record.
+        record : Record
+        """
+        return cls(
+            name=f"the model (type {told.name})" if told.modal is None else "the modal model",
+            modal=told.modal,
+            beam=told.fit,
+            modes=shown_modes(told),
+            stated_delay_s=record.torque_delay_s - record.angle_delay_s,
+        )
+
+    @property
+    def transfer(self) -> Plant | ModalModel:
+        """Transfer function from angle to torque, as a prediction takes it."""
+        return self.beam.plant if self.modal is None else self.modal.model
+
+    @property
+    def residual(self) -> NDArray[np.complex128]:
+        """Whitened residual, shape (K,)."""
+        return self.beam.residual if self.modal is None else self.modal.residual
+
+    @property
+    def delay_s(self) -> float:
+        """Delay that is taken out of its response: of a beam the fitted one."""
+        return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
+
+    def band(self, frequency_hz: Real) -> ResponseBand:
+        """Return its response without the delay, with the band.
+
+        Parameters
+        ----------
+        frequency_hz : ndarray, shape (n,)
+            Positive.
+        """
+        if self.modal is None:
+            return response_band(self.beam, frequency_hz)
+        return modal_response_band(self.modal, frequency_hz, self.delay_s)
+
+    def compared(self, analysis: RecordAnalysis) -> RecordAnalysis:
+        """Return an analysis with the noise and the bins of the residual.
+
+        Parameters
+        ----------
+        analysis : RecordAnalysis
+            That of the record.
+        """
+        if self.modal is None:
+            return analysis
+        return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
+
+    def fit_percent(self, analysis: RecordAnalysis) -> float:
+        """Fit to the measured torque in the band (NRMSE).
+
+        Parameters
+        ----------
+        analysis : RecordAnalysis
+            That of the record.
+        """
+        fit = self.beam if self.modal is None else self.modal
+        return self.compared(analysis).fit_percent(fit)
+
+
+def shown_modes(told: Headline) -> tuple[ModeEstimate, ...]:
+    """Return the modes of a headline that the record shows, with their deviations."""
+    return tuple(
+        ModeEstimate(
+            number=mode.number,
+            frequency_hz=mode.frequency_hz.value,
+            frequency_std_hz=mode.frequency_hz.std or 0.0,
+            damping_ratio=mode.damping_ratio.value,
+            damping_ratio_std=mode.damping_ratio.std or 0.0,
+        )
+        for mode in told.modes
+        if mode.shown
+    )

@@ -1,0 +1,154 @@
+"""Whether the beam is uniform: modal constants measured against those of a uniform beam."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from analysis.identify import CONSTANTS
+from analysis.report import _style as style
+from analysis.report._table import WORDS, Cell, Column, Table, estimate, number
+from analysis.statistics import NORMAL_95
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from analysis.identify import UniformBeamTest
+    from analysis.report._table import Entry
+
+UNIFORMITY: Final = "uniform_beam"
+"""Name of the figure."""
+
+_TITLES: Final = {
+    "ln_frequency": "Frequency",
+    "ln_damping_ratio": "Damping ratio",
+    "ln_residue": "Residue, magnitude",
+    "residue_phase_rad": "Residue, phase",
+}
+"""Modal constants as people read them; all but the phase are compared by their logarithms."""
+
+_PER_CENT: Final = 100.0
+
+
+def _deviations(test: UniformBeamTest) -> NDArray[np.float64]:
+    """Measured less predicted constants, shape (n, 4)."""
+    away = (test.measured - test.predicted).reshape(-1, len(CONSTANTS))
+    phase = CONSTANTS.index("residue_phase_rad")
+    away[:, phase] -= 2 * np.pi * np.round(away[:, phase] / (2 * np.pi))
+    return away
+
+
+def uniformity_figure(test: UniformBeamTest) -> Figure:
+    """Draw the deviations of the modal constants from those of a uniform beam, by mode.
+
+    Parameters
+    ----------
+    test : UniformBeamTest
+        With degrees of freedom.
+    """
+    away, std = _deviations(test), test.std.reshape(-1, len(CONSTANTS))
+    figure = style.new_figure(9.0, 4.0)
+    grid = figure.add_gridspec(
+        2, len(CONSTANTS), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
+        wspace=0.34,
+    )  # fmt: skip
+    for column, name in enumerate(CONSTANTS):
+        in_std, in_per_cent = (figure.add_subplot(grid[row, column]) for row in range(2))
+        in_std.set_title(_TITLES[name], fontsize=8.5)
+        in_std.axhspan(
+            -NORMAL_95, NORMAL_95, color=style.SHADE, linewidth=0, zorder=0,
+            label="95 % of uniform beams",
+        )  # fmt: skip
+        values = away[:, column] / std[:, column]
+        in_std.plot(test.modes, values, "o", color=style.BLUE, markersize=5.0)
+        _frame(in_std, test.modes, float(np.abs(values).max()), least=3.0)
+        half = NORMAL_95 * _PER_CENT * std[:, column]
+        percent = _PER_CENT * away[:, column]
+        in_per_cent.errorbar(
+            test.modes, percent, half, fmt="o", color=style.INK, markersize=4.0, capsize=3.0,
+            elinewidth=1.0, label="measured, 95 %",
+        )  # fmt: skip
+        _frame(in_per_cent, test.modes, float((np.abs(percent) + half).max()))
+        in_per_cent.set_xlabel("Mode", labelpad=1)
+        in_std.tick_params(labelbottom=False)
+        if column == 0:
+            in_std.set_ylabel("Deviation (std)")
+            in_per_cent.set_ylabel("Deviation (%)")
+    handles = [
+        each for axes in (in_std, in_per_cent) for each in axes.get_legend_handles_labels()[0]
+    ]
+    labels = [
+        each for axes in (in_std, in_per_cent) for each in axes.get_legend_handles_labels()[1]
+    ]
+    figure.align_ylabels()
+    figure.legend(
+        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.995), ncols=2,
+        borderaxespad=0.0,
+    )  # fmt: skip
+    return figure
+
+
+def _frame(axes: Axes, modes: tuple[int, ...], reach: float, *, least: float = 0.0) -> None:
+    """Set limits about zero and a tick at each mode."""
+    axes.axhline(0.0, color="#9A9A9A", linewidth=0.7, zorder=1)
+    limit = max(1.2 * reach, least)
+    axes.set_ylim(-limit, limit)
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.set_xlim(modes[0] - 0.5, modes[-1] + 0.5)
+    axes.set_xticks(modes)
+
+
+def uniformity_description(test: UniformBeamTest) -> str:
+    """Say what the figure shows, and with which result."""
+    return (
+        "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
+        "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
+        "uniform beam are), below in per cent with the 95 % interval (phase: per cent of 1 rad). "
+        f"Chi-square {test.chi_square:.4g} for {test.degrees_of_freedom} degrees of freedom. "
+        f"{test.summary.sentence}"
+    )
+
+
+def uniformity_table(test: UniformBeamTest) -> Table:
+    """Measured and predicted modal constants with their deviations."""
+    rows: list[tuple[Entry, ...]] = []
+    away = _deviations(test).ravel()
+    for place, (measured, std, predicted, off) in enumerate(
+        zip(
+            test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), away.tolist(),
+            strict=True,
+        )
+    ):  # fmt: skip
+        name = CONSTANTS[place % len(CONSTANTS)]
+        words = Cell(name, name.removesuffix("_rad").replace("_", " "))
+        shown = estimate((measured, std, predicted), std)
+        rows.append(
+            (
+                test.modes[place // len(CONSTANTS)], words, *shown,
+                number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
+            )
+        )  # fmt: skip
+    return Table.of(
+        "modal_constants",
+        "Modal constants measured and of a uniform beam",
+        (
+            Column("Mode", "mode"),
+            Column("Constant", "constant", WORDS),
+            Column("Measured", "measured"),
+            Column("std", "std", spread=True),
+            Column("Uniform beam", "uniform_beam"),
+            Column("Deviation (std)", "deviation_std"),
+            Column("Deviation (%)", "deviation"),
+        ),
+        rows,
+        (
+            "ln of the frequency in Hz, of the damping ratio, and of the residue's magnitude in "
+            "N·m/s; phase of the residue over j, in rad.",
+            test.summary.sentence,
+        ),
+        grouped=True,
+    )

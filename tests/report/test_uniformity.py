@@ -1,0 +1,203 @@
+"""Report of a record: modal model first, whether the beam is uniform, conditions of parameters."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from analysis.identify import CONSTANTS, Measurement, ModalModel, select
+from analysis.report import _style as style
+from analysis.report._bands import loss_estimate, modal_response_band
+from analysis.report._document import document
+from analysis.report._equation import definitions, equations, mathml
+from analysis.report._record_figures import FIGURES, illustrations
+from analysis.report._record_report import record_page, report_tables, uniformity_tables
+from analysis.report._shown_model import ShownModel
+from analysis.report._style import Picture
+from analysis.report._text import as_text, record_text, result_text
+from analysis.report._uniformity import uniformity_figure, uniformity_table
+from analysis.results import RecordResult, WholeRecord
+
+pytestmark = pytest.mark.fit
+
+EXACT = "if the beam is uniform to 1e-5"
+TOLERANT = "if each mode lies where that of a uniform beam does, to 0.1 %"
+
+
+@pytest.fixture(scope="module")
+def modal_result(record_result):
+    """Result of a record whose modes are those of the modal model."""
+    record = record_result.record
+    selection = select(Measurement.of_record(record))
+    return RecordResult(record, WholeRecord(record, selection, (0.0, 50.0)))
+
+
+@pytest.fixture(scope="module")
+def unexplained_losses(modal_result, retold):
+    """The same, were its losses those of no beam with two orders."""
+    told = modal_result.whole.headline
+    reason = "no beam explains the losses"
+    test = replace(told.uniform_beam, status="refused", p_value=2e-18)
+    parameters = {name: each.flagged(reason) for name, each in told.parameters.items()}
+    tolerant = replace(told.tolerant, basis="none")
+    return retold(
+        modal_result,
+        headline=replace(told, uniform_beam=test, tolerant=tolerant, parameters=parameters),
+    )
+
+
+def drawn(result):
+    with style.styled():
+        return {each.name: each for each in illustrations(result.whole)}
+
+
+def model_of(constants, background):
+    """Modal model of its real constants."""
+    poles, residues = [], []
+    for ln_hz, ln_ratio, ln_residue, phase in constants.reshape(-1, len(CONSTANTS)):
+        omega, ratio = 2 * np.pi * np.exp(ln_hz), np.exp(ln_ratio)
+        poles.append(omega * (1j - ratio / np.sqrt(1 - ratio**2)))
+        residues.append(1j * np.exp(ln_residue + 1j * phase))
+    return ModalModel(tuple(poles), tuple(residues), tuple(background))
+
+
+def test_the_band_of_the_modal_model_is_what_draws_scatter(modal_result):
+    modal = modal_result.whole.headline.modal
+    frequency_hz = np.array([1.5, 2.55, 5.0, 11.0, 16.0, 30.0, 44.0, 48.0])
+    band = modal_response_band(modal, frequency_hz)
+    count = modal.constants.size
+    at = np.concatenate([modal.constants, modal.model.background])
+    factor = np.linalg.cholesky(
+        modal.joint_covariance / np.outer(*[np.sqrt(np.diag(modal.joint_covariance))] * 2)
+    )
+    rng = np.random.default_rng(5)
+    spread = np.sqrt(np.diag(modal.joint_covariance))
+    logs = []
+    for _ in range(400):
+        draw = at + spread * (factor @ rng.standard_normal(at.size))
+        response = model_of(draw[:count], draw[count:]).response(2j * np.pi * frequency_hz)
+        logs.append(np.log(response / band.response))
+    scatter = np.array(logs)
+    assert scatter.real.std(axis=0) == pytest.approx(band.log_magnitude_std, rel=0.2)
+    assert scatter.imag.std(axis=0) == pytest.approx(band.phase_std_rad, rel=0.2)
+
+
+def test_what_is_shown_first_is_the_modal_model(modal_result):
+    whole = modal_result.whole
+    model = ShownModel.of(whole.headline, whole.record)
+    assert model.transfer is whole.headline.modal.model
+    assert model.fit_percent(whole.analysis) == pytest.approx(
+        whole.analysis.fit_percent(whole.fit), abs=0.2
+    )
+    figures = drawn(modal_result)
+    assert "of the modal model" in figures["record_frf"].description
+    assert "of the modal model" in figures["residual"].description
+    assert "as the modal model predicts" in figures["record_signals"].description
+    (modes, *_) = report_tables(modal_result)
+    assert modes.caption.endswith("modal model")
+    assert {row["source"] for row in modes.rows} == {"modal"}
+    inertia = [row["participation_kg_m2"].value for row in modes.rows]
+    beam = whole.record.beam
+    assert 0.9 < sum(inertia) / (beam.density_kg_per_m * beam.length_m**3 / 3) < 1.0
+
+
+def test_parameters_state_their_condition(modal_result):
+    tables = {each.name: each for each in report_tables(modal_result)[1]}
+    assert tables["parameters"].caption == f"Parameters {TOLERANT}"
+    assert tables["exact_geometry"].caption == f"Parameters {EXACT}: type VI"
+    tolerant, exact = (
+        {row["parameter"].value: row for row in tables[name].rows}
+        for name in ("parameters", "exact_geometry")
+    )
+    assert tolerant["alpha"]["std"].value > 2 * exact["alpha"]["std"].value
+    assert list(tolerant) == list(exact)
+    brief = as_text(result_text(modal_result, verbose=False))
+    assert TOLERANT in " ".join(brief.split())
+    complete = as_text(record_text(modal_result.whole))
+    assert f"Parameters {EXACT}" in complete
+    assert f"Modes {EXACT}" in complete
+
+
+def test_constants_are_compared_with_those_of_a_uniform_beam(modal_result):
+    test = modal_result.whole.headline.uniform_beam
+    constants, narrower = uniformity_tables(modal_result.whole)
+    assert (len(constants.rows), len(narrower.rows)) == (12, 3)
+    away = np.array([row["deviation_std"].value for row in constants.rows])
+    assert np.abs(away).max() < 4
+    with style.styled():
+        axes = uniformity_figure(test).axes
+    assert len(axes) == 2 * len(CONSTANTS)
+    for column, name in enumerate(CONSTANTS):
+        (points,) = [line for line in axes[2 * column].get_lines() if line.get_marker() == "o"]
+        of_name = [row for row in constants.rows if row["constant"].value == name]
+        np.testing.assert_allclose(
+            points.get_ydata(), [row["deviation_std"].value for row in of_name]
+        )
+    assert test.summary.sentence in drawn(modal_result)["uniform_beam"].description
+
+
+def test_the_page_has_a_section_on_the_uniformity(modal_result):
+    pictures = [Picture(name, "A figure.", b"") for name in (*FIGURES,)]
+    modes, tables, _ = report_tables(modal_result)
+    text = record_page(modal_result, pictures, modes, tables, datetime(2026, 1, 1, tzinfo=UTC))
+    figures, uniformity = text.index('id="figures"'), text.index('id="uniformity"')
+    assert figures < uniformity < text.index('id="figure-uniform_beam"') < text.index('id="model"')
+    assert text.count('id="figure-uniform_beam"') == text.count('id="modal_constants"') == 1
+    assert modal_result.whole.headline.uniform_beam.summary.sentence in text
+
+
+def test_a_turn_of_a_phase_is_no_deviation(modal_result):
+    test = modal_result.whole.headline.uniform_beam
+    turned = test.measured.copy()
+    turned[CONSTANTS.index("residue_phase_rad")] += 2 * np.pi
+    one, other = (
+        uniformity_table(each).rows[CONSTANTS.index("residue_phase_rad")]["deviation_std"].value
+        for each in (test, replace(test, measured=turned))
+    )
+    assert one == pytest.approx(other, abs=1e-6)
+
+
+def test_losses_that_no_beam_explains_are_points_alone(unexplained_losses):
+    assert loss_estimate(unexplained_losses.whole) is None
+    figures = drawn(unexplained_losses)
+    labels = [handle.get_label() for handle in figures["loss_factor"].figure.axes[0].get_lines()]
+    assert not {"total", "internal (material)", "external (surroundings)"} & set(labels)
+    assert "There is no curve" in figures["loss_factor"].description
+    assert "not properties of the material" in figures["uniform_beam"].description
+    content = document([unexplained_losses])
+    assert content["records"][0]["curves"]["loss_factor"] is None
+    assert uniformity_tables(unexplained_losses.whole)[1:] == ()
+    tables = {each.name: each for each in report_tables(unexplained_losses)[1]}
+    assert all(row["remark"] for row in tables["parameters"].rows if row["value"].doubtful)
+
+
+def test_the_document_has_source_participation_and_the_test(modal_result):
+    (headline,) = document([modal_result])["headlines"]
+    found = headline["validity"]["uniform_beam"]
+    assert found["status"] == "passed"
+    assert found["sentence"].startswith("A uniform beam predicts the modes (p = 0.")
+    assert len(found["constants"]) == 12
+    for mode in headline["modes"]:
+        assert (mode["source"], mode["frequency_hz"]["flag"]) == ("modal", None)
+        assert mode["participation"]["value"] > 0
+    assert headline["exact_geometry"]["condition"] == EXACT
+    names, matrix = headline["covariance"]["names"], headline["covariance"]["matrix"]
+    assert np.shape(matrix) == (len(names), len(names))
+    alpha = headline["parameters"]["alpha"]
+    at = names.index("alpha")
+    assert alpha["std"] == pytest.approx(np.sqrt(matrix[at][at]))
+    (curves,) = [record["curves"] for record in document([modal_result])["records"]]
+    assert curves["model"] == "modal"
+    assert curves["loss_factor"] is not None
+
+
+def test_the_modal_model_is_written_as_an_equation(modal_result):
+    first, *others = equations(modal_result.whole)
+    assert r"\sum_{k}" in first.tex
+    assert r"\frac{\bar{R}_{k}}{s - \bar{p}_{k}}" in first.tex
+    assert r"\sum_{n = 0}^{4} b_{n} s^{n}" in first.tex
+    ET.fromstring(mathml(first))
+    assert len(others) == 3
+    assert "modal model with a pole p and a residue R" in definitions(modal_result.whole)
