@@ -54,14 +54,15 @@ that determines a mode."""
 
 _HALF_WIDTHS: Final = 3.0
 _NEAREST: Final = 0.02
-"""Range about a mode in which the noise has no narrow peak: in half-widths, and at least relative
-to the frequency."""
+_NEAREST_BINS: Final = 24
+"""Range about a mode in which the noise has no narrow peak: in half-widths, at least relative to
+the frequency, and bins beyond."""
 
 _NOISE_PASSES: Final = 3
 _SETTLED: Final = 0.02
 """Change of the noise's mean logarithm below which it is not estimated again."""
 
-_MOST_FURTHER: Final = 3
+_MOST_FURTHER: Final = 2
 """Resonances beyond those of the beam that are looked for: of the sensor or the mount."""
 
 _EVIDENCE: Final = 60.0
@@ -241,7 +242,8 @@ class _Search:
         """Bins in which what remains may be a mode's, not the noise's, shape (K,)."""
         hz = self.comparison.frequency_hz[:, None]
         frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
-        reach = np.maximum(_HALF_WIDTHS * eta / 2, _NEAREST) * frequencies
+        bins_hz = _NEAREST_BINS * float(hz[1, 0] - hz[0, 0])
+        reach = np.maximum(_HALF_WIDTHS * eta / 2, _NEAREST) * frequencies + bins_hz
         near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach, axis=1)
         return near
 

@@ -84,8 +84,9 @@ INTEGER: Final = STRUCTURES["III"]
 no valleys there, and no damping that is a stiffness or an inertia in truth."""
 
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
-"""What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
+_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop", "harmonics"})
+"""What makes a search for knocks idle: a sweep has harmonics all along. Settings at an edge may be
+a loud knock's doing."""
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
 """All that is said where the record contradicts its file."""
 
@@ -426,7 +427,8 @@ def _with_effects(
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
     field, changes = along_time(field.with_orders_free())
-    if forces or field.drag is not None:
+    one_sweep = linear.comparison.measurement.one_sweep
+    if not one_sweep and (forces or field.drag is not None):
         # What changes along the record may have looked like an amplitude, which does so as well.
         other, other_changes = along_time(linear.with_orders_free(), rival_bic=field.bic)
         if other_changes and other.bic < field.bic:

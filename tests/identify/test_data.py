@@ -25,6 +25,7 @@ RECORD = SimpleNamespace(
     uniformity=2e-3,
     tip_mass_kg=None,
     axis_tilt_deg=None,
+    there=None,
 )
 
 

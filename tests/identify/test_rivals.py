@@ -9,7 +9,6 @@ import pytest
 from analysis.identify._candidates import CandidateSet
 from analysis.identify._headline import structures
 from analysis.identify._profile_likelihood import Profile
-from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import order_verdict
 from analysis.models import STRUCTURES
 
@@ -71,31 +70,11 @@ def test_no_chance_beside_a_clamp_that_is_far_better_with_the_same_orders():
     )
     assert rig.freest.extras == CLAMP
     assert rig.other_kinds(10.0) == ()
-    (found,) = of_rig(rig)
-    assert (found.kind, found.interval) == ("elastic clamp", pytest.approx((80.0, 125.0)))
 
 
 def test_a_clamp_that_is_no_better_with_the_orders_free_is_named_beside_the_beam():
     rig = field_of(fitted("VI", 9.0, -71.0), fitted("III", 0.0, -71.0, extras=CLAMP))
     assert rig.freest.extras == ()
-    (found,) = of_rig(rig)
-    assert found.kind == "rival explanations"
-    assert "100 N·m/rad (type III)" in found.sentence
-
-
-@pytest.mark.parametrize(
-    ("stated", "words"),
-    [
-        ({}, "95 %) that the file does not state."),
-        ({"first_s": CONSTANT_S[120.0]}, "95 %); the file states one of first order at 120 Hz."),
-        ({"second_s": CONSTANT_S[120.0]}, "95 %); the file states one of second order at 120 Hz."),
-    ],
-)
-def test_a_filter_is_compared_with_the_one_that_the_file_states(stated, words):
-    (found,) = of_rig(field_of(fitted("VI", 0.0, -80.0, extras=FILTER), **stated))
-    assert "its corner at 98.70 Hz (98.00 to 99.50 Hz; 95 %)" in found.sentence
-    assert words in found.sentence
-    assert found.parameters == FILTER
 
 
 @pytest.mark.parametrize(

@@ -200,6 +200,7 @@ def sound_arguments(ground, words):
         ],
         "analyze export record": [str(ground.session), "@/out.csv"],
         "analyze export frf": [str(ground.session), "@/out.csv"],
+        "analyze export model": [str(ground.session), "@/out.json"],
     }[" ".join(words)]  # fmt: skip
 
 
