@@ -60,7 +60,6 @@ _NEAR: Final = 6.0
 
 _GOOD: Final = 0.05
 _MOST_NAMED: Final = 5
-_SMALLEST: Final = 1e-99
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,9 +349,7 @@ def finding(
     named = [each.words for each in found]
     if step is not None and step.named:
         named.append(step.words)
-    p_value = test.p_value or 0.0
-    probability = f"p = {p_value:.1g}" if p_value > _SMALLEST else f"p < {_SMALLEST:g}"
-    refused = f"A plain uniform beam does not predict the modes ({probability})."
+    refused = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
     if not named:
         return Finding(
             kind="rival explanations",

@@ -43,7 +43,7 @@ def refused_reason(test: UniformBeamTest) -> str | None:
     """Say why values of a uniform beam are not to be believed; None where they may be."""
     if test.status != "refused":
         return None
-    return f"a uniform beam does not predict the modal constants (p = {test.p_value:.1g})"
+    return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
 _N = TypeVar("_N", bound=Numbers)
@@ -78,7 +78,7 @@ def with_modal_model(
     effective = None if refused is None else NOT_UNIFORM
     condition = exact if refused is None else exact.doubted(refused)
     # What drag does depends on how a mode decays, which the beam takes into account.
-    of_beam = refused is None and (tolerant is None or "drag" in exact.parameters)
+    of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
     modes = _modes(condition, modal, mode_doubt, half_width, own=of_beam)
     told = replace(condition, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:

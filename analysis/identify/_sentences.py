@@ -72,7 +72,7 @@ def _uniformity(told: Headline) -> list[str]:
     if test is None or test.p_value is None:
         return []
     modes = listed([str(number) for number in test.modes])
-    chance = f"p = {test.p_value:.2g}"
+    chance = test.summary.chance
     if test.status == "passed":
         return [
             "A uniform beam predicts frequencies, damping ratios and residues of modes "

@@ -304,7 +304,7 @@ def test_the_program_answers_to_requests(session, program):
     write_samples(program.stdin, wire(session.samples[:9500]))
     for number, (tick, whole) in enumerate([(300, False), (9000, False), (9000, True)]):
         write_request(program.stdin, EstimateRequest(number, tick, whole))
-    output, errors = program.communicate(timeout=60)
+    output, errors = program.communicate(timeout=300)
     assert (program.returncode, errors) == (0, b"")
     answers = [json.loads(line) for line in output.splitlines()]
     assert [(each["id"], each["tick"], each["whole"]) for each in answers] == [
@@ -351,15 +351,15 @@ def test_the_program_estimates_unasked(session, program):
     while first["tick"] < 5000:  # it was quicker than the samples
         first = json.loads(program.stdout.readline())
     write_samples(program.stdin, wire(session.samples[5000:9000]))
-    deadline_s = time.monotonic() + 60
+    deadline_s = time.monotonic() + 300  # it gives way to everything else
     while json.loads(program.stdout.readline())["tick"] < 9000:
         assert time.monotonic() < deadline_s
-    program.stdin.close()
-    assert program.wait(60) == 0
+    program.communicate(timeout=300)
+    assert program.returncode == 0
 
 
 @pytest.mark.parametrize("stream", [b"", b"{}\n", b'{"version": 1}'])
 def test_the_program_refuses_another_stream(program, stream):
-    _, errors = program.communicate(stream, timeout=60)
+    _, errors = program.communicate(stream, timeout=300)
     assert program.returncode == 1
     assert errors.startswith(b"Error: The stream of samples to the online fit is broken")
