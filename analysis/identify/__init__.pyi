@@ -20,8 +20,8 @@ from ._headline import Quantity as Quantity
 from ._headline import Simpler as Simpler
 from ._headline import Size as Size
 from ._headline import StructureStatus as StructureStatus
-from ._headline import headline_json as headline_json
 from ._headline import of_fit as of_fit
+from ._headline_json import headline_json as headline_json
 from ._modal_fit import ModalFit as ModalFit
 from ._modal_headline import refused_reason as refused_reason
 from ._modal_headline import tolerant_sizes as tolerant_sizes

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._verdict import (
@@ -26,17 +26,15 @@ from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify._verdict import OrderVerdict
-    from rigd.session import Validity
 
 EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
 UNEXPLAINED: Final = "part of the record is unexplained"
@@ -610,108 +608,3 @@ def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> M
 def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
     half = NORMAL_95 * std
     return Quantity(value, std, (value - half, value + half), reason)
-
-
-class JudgedOrder(Protocol):
-    """What is known of one order, from one record or from all of a campaign."""
-
-    @property
-    def order(self) -> str:
-        """Either "alpha" or "lambda"."""
-
-    @property
-    def status(self) -> str:
-        """As `OrderVerdict` has it."""
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """95 %."""
-
-
-def headline_json(
-    file: str | None,
-    told: Numbers,
-    orders: Iterable[JudgedOrder],
-    findings: Iterable[Finding],
-    validity: Validity,
-) -> dict[str, Any]:
-    """Write a headline as the JSON document has it.
-
-    Parameters
-    ----------
-    file : str or None
-        None for the estimate of a whole campaign.
-    told : Numbers
-    orders : iterable of JudgedOrder
-    findings : iterable of Finding
-    validity : Validity
-        How exact the linear model is for the record.
-
-    Returns
-    -------
-    dict
-        Numbers may be not finite.
-    """
-    uniform_beam = None if told.uniform_beam is None else told.uniform_beam.as_json()
-    return {
-        "file": file,
-        "type": told.name,
-        "validity": {**validity.as_json(), "uniform_beam": uniform_beam},
-        "parameters": {name: each.as_json() for name, each in told.parameters.items()},
-        "drag_speed_m_s": told.drag_speed_m_s,
-        "sizes": [
-            {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
-            for each in told.sizes
-        ],
-        "modes": [_mode_json(each) for each in told.modes],
-        "uniformity_percent": None if told.tolerant is None else 100 * told.tolerant.uniformity,
-        "basis": None if told.tolerant is None else told.tolerant.basis,
-        "covariance": None if told.tolerant is None else told.tolerant.covariance_json(),
-        "modal_model": None if told.modal is None else told.modal.as_json(),
-        "exact_geometry": None if told.exact is None else _exact_json(told.exact),
-        "structures": [{"type": name, "status": status} for name, status in told.structures],
-        "orders": {
-            each.order: {
-                "status": each.status,
-                "interval_95": None if each.interval is None else list(each.interval),
-            }
-            for each in orders
-        },
-        "conditional": None
-        if told.simpler is None
-        else {
-            "type": told.simpler.name,
-            "on": dict(told.simpler.fixed),
-            "parameters": {n: each.as_json() for n, each in told.simpler.parameters.items()},
-        },
-        "named": [
-            {
-                "what": each.kind,
-                "value": each.value,
-                "interval_95": None if each.interval is None else list(each.interval),
-                "sentence": each.sentence,
-            }
-            for each in findings
-        ],
-    }
-
-
-def _mode_json(mode: Mode) -> dict[str, Any]:
-    participation = mode.participation
-    return {
-        "mode": mode.number,
-        "frequency_hz": mode.frequency_hz.as_json(),
-        "damping_ratio": mode.damping_ratio.as_json(),
-        "participation": None if participation is None else participation.as_json(),
-        "source": mode.source,
-        "shown": mode.shown,
-    }
-
-
-def _exact_json(exact: Numbers) -> dict[str, Any]:
-    """Numbers that hold if the beam is uniform to 1e-5."""
-    return {
-        "condition": EXACT_CONDITION,
-        "parameters": {name: each.as_json() for name, each in exact.parameters.items()},
-        "modes": [_mode_json(each) for each in exact.modes],
-    }

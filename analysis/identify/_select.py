@@ -275,8 +275,8 @@ def _selected(
         along = tuple(changing(changes, one_sweep=measurement.one_sweep))
         found += _settings(told, numbers, kinds)
         found += () if small is None else (small.finding(),)
-        if modal is not None and test is not None and refused:
-            found += (_explanation(measurement, told, modal, test),)
+        if modal is not None and test is not None and refused and wrong is None:
+            found += _explanation(measurement, told, modal, test)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
         alone = doubt is None and not field.other_kinds(STRONG)
@@ -385,11 +385,16 @@ def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> Unif
 
 def _explanation(
     measurement: Measurement, told: CandidateSet, modal: ModalFit, test: UniformBeamTest
-) -> Finding:
-    """Name simple causes that would explain what a uniform beam does not."""
+) -> tuple[Finding, ...]:
+    """Name simple causes that would explain what a uniform beam does not.
+
+    Two modes leave no degree of freedom to test one.
+    """
+    if len(modal.visible) <= _MODES_TO_JUDGE:
+        return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
     step = step_score(told.comparison, modal) if measurement.one_sweep else None
-    return explanation_finding(test, causes, step)
+    return (explanation_finding(test, causes, step),)
 
 
 def _settings(field: CandidateSet, told: Headline, kinds: Collection[str]) -> tuple[Finding, ...]:

@@ -1,0 +1,119 @@
+"""Headline as the JSON document has it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+from analysis.identify._headline import EXACT_CONDITION
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from analysis.identify._finding import Finding
+    from analysis.identify._headline import Mode, Numbers
+    from rigd.session import Validity
+
+
+class JudgedOrder(Protocol):
+    """What is known of one order, from one record or from all of a campaign."""
+
+    @property
+    def order(self) -> str:
+        """Either "alpha" or "lambda"."""
+
+    @property
+    def status(self) -> str:
+        """As `OrderVerdict` has it."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 %."""
+
+
+def headline_json(
+    file: str | None,
+    told: Numbers,
+    orders: Iterable[JudgedOrder],
+    findings: Iterable[Finding],
+    validity: Validity,
+) -> dict[str, Any]:
+    """Write a headline as the JSON document has it.
+
+    Parameters
+    ----------
+    file : str or None
+        None for the estimate of a whole campaign.
+    told : Numbers
+    orders : iterable of JudgedOrder
+    findings : iterable of Finding
+    validity : Validity
+        How exact the linear model is for the record.
+
+    Returns
+    -------
+    dict
+        Numbers may be not finite.
+    """
+    uniform_beam = None if told.uniform_beam is None else told.uniform_beam.as_json()
+    return {
+        "file": file,
+        "type": told.name,
+        "validity": {**validity.as_json(), "uniform_beam": uniform_beam},
+        "parameters": {name: each.as_json() for name, each in told.parameters.items()},
+        "drag_speed_m_s": told.drag_speed_m_s,
+        "sizes": [
+            {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
+            for each in told.sizes
+        ],
+        "modes": [_mode_json(each) for each in told.modes],
+        "uniformity_percent": None if told.tolerant is None else 100 * told.tolerant.uniformity,
+        "basis": None if told.tolerant is None else told.tolerant.basis,
+        "covariance": None if told.tolerant is None else told.tolerant.covariance_json(),
+        "modal_model": None if told.modal is None else told.modal.as_json(),
+        "exact_geometry": None if told.exact is None else _exact_json(told.exact),
+        "structures": [{"type": name, "status": status} for name, status in told.structures],
+        "orders": {
+            each.order: {
+                "status": each.status,
+                "interval_95": None if each.interval is None else list(each.interval),
+            }
+            for each in orders
+        },
+        "conditional": None
+        if told.simpler is None
+        else {
+            "type": told.simpler.name,
+            "on": dict(told.simpler.fixed),
+            "parameters": {n: each.as_json() for n, each in told.simpler.parameters.items()},
+        },
+        "named": [
+            {
+                "what": each.kind,
+                "value": each.value,
+                "interval_95": None if each.interval is None else list(each.interval),
+                "sentence": each.sentence,
+            }
+            for each in findings
+        ],
+    }
+
+
+def _mode_json(mode: Mode) -> dict[str, Any]:
+    participation = mode.participation
+    return {
+        "mode": mode.number,
+        "frequency_hz": mode.frequency_hz.as_json(),
+        "damping_ratio": mode.damping_ratio.as_json(),
+        "participation": None if participation is None else participation.as_json(),
+        "source": mode.source,
+        "shown": mode.shown,
+    }
+
+
+def _exact_json(exact: Numbers) -> dict[str, Any]:
+    """Numbers that hold if the beam is uniform to 1e-5."""
+    return {
+        "condition": EXACT_CONDITION,
+        "parameters": {name: each.as_json() for name, each in exact.parameters.items()},
+        "modes": [_mode_json(each) for each in exact.modes],
+    }
