@@ -1,8 +1,6 @@
-"""Selection of a structure for one record: candidates, tests, profiles, verdict.
+"""Verdict on one record: modal model, test of uniformity, orders with a tolerance, candidates.
 
-Every structure is fitted under one noise spectrum, the residual is tested, what is found beside the
-beam is named, the orders are profiled in the freest structure. What the verdict says of that
-stands in `analysis.identify._sentences`.
+Sentences are in `analysis.identify._sentences`.
 """
 
 from __future__ import annotations
@@ -78,6 +76,7 @@ if TYPE_CHECKING:
 
 
 _MODES_TO_JUDGE: Final = 2
+_TILTED: Final = "the axis is tilted, and fits to the whole record are of one that is plumb"
 _CLIPPED: Final = "the torque is clipped"
 INTEGER: Final = STRUCTURES["III"]
 """Both dampings of order 1. It is fitted from everywhere: what a record does not tell of orders has
@@ -137,18 +136,14 @@ def select(
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
-    """Choose the structure that a record supports, and say what is known.
+    """Report what a record supports: modes first, orders where the beam earns them.
 
-    All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
-    integer internal order also with the modes' stiffness free; where it promises something, also
-    with an elastic clamp, a tip mass, a filter or another clock. On the kind of rig with the lowest
-    BIC the orders are freed as well, and kinds of rig are told apart by these freest structures.
-    The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of
-    the air along the beam makes the lowest lower, all are fitted with it; where it is evident,
-    before other kinds of rig are tried. If restoring forces that are not linear, or a change along
-    the record, save far more than chance would, all are fitted again with these beside the beam.
-    Where all that leaves more than noise, a knock on the beam is looked for; if it explains the
-    rest, all is done again with it.
+    The modal model is fitted to what remains of hum, knocks and gaps, and the modes are its own. If
+    it leaves nothing but noise, the antenna is linear and constant. Otherwise drag, forces that are
+    not linear, changes along the record and knocks are looked for. A uniform beam is tested against
+    the modal constants; orders, coefficients and stiffness are estimated from these with the
+    tolerance of the geometry that the measurement states. All structures are also fitted to the
+    record, on an exactly uniform beam: their values are a condition.
 
     Parameters
     ----------
@@ -369,7 +364,9 @@ def _with_modes(
     if modal is None or test is None:
         return exact
     tolerant = None
-    if measurement.uniformity or test.status == "refused":
+    if measurement.axis_tilt_deg:
+        exact = exact.doubted(_TILTED)
+    if measurement.uniformity or test.status == "refused" or measurement.axis_tilt_deg:
         tolerant = tolerant_estimate(
             modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
         )
