@@ -58,6 +58,9 @@ def findings(
 
 # Settings at an edge, or not as the file states them
 
+_DELAY_OFF_S: Final = 1e-4
+"""Delay worth a word: backlash of a few tenths of a milliradian passes for a shorter one."""
+
 _BEAM_OFF: Final = 0.003
 """Deviation of stiffness or density, relative to the file's, worth a word."""
 
@@ -120,7 +123,8 @@ def _difference(
 
 def _of_instruments(field: CandidateSet, told: Headline) -> Iterator[Finding]:
     """Find a delay and an inertia that the file does not state."""
-    if off := _difference(field, told, "delay_s"):
+    off = _difference(field, told, "delay_s")
+    if off is not None and abs(off[0]) > _DELAY_OFF_S:
         value, *interval = off
         low, high = interval
         (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
