@@ -36,7 +36,8 @@ from rigd.excitation import (
     next_piece,
     parse_target,
 )
-from rigd.excitation._fisher_information import OF_UNIFORM, RecordSoFar, covariance_of
+from rigd.excitation._beam_estimate import OF_UNIFORM
+from rigd.excitation._fisher_information import RecordSoFar, covariance_of
 from rigd.excitation._piece_search import PieceSearch
 from rigd.excitation._targets import Quantities
 from rigd.profile import load_profile

@@ -68,20 +68,6 @@ def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
     )
 
 
-def uniform_beam(modal: PooledModal | None) -> list[str]:
-    """Say whether a uniform beam predicts the modal constants."""
-    test = modal.uniform_beam if modal else None
-    if test is None or test.p_value is None:
-        return []
-    which = (
-        f"frequencies, damping ratios and residues of modes {listed([str(n) for n in test.modes])} "
-        f"({chance(test.p_value)})"
-    )
-    if test.status == "passed":
-        return [f"A uniform beam predicts {which}."]
-    return [f"A uniform beam does not predict {which}: the modes are reported without it."]
-
-
 def slope(found: PooledOrder, modal: PooledModal) -> str:
     """Say what is known of an order as the slope of a loss over the modes in sight.
 

@@ -19,7 +19,7 @@ from analysis.campaigns._orders import (
     rivals,
     tolerant_pooled_order,
 )
-from analysis.identify import EVEN, STRONG, refused_reason
+from analysis.identify import EVEN, STRONG, refused_reason, uniformity
 from rigd.units import interval_text
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ def _numbers(
     sessions: int,
 ) -> tuple[str, ...]:
     """Say what the numbers are of, whether they explain the records, and how large the losses."""
-    gate = geometry.uniform_beam(modal)
+    gate = uniformity(modal.uniform_beam if modal else None)
     if modal is None or modal.tolerant is None:
         left = sentences.left_over(freest, adequate, sessions)
         return sentences.headline(freest, best), *gate, left, *sentences.sizes(freest.sizes)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._causes import Cause
-    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._plant import Plant
     from analysis.identify._step_in_time import Step
     from analysis.identify._uniform_beam import UniformBeamTest
@@ -63,8 +63,8 @@ _MOST_NAMED: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
-    """One cause that would explain the modes.
+class CauseFit:
+    """One cause, fitted to the modal constants, that would explain the modes.
 
     Attributes
     ----------
@@ -101,13 +101,13 @@ class Explanation:
 
 
 def explanations(
-    fit: ModalFit, nominal: Plant, tilt_deg: float | None = None
-) -> tuple[Explanation, ...]:
+    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
+) -> tuple[CauseFit, ...]:
     """Find causes that explain the modes, each alone; the best first.
 
     Parameters
     ----------
-    fit : ModalFit
+    fit : ModalEstimate
     nominal : Plant
         Rig and specimen as the file states them; with a mass at the tip, if it states one.
     tilt_deg : float, optional
@@ -120,7 +120,7 @@ def explanations(
     found = problem.minima()[0].x
     straight = problem.starts()[len(problem.starts()) // 2]
     without = np.where(np.arange(found.size) == 0, problem.lower, straight)
-    explained_by: dict[str, Explanation] = {}
+    explained_by: dict[str, CauseFit] = {}
     for cause in CAUSES:
         bases = (found, straight, without) if cause.name == RELAXATION else (found, straight)
         explained = _explained(problem, cause, bases)
@@ -145,7 +145,7 @@ def explanations(
 
 def _explained(
     problem: ConstantsProblem, cause: Cause, bases: Sequence[NDArray[np.float64]]
-) -> Explanation | None:
+) -> CauseFit | None:
     """Fit one cause; None if it is not to be tested, explains nothing or is not plausible."""
     count = problem.lower.size
     freedom = problem.compared - count - len(cause.lower)
@@ -166,7 +166,7 @@ def _explained(
         return None
     plant = problem.plant(y[:count])
     size, unit, words = cause.described(own.tolist(), plant.beam)
-    return Explanation(
+    return CauseFit(
         name=cause.name,
         words=words,
         size=size,
@@ -332,16 +332,14 @@ def _step(
 # Words
 
 
-def finding(
-    test: UniformBeamTest, found: Sequence[Explanation], step: Step | None = None
-) -> Finding:
+def finding(test: UniformBeamTest, found: Sequence[CauseFit], step: Step | None = None) -> Finding:
     """Put in words what would explain the modes.
 
     Parameters
     ----------
     test : UniformBeamTest
         That refused the plain uniform beam.
-    found : sequence of Explanation
+    found : sequence of CauseFit
         As `explanations` gives them.
     step : Step, optional
         Step of the stiffness, as `step_score` finds it.

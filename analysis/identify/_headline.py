@@ -58,7 +58,7 @@ _OF_FREQUENCIES: Final = ("density_over_stiffness", "stiffness_offset")
 
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
-_NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
+NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
     "internal": ("zeta", "alpha"),
     "external": ("gamma", "lambda"),
 }
@@ -428,11 +428,11 @@ def of_fit(
         },
         sizes=tuple(
             # A loss factor is known without its order; a coefficient alone belongs to it.
-            _size(
+            size_of(
                 each,
                 size,
                 unexplained
-                or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None)
+                or (reasons.get(NAMES[each][1]) if size.omega_rad_s is None else None)
                 or few,
             )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
@@ -533,7 +533,16 @@ def _parameter(
     return Quantity(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
 
 
-def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
+def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
+    """Loss factor with its 95 % interval.
+
+    Parameters
+    ----------
+    damping : str
+    size : DampingSize
+    reason : str or None
+        Its flag.
+    """
     # Positive, and uncertain by a factor.
     spread = NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
@@ -572,7 +581,7 @@ def _doubted_by(told: Headline, other: Candidate, *, flagging: bool) -> Headline
 
 def _loss(values: Mapping[str, float], each: Size) -> float:
     """Loss factor of a damping at the frequency of a size, or its coefficient."""
-    coefficient, order = _NAMES[each.damping]
+    coefficient, order = NAMES[each.damping]
     omega = each.omega_rad_s
     if omega is None:
         return values[coefficient]
@@ -599,12 +608,24 @@ def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> M
         reason = "computed from the model: the record does not show this mode"
     return Mode(
         mode.number,
-        _symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
-        _symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
+        symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
+        symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
         shown,
     )
 
 
-def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
-    half = NORMAL_95 * std
+def symmetric(
+    value: float, std: float, reason: str | None, half_width: float = NORMAL_95
+) -> Quantity:
+    """Quantity with a symmetric 95 % interval.
+
+    Parameters
+    ----------
+    value, std : float
+    reason : str or None
+        Its flag.
+    half_width : float
+        Half width of the interval, in standard deviations.
+    """
+    half = half_width * std
     return Quantity(value, std, (value - half, value + half), reason)

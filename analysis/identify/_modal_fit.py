@@ -27,7 +27,7 @@ from analysis.identify._modal_model import BACKGROUND, ModalEstimate, ModalModel
 from analysis.identify._noise import smooth_power, with_peaks
 from analysis.identify._residual_tests import input_relation, whiteness
 from analysis.identify._result import Ringing
-from analysis.optimizer import Box, NormalEquations, descend
+from analysis.optimizer import Box, NormalEquations, Recent, descend
 from rigd.beam import LoadedBeam
 
 if TYPE_CHECKING:
@@ -82,9 +82,6 @@ class ModalFit(ModalEstimate):
         Deviance that each mode saves.
     residual : ndarray of complex, shape (K,)
         Whitened; parts of variance 1 where chance is all that remains.
-    deviance : float
-        ``-2 ln`` likelihood but for a constant: squares, and twice the logarithms of the noise.
-    parameters : int
     noise : Noise
         As estimated from this residual; bins below the first mode do not count.
     whiteness : Whiteness
@@ -98,8 +95,6 @@ class ModalFit(ModalEstimate):
 
     evidence: tuple[float, ...]
     residual: NDArray[np.complex128]
-    deviance: float
-    parameters: int
     noise: Noise
     whiteness: Whiteness
     input_relation: InputRelation
@@ -224,7 +219,9 @@ class _Search:
         search = self
         for _ in range(_NOISE_PASSES):
             search = search.descended()
-            model, residual = search.problem().model_and_residual(search.x)
+            problem = search.problem()
+            model = problem.model(search.x)
+            residual = problem.residual(search.x, model)
             comparison = search.comparison.renewed(model, search.noise).filled(model)
             power = smooth_power(residual, finely=True)
             power = with_peaks(residual, power, ~search.near_modes())
@@ -256,7 +253,7 @@ class _Search:
         """Add a resonance where the residual still follows the angle, if that explains it."""
         search = self
         for _ in range(_MOST_FURTHER):
-            related = search.relation()
+            related = search.relation(search.problem().at(search.x))
             if not related.related:
                 break
             start = [math.log(2 * math.pi * related.at_hz), 0.02]
@@ -289,9 +286,9 @@ class _Search:
         own = self.cost()
         return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
 
-    def relation(self) -> InputRelation:
-        """Relation of the residual to the angle."""
-        residual = self.problem().at(self.x).residual.view(np.complex128)
+    def relation(self, point: _Point) -> InputRelation:
+        """Relation of the residual at this point to the angle."""
+        residual = point.residual.view(np.complex128)
         angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
         counts = self.noise.counts
         first = int(np.argmax(counts))
@@ -313,38 +310,43 @@ class _Search:
             return None
         x, numbers = search.x, search.numbers
         problem = search.problem()
-        model, _ = problem.model_and_residual(x)
         point = problem.at(x)
         every = problem.covariance(point)
         constants, covariance = problem.constants(point, x, every)
         residual = point.residual.view(np.complex128)
         counts = search.noise.counts
-        squares = float(point.residual @ point.residual)
         return ModalFit(
-            model=model,
+            model=problem.model(x),
             numbers=numbers,
             constants=constants,
             joint_covariance=covariance,
             evidence=tuple(saved.tolist()),
             residual=residual,
-            deviance=squares + 2 * float(np.sum(np.log(search.noise.power[counts]))),
-            parameters=x.size + 2 * len(numbers) + BACKGROUND,
             noise=search.noise,
             whiteness=whiteness(residual[counts], search.comparison.frequency_hz[counts]),
-            input_relation=search.relation(),
+            input_relation=search.relation(point),
             ringing=problem.ringing(point, every),
-            span=np.concatenate([point.span, _orthonormal(point.jacobian)]),
+            span=np.concatenate([point.span, _orthonormal(point.jacobian)[0]]),
         )
 
 
-def _orthonormal(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal rows that span some rows, nearly independent or not."""
+def _gram(
+    rows: NDArray[np.float64], ridge: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Rows of length 1, their Gram matrix with a ridge, and the lengths that they had."""
     scale = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     scale[scale == 0] = 1.0  # a decay that is over at once
     scaled = rows / scale[:, None]
     gram = scaled @ scaled.T
-    gram[np.diag_indices_from(gram)] += 1e-13
-    return np.linalg.solve(np.linalg.cholesky(gram), scaled)
+    gram[np.diag_indices_from(gram)] += ridge
+    return scaled, gram, scale
+
+
+def _orthonormal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Orthonormal rows that span some rows, and the factor that times these gives the rows."""
+    scaled, gram, scale = _gram(rows, 1e-13)
+    factor = np.linalg.cholesky(gram)
+    return np.linalg.solve(factor, scaled), factor * scale[:, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,6 +381,7 @@ class _Problem:
         further: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
+        self._recent: Recent[_Point] = Recent()
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -427,7 +430,13 @@ class _Problem:
         return total
 
     def at(self, x: NDArray[np.float64]) -> _Point:
-        """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``."""
+        """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
+
+        The last two points cost nothing again.
+        """
+        return self._recent.at(x, self._at)
+
+    def _at(self, x: NDArray[np.float64]) -> _Point:
         modes = x.reshape(-1, 2)
         rows: list[NDArray[np.complex128]] = []
         slopes: list[NDArray[np.complex128]] = []
@@ -447,17 +456,11 @@ class _Problem:
         nuisance = self._white(self._nuisance(poles))
         drag, *by_drag = self._white(self._drag(poles))
         columns = np.concatenate([spectra[:count], self._background, nuisance])
-        scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
-        scale[scale == 0] = 1.0  # a decay that is over at once
-        scaled = columns / scale[:, None]
-        gram = scaled @ scaled.T
-        gram[np.diag_indices_from(gram)] += 1e-13
-        factor = np.linalg.cholesky(gram)
-        solved = np.linalg.solve(factor, scaled)  # orthonormal rows
+        span, factor = _orthonormal(columns)
         measured = self._measured - drag
-        along = solved @ measured
-        residual = along @ solved - measured
-        linear = np.linalg.solve(factor.T, along) / scale
+        along = span @ measured
+        residual = along @ span - measured
+        linear = np.linalg.solve(factor.T, along)
         decays = linear[count + BACKGROUND :]
         jacobian = np.array(by_drag).reshape(x.size, residual.size)
         if poles:
@@ -467,13 +470,11 @@ class _Problem:
             four = spectra[count + 4 * k : count + 4 * k + 4]
             jacobian[2 * k] += a * four[0] + b * four[2]
             jacobian[2 * k + 1] += a * four[1] + b * four[3]
-        projected = jacobian - (jacobian @ solved.T) @ solved
-        return _Point(residual, linear, columns, solved, jacobian, projected)
+        projected = jacobian - (jacobian @ span.T) @ span
+        return _Point(residual, linear, columns, span, jacobian, projected)
 
-    def model_and_residual(
-        self, x: NDArray[np.float64]
-    ) -> tuple[ModalModel, NDArray[np.complex128]]:
-        """Modal model at a point, and its residual in N·m, not whitened."""
+    def model(self, x: NDArray[np.float64]) -> ModalModel:
+        """Modal model at a point."""
         linear = self.at(x).linear
         modes = x.reshape(-1, 2)
         poles, residues = [], []
@@ -487,21 +488,22 @@ class _Problem:
             # (a + b q) q² over the denominator, less its remainder
             background[0] += a - b * eta
             background[1] += b / omega
-        model = ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
+        return ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
+
+    def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
+        """Residual of the model at a point in N·m, not whitened."""
+        first = 2 * len(self._numbers) + BACKGROUND
+        amplitudes = self.at(x).linear[first:]
         here = self._poles(x)
-        columns = self._nuisance(here)
         comparison = self._comparison
         torque = comparison.prediction.torque(model)[0]
         bare = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
-        return model, bare + linear[first + BACKGROUND :] @ columns + self._drag(here)[0]
+        drag: NDArray[np.complex128] = self._drag(here)[0]
+        return drag + bare + amplitudes @ self._nuisance(here)
 
     def covariance(self, point: _Point) -> NDArray[np.float64]:
         """Covariance of the unknowns and the linear parameters."""
-        total = np.concatenate([point.full_jacobian, point.columns])
-        scale = np.sqrt(np.einsum("ij,ij->i", total, total))
-        scale[scale == 0] = 1.0
-        gram = (total / scale[:, None]) @ (total / scale[:, None]).T
-        gram[np.diag_indices_from(gram)] += 1e-14
+        _, gram, scale = _gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
         return covariance
 
@@ -549,7 +551,7 @@ class _Problem:
             rows[1, eta_at] = 1 / eta
             rows[2, [omega_at, eta_at, a_at, b_at]] = 1.0, by_eta.real, by_a.real, by_b.real
             rows[3, [eta_at, a_at, b_at]] = by_eta.imag, by_a.imag, by_b.imag
-            # What the numerator leaves beyond the poles, as in `model_and_residual`.
+            # What the numerator leaves beyond the poles, as in `model`.
             background[0, [a_at, b_at, eta_at]] = 1.0, -eta, -b
             background[1, [b_at, omega_at]] = np.array([1.0, -b]) / math.exp(log_omega)
         own = covariance[: chain.shape[1], : chain.shape[1]]

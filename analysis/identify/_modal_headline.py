@@ -8,13 +8,10 @@ would tell of a beam that is uniform to 1e-5 is reported as a condition.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-import numpy as np
-
-from analysis.identify._headline import Mode, Numbers, Quantity, Size
+from analysis.identify._headline import NAMES, Mode, Numbers, Quantity, size_of, symmetric
 from analysis.identify._plant import OF_BEAM
 from analysis.identify._profile_likelihood import WIDEST_SHARE
 from analysis.identify._uncertainty import damping_size
@@ -24,7 +21,7 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from analysis.identify._headline import StructureStatus
+    from analysis.identify._headline import Size, StructureStatus
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._profile_likelihood import Order, Profile
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
@@ -113,36 +110,27 @@ def _modes(
     told: Numbers, modal: ModalEstimate, doubt: str | None, half_width: float, *, own: bool
 ) -> tuple[Mode, ...]:
     """Modes that show by the modal model, the others as the beam has them."""
-    std = np.sqrt(np.diag(modal.covariance)).reshape(-1, 4)
-    constants = modal.constants.reshape(-1, 4)
+    visible = modal.visible
     found: dict[int, Mode] = {mode.number: mode for mode in told.modes}
-    for place, number in enumerate(modal.numbers):
-        if number not in modal.visible:
-            continue
-        ln_frequency, ln_ratio, *_ = constants[place]
+    for number in visible:
+        its = modal.mode(number)
         inertia, spread = modal.inertia(number)
         mode = Mode(
             number,
-            _relative(math.exp(ln_frequency), std[place, 0], doubt, half_width),
-            _relative(math.exp(ln_ratio), std[place, 1], doubt, half_width),
+            symmetric(its.frequency_hz, its.frequency_std_hz, doubt, half_width),
+            symmetric(its.damping_ratio, its.damping_ratio_std, doubt, half_width),
             shown=True,
             source="modal",
-            participation=_relative(inertia, spread, doubt, half_width),
+            participation=symmetric(inertia, inertia * spread, doubt, half_width),
         )
         if own and number in found:
             before = found[number]
             mode = replace(before, shown=True, participation=mode.participation)
         found[number] = mode
     return tuple(
-        each if each.number in modal.visible else replace(each, shown=False)
+        each if each.number in visible else replace(each, shown=False)
         for _, each in sorted(found.items())
     )
-
-
-def _relative(value: float, spread: float, flag: str | None, half_width: float) -> Quantity:
-    """Quantity with a relative standard deviation."""
-    half = half_width * spread
-    return Quantity(value, value * spread, (value * (1 - half), value * (1 + half)), flag)
 
 
 def _parameters(
@@ -228,24 +216,15 @@ def tolerant_sizes(
     """
     values = dict(estimate.values)
     found = []
-    for damping, coefficient, order in (
-        ("internal", "zeta", "alpha"),
-        ("external", "gamma", "lambda"),
-    ):
+    for damping, (coefficient, order) in NAMES.items():
         size = damping_size(
             coefficient, order, values, PARAMETERS, estimate.covariance, estimate.first_rad_s
         )
         if size is None:
             continue
-        spread = size.std / size.value
-        ends = (
-            size.value * math.exp(-NORMAL_95 * spread),
-            size.value * math.exp(min(NORMAL_95 * spread, 300.0)),
-        )
         flag = doubt or (NO_ORDER if estimate.basis == "none" else None)
         flag = flag or (effective if damping == "external" else None)
-        quantity = Quantity(size.value, size.std, ends, flag)
-        found.append(Size(damping, size.omega_rad_s, quantity))  # type: ignore[arg-type]
+        found.append(size_of(damping, size, flag))
     return tuple(found)
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Headline, Quantity, Simpler
+    from analysis.identify._uniform_beam import UniformBeamTest
     from analysis.identify._verdict import OrderVerdict
 
 # Sentences
@@ -51,7 +52,7 @@ def of_headline(
     if len(told.visible_modes) < _SEVERAL:
         said = [f"{ONE_MODE.capitalize()}, nor does it determine their orders."]
     else:
-        said = [*_uniformity(told), *_of_damping(told, orders)]
+        said = [*uniformity(told.uniform_beam), *_of_damping(told, orders)]
     if told.tolerant is None:
         said += [order(each) for each in orders]
     else:
@@ -66,9 +67,13 @@ def of_headline(
     return said
 
 
-def _uniformity(told: Headline) -> list[str]:
-    """Say whether a uniform beam predicts the modal constants."""
-    test = told.uniform_beam
+def uniformity(test: UniformBeamTest | None) -> list[str]:
+    """Say whether a uniform beam predicts the modal constants; nothing if that was not tested.
+
+    Parameters
+    ----------
+    test : UniformBeamTest or None
+    """
     if test is None or test.p_value is None:
         return []
     modes = listed([str(number) for number in test.modes])

@@ -17,22 +17,22 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from analysis.identify._altered_beam import Alteration, mode_terms
-from analysis.identify._free_decay import mode_poles
 from analysis.identify._modal_model import CONSTANTS
-from analysis.identify._plant import LOGARITHMIC, Plant
-from analysis.identify._predictor import ResponseGrid, torque_channel
+from analysis.identify._plant import LOGARITHMIC
+from analysis.identify._predictor import torque_channel
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues
 from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._modal_model import ModalEstimate
+    from analysis.identify._plant import Plant
     from analysis.optimizer import Minimum
 
 PARAMETERS: Final = (
@@ -59,10 +59,6 @@ _DELAY_UNIT_S: Final = 0.01
 _LARGEST_DELAY: Final = 1.0
 _RENEWALS: Final = 4
 """Times that the shapes of a loaded or tilted beam are computed, with the beam found so far."""
-
-_CIRCLE: Final = np.exp(2j * np.pi * np.arange(8) / 8)
-_RADIUS: Final = 0.2
-"""Radius of the circle round a pole, relative to the decay rate."""
 
 _STEP: Final = 1e-5
 _NEWTON_STEPS: Final = 6
@@ -98,34 +94,6 @@ _PROFILE_STEPS: Final = 8
 _CLOSE: Final = 0.05
 _LONGEST_STEP: Final = 3.0
 _LARGEST_LN: Final = 300.0
-
-
-def modal_constants(plant: Plant, modes: Sequence[int]) -> NDArray[np.float64]:
-    """`CONSTANTS` of some modes of a plant in turn, shape (4 n,); NaN where a mode has no pole.
-
-    A residue is the mean over a circle round its pole (Cauchy's integral): exact for any ends and
-    instruments that the response knows.
-
-    Parameters
-    ----------
-    plant : Plant
-    modes : sequence of int
-    """
-    found = {pole.mode: pole.at_rad_s for pole in mode_poles(plant, max(modes), ())}
-    if not all(mode in found and found[mode].imag > 0 for mode in modes):
-        return np.full(len(CONSTANTS) * len(modes), np.nan)
-    poles = np.array([found[mode] for mode in modes])
-    turns = (_RADIUS * np.abs(poles.real) + 1e-9 * np.abs(poles))[:, None] * _CIRCLE
-    response = ResponseGrid((poles[:, None] + turns).ravel()).evaluate(plant)[0]
-    residues = np.mean(response.reshape(turns.shape) * turns, axis=1)
-    log_residues = np.log(residues / 1j)
-    rows = (
-        np.log(poles.imag / (2 * np.pi)),
-        np.log(-poles.real / np.abs(poles)),
-        log_residues.real,
-        log_residues.imag,
-    )
-    return np.array(rows).T.ravel()
 
 
 class ConstantsProblem:
@@ -170,8 +138,7 @@ class ConstantsProblem:
         self.compared = count * len(CONSTANTS)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length = nominal.beam.length_m
-        self._z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
-        self._k4 = (self._z / length) ** 4
+        z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self.stated = Alteration.stated(nominal, tilt_deg)
         self.terms = mode_terms(self.stated, nominal.beam, self.modes)
         constants = self.measured.reshape(-1, len(CONSTANTS))
@@ -180,7 +147,7 @@ class ConstantsProblem:
         self._poles = self._omega * (1j - self._ratios)
         # Where the search begins: the mean of all modes.
         mass = self.terms.mass + self.terms.lump
-        self._ln_ratio = float(np.mean(np.log(self._k4 / mass) - 2 * np.log(self._omega)))
+        self._ln_ratio = float(np.mean(np.log((z / length) ** 4 / mass) - 2 * np.log(self._omega)))
         ln_stiffness = constants[:, 2] - np.log(self._omega) + np.log(length / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
         low, high = _LN_LOSS_RANGE
@@ -328,13 +295,7 @@ class ConstantsProblem:
 
     def minimum(self, x: NDArray[np.float64]) -> Minimum:
         """Descend from a point."""
-        return descend(
-            self.equations,
-            x,
-            Box(self.lower, self.upper),
-            relative_tolerance=_TOLERANCE,
-            max_evaluations=_MANY,
-        )
+        return _descend(self.equations, x, self.lower, self.upper)
 
     def minima(self) -> list[Minimum]:
         """Minima from all starts, the lowest first."""
@@ -359,13 +320,7 @@ class ConstantsProblem:
         """
         high = self.upper.copy()
         high[place] = self.lower[place]
-        return descend(
-            self.equations,
-            x,
-            Box(self.lower, high),
-            relative_tolerance=_TOLERANCE,
-            max_evaluations=_MANY,
-        )
+        return _descend(self.equations, x, self.lower, high)
 
     def held(self, place: int, value: float, x: NDArray[np.float64]) -> Minimum:
         """Descend with one of `PARAMETERS` held; `x` of the result are the unknowns.
@@ -392,14 +347,24 @@ class ConstantsProblem:
                 found.cost, backward.T @ found.gradient, backward.T @ found.hessian @ backward
             )
 
-        found = descend(
-            equations,
-            forward @ x,
-            Box(low, high),
-            relative_tolerance=_TOLERANCE,
-            max_evaluations=_MANY,
-        )
+        found = _descend(equations, forward @ x, low, high)
         return replace(found, x=backward @ found.x)
+
+
+def _descend(
+    equations: Callable[[NDArray[np.float64]], NormalEquations],
+    x: NDArray[np.float64],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+) -> Minimum:
+    """Descend between bounds."""
+    return descend(
+        equations,
+        x,
+        Box(lower, upper),
+        relative_tolerance=_TOLERANCE,
+        max_evaluations=_MANY,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -617,6 +582,7 @@ def _estimate(
 ) -> TolerantEstimate:
     """Values, deviations and intervals at a minimum."""
     best = minima[0]
+    plant = problem.plant(best.x)
     hessian = best.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
     covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
     values = problem.parameters(best.x)
@@ -644,8 +610,8 @@ def _estimate(
         basis=basis,
         uniformity=problem.uniformity,
         p_value=p_value,
-        plant=problem.plant(best.x),
-        values=problem.plant(best.x).parameters,
+        plant=plant,
+        values=plant.parameters,
         std=std,
         interval=ends,
         covariance=covariance,

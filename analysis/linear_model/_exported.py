@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from analysis.linear_model._dynamics import Dynamics, Uncertain
     from analysis.linear_model._identified import IdentifiedModel
-    from analysis.linear_model._pole_fit import Input, Structure
+    from analysis.linear_model._pole_fit import Input, PoleStructure
     from analysis.linear_model._state_space import StateSpace
 
 SAMPLES: Final = 50
@@ -58,7 +58,7 @@ class ModelOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class PosteriorSamples:
     """Samples of the parameters, and the state space of each with the same states.
 
     Attributes
@@ -128,10 +128,10 @@ class LinearModel:
         Its parameters.
     options : ModelOptions
     system : StateSpace
-    structure : Structure
+    structure : PoleStructure
         Its states.
     accuracy : Accuracy
-    posterior : Posterior
+    posterior : PosteriorSamples
     """
 
     identified: IdentifiedModel
@@ -139,9 +139,9 @@ class LinearModel:
     uncertain: Uncertain
     options: ModelOptions
     system: StateSpace
-    structure: Structure
+    structure: PoleStructure
     accuracy: Accuracy
-    posterior: Posterior
+    posterior: PosteriorSamples
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -300,8 +300,8 @@ def _relative_std(uncertain: Uncertain, s: NDArray[np.complex128]) -> NDArray[np
 
 
 def _posterior(
-    uncertain: Uncertain, fit: PoleFit, structure: Structure, options: ModelOptions
-) -> Posterior:
+    uncertain: Uncertain, fit: PoleFit, structure: PoleStructure, options: ModelOptions
+) -> PosteriorSamples:
     """Draw parameters from a normal distribution, and realise each with the same states."""
     count = options.samples
     drawn: list[NDArray[np.float64]] = []
@@ -326,11 +326,11 @@ def _posterior(
             f"Only {len(drawn)} of {count} samples of the posterior have the states of the model: "
             "its parameters are too uncertain; record more, or add --samples 0."
         )
-    return Posterior(np.array(drawn).reshape(count, uncertain.values.size), tuple(systems))
+    return PosteriorSamples(np.array(drawn).reshape(count, uncertain.values.size), tuple(systems))
 
 
 def _sampled(
-    uncertain: Uncertain, values: NDArray[np.float64], nominal: Dynamics, structure: Structure
+    uncertain: Uncertain, values: NDArray[np.float64], nominal: Dynamics, structure: PoleStructure
 ) -> Dynamics | None:
     """Return the dynamics of a sample; None if it is impossible or has not the same states."""
     parameters = uncertain.named(values)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.linear_model._dynamics import LinearModelError
-from analysis.linear_model._pole_fit import Structure
+from analysis.linear_model._pole_fit import PoleStructure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -28,7 +28,7 @@ _MOST_REAL: Final = 12
 _MOST_INTEGRATORS: Final = 2
 
 
-def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[Structure, StateSpace]:
+def realised(fit: PoleFit, order: int | None, given: Input) -> tuple[PoleStructure, StateSpace]:
     """Realise a response with a number of states.
 
     Parameters
@@ -82,7 +82,7 @@ def _suffice(fit: PoleFit, pairs: int, real: int) -> bool:
     return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in ladders)
 
 
-def _structures(pairs: int, states: int, given: Input) -> Iterator[Structure]:
+def _structures(pairs: int, states: int, given: Input) -> Iterator[PoleStructure]:
     """Return the structures of a number of pairs and of states beyond those of all structures."""
     if given == "angle":  # which has the velocity and the acceleration as inputs
         yield from _ladders(pairs, states - 2 * pairs, _MOST_INTEGRATORS)
@@ -91,22 +91,22 @@ def _structures(pairs: int, states: int, given: Input) -> Iterator[Structure]:
         yield from _ladders(pairs, states - 2 * pairs - integrators, integrators)
 
 
-def _ladders(pairs: int, real: int, integrators: int) -> Iterator[Structure]:
+def _ladders(pairs: int, real: int, integrators: int) -> Iterator[PoleStructure]:
     if not 0 <= real <= _MOST_REAL:
         return
     for low, high in _LADDERS_RAD_S[: None if real else 1]:
         poles = np.geomspace(low, high, real) if real > 1 else np.full(real, (low * high) ** 0.5)
-        yield Structure(pairs, tuple((-poles).tolist()), integrators)
+        yield PoleStructure(pairs, tuple((-poles).tolist()), integrators)
 
 
 def _best(
     fit: PoleFit, states: int, given: Input, least: Mapping[int, int], tolerance: float
-) -> tuple[Structure, StateSpace] | None:
+) -> tuple[PoleStructure, StateSpace] | None:
     """Return the most accurate stable realisation within a tolerance, None if there is none.
 
     With the numbers of pairs and at least as many real poles as are given.
     """
-    found: list[tuple[float, int, Structure, NDArray[np.float64]]] = []
+    found: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
     for structure in (
         each
         for pairs, real in least.items()

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.linear_model._state_space import Signals, StateSpace, with_filter
+from analysis.linear_model._state_space import SignalNames, StateSpace, with_filter
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 Input = Literal["acceleration", "angle"]
 INPUTS: Final[tuple[Input, ...]] = ("acceleration", "angle")
 
-_MOTION: Final = Signals(
+_MOTION: Final = SignalNames(
     ("motor_angle", "motor_velocity", "motor_acceleration"), ("rad", "rad/s", "rad/s^2")
 )
-_TORQUE: Final = Signals(("coupling_torque",), ("N.m",))
+_TORQUE: Final = SignalNames(("coupling_torque",), ("N.m",))
 
 _FIT_POINTS: Final = (200, 10)
 _CHECK_POINTS: Final = (1200, 34)
@@ -54,7 +54,7 @@ _MAX_GROWTH_PER_S: Final = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
-class Structure:
+class PoleStructure:
     """States of a realisation, whatever the parameters.
 
     Attributes
@@ -118,21 +118,21 @@ class PoleFit:
         """Response there with filters, without delay, in N·m/rad."""
         return self.dynamics.filtered(self.check_s)
 
-    def real_poles(self, structure: Structure) -> tuple[float, ...]:
+    def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
         """Return all real poles of a realisation, in rad/s.
 
         Parameters
         ----------
-        structure : Structure
+        structure : PoleStructure
         """
         return (*self.dynamics.real_poles, *structure.ladder_rad_s)
 
-    def solve(self, structure: Structure) -> tuple[NDArray[np.float64], float]:
+    def solve(self, structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
         """Fit a structure.
 
         Parameters
         ----------
-        structure : Structure
+        structure : PoleStructure
 
         Returns
         -------
@@ -157,13 +157,13 @@ class PoleFit:
         return coefficients, float(np.abs(residual[self._in_band]).max())
 
     def system(
-        self, structure: Structure, coefficients: NDArray[np.float64], given: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
         Parameters
         ----------
-        structure : Structure
+        structure : PoleStructure
         coefficients : ndarray
             As `solve` returned them.
         given : str
@@ -183,12 +183,12 @@ class PoleFit:
         """
         return np.abs(angle_response(system, self.check_s) / self.exact - 1)
 
-    def stable_on_motor(self, structure: Structure, coefficients: NDArray[np.float64]) -> bool:
+    def stable_on_motor(self, structure: PoleStructure, coefficients: NDArray[np.float64]) -> bool:
         """Whether a motor without friction, as heavy as the beam, is stable with it.
 
         Parameters
         ----------
-        structure : Structure
+        structure : PoleStructure
         coefficients : ndarray
             As `solve` returned them.
         """
@@ -200,7 +200,7 @@ class PoleFit:
         return bool(np.linalg.eigvals(coupled).real.max(initial=0.0) <= _MAX_GROWTH_PER_S)
 
     def _unfiltered(
-        self, structure: Structure, coefficients: NDArray[np.float64], given: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], given: Input
     ) -> StateSpace:
         upper, real = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
         poles = 2 * upper.size + len(real)
@@ -229,7 +229,7 @@ class PoleFit:
                 np.array([[stiffness, viscosity, inertia]]),
                 _MOTION,
                 _TORQUE,
-                Signals(tuple(names), ("rad.s",) * poles),
+                SignalNames(tuple(names), ("rad.s",) * poles),
             )
         # The velocity and the angle are integrals of the input: v' = u, q' = v.
         k = structure.integrators
@@ -242,9 +242,9 @@ class PoleFit:
             b,
             np.append(c, np.array([[viscosity, stiffness]])[:, :k], axis=1),
             np.array([[inertia]]),
-            Signals(_MOTION.names[2:], _MOTION.units[2:]),
+            SignalNames(_MOTION.names[2:], _MOTION.units[2:]),
             _TORQUE,
-            Signals(
+            SignalNames(
                 (*names, *("motor_velocity", "motor_angle")[:k]),
                 (*("rad/s",) * poles, *("rad/s", "rad")[:k]),
             ),

@@ -21,7 +21,7 @@ _BLOCK: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Signals:
+class SignalNames:
     """Names and units of the components of a vector, in ASCII."""
 
     names: tuple[str, ...]
@@ -35,7 +35,7 @@ class StateSpace:
     Attributes
     ----------
     a, b, c, d : ndarray, shapes (n, n), (n, m), (p, n), (p, m)
-    inputs, outputs, states : Signals
+    inputs, outputs, states : SignalNames
     delay_s : float
         By how much the outputs come later than the matrices say; negative: the inputs are older
         than the outputs.
@@ -47,9 +47,9 @@ class StateSpace:
     b: NDArray[np.float64]
     c: NDArray[np.float64]
     d: NDArray[np.float64]
-    inputs: Signals
-    outputs: Signals
-    states: Signals
+    inputs: SignalNames
+    outputs: SignalNames
+    states: SignalNames
     delay_s: float = 0.0
     period_s: float = 0.0
 
@@ -119,13 +119,13 @@ def with_filter(system: StateSpace, time_constant_s: float, order: int) -> State
         b=b,
         c=np.eye(1, n + order, n),
         d=np.zeros_like(system.d),
-        states=joined((system.states, Signals(names, (unit,) * order))),
+        states=joined((system.states, SignalNames(names, (unit,) * order))),
     )
 
 
-def joined(parts: Sequence[Signals]) -> Signals:
+def joined(parts: Sequence[SignalNames]) -> SignalNames:
     """Return the components of several vectors one after the other."""
-    return Signals(
+    return SignalNames(
         tuple(name for each in parts for name in each.names),
         tuple(unit for each in parts for unit in each.units),
     )

@@ -1,10 +1,10 @@
+from ._beam_estimate import BAND_HZ as BAND_HZ
+from ._beam_estimate import BeamEstimate as BeamEstimate
 from ._experiment_design import Design as Design
 from ._experiment_design import DesignRig as DesignRig
 from ._experiment_design import design_excitation as design_excitation
 from ._experiment_design import expected_precisions as expected_precisions
 from ._experiment_design import next_piece as next_piece
-from ._fisher_information import BAND_HZ as BAND_HZ
-from ._fisher_information import BeamEstimate as BeamEstimate
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
 from ._moves import Braking as Braking

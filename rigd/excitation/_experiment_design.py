@@ -22,12 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, LoadedBeam
-from rigd.excitation._fisher_information import (
-    BeamEstimate,
-    RecordSoFar,
-    covariance_of,
-    information,
-)
+from rigd.excitation._beam_estimate import BeamEstimate
+from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
 from rigd.excitation._piece_search import (
     LOOK_AHEAD_S,
     SHORTEST_S,

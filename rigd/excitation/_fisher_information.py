@@ -16,62 +16,26 @@ M. B. Zarrop, Optimal experiment design for dynamic system identification, Sprin
 L. Pronzato and A. Pázman, Design of experiments in nonlinear models, Springer (2013).
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from math import isfinite, pi
+from dataclasses import dataclass
+from math import pi
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Beam,
-    Damping,
-    LoadedBeam,
-    clamped_free_eigenvalues,
-    pole_gradient,
-    poles_for_eigenvalues,
-    tip_response,
-    transfer,
-    transfer_and_gradient,
+from rigd.beam import tip_response, transfer, transfer_and_gradient
+from rigd.excitation._beam_estimate import (
+    BAND_HZ,
+    BY_PARAMETER,
+    CHANGES,
+    MODAL,
+    PARAMETERS,
+    TOLERATED,
+    BeamEstimate,
+    Complex,
+    Real,
+    parameter_scales,
 )
-from rigd.excitation._signals import ExcitationError
-
-Real = NDArray[np.float64]
-Complex = NDArray[np.complexfloating[Any, Any]]
-
-BAND_HZ: Final = 50.0
-"""Upper end of the band that the whole-record fit compares."""
-
-OF_UNIFORM: Final = (
-    "zeta",
-    "alpha",
-    "gamma",
-    "lambda",
-    "density_over_stiffness",
-    "bending_stiffness_n_m2",
-    "delay_s",
-    "tool_inertia_kg_m2",
-)
-"""Parameters of the fit of a uniform beam on a rigid clamp."""
-
-_OF_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
-
-PARAMETERS: Final = (*OF_UNIFORM, *_OF_ENDS)
-"""Parameters of the fit; the `LOGARITHMIC` ones count by their logarithm."""
-
-LOGARITHMIC: Final = frozenset(
-    {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
-)
-
-_BY_PARAMETER: Final = {
-    "density_over_stiffness": "ln_density_over_stiffness",
-    "bending_stiffness_n_m2": "ln_stiffness",
-}
-"""Names by which the exact model is differentiated, where they differ."""
-
-_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
-"""Parameters beside beam and damping; 0 where nothing is said of them."""
 
 _PRIOR_STD: Final = {
     "zeta": 3.0,
@@ -84,319 +48,10 @@ _PRIOR_STD: Final = {
 }
 """What is known without any record: coefficients within a factor of 20, orders within (0, 2)."""
 
-_TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
-"""By what a mode of an antenna differs from that of the beam, with its standard deviation over the
-uniformity, as the analyser has it. The number of the mode follows the name."""
-
-_MODAL: Final = (*_TOLERATED, "ln_damping_ratio", "residue_phase_rad")
-"""What a mode of the modal model is free in."""
-
-_BACKGROUND: Final = 5
-"""Terms of the modal model's background."""
-
 _RATE_OVER_BAND: Final = 2.4
 _TAPER: Final = 1.1
 _DECAY: Final = 5.0
 """What wraps round in a transform of twice the length has decayed by exp(-5)."""
-
-
-# What is known of the beam
-
-
-@dataclass(frozen=True, slots=True)
-class BeamEstimate:
-    """The beam as a fit found it, with the noise that the torque had."""
-
-    beam: Beam
-    """Length as given, density and stiffness as estimated."""
-    damping: Damping
-    """Damping as estimated; a coefficient of 0 is a kind of damping that the structure has not."""
-    names: tuple[str, ...]
-    """Parameters that the fit leaves free, of `PARAMETERS`, and deviations of modes."""
-    noise_frequency_hz: Real
-    """Shape (m,), increasing: where the spectrum of the noise is given."""
-    noise_nm2_per_hz: Real
-    """Shape (m,): one-sided power spectral density of the torque's noise."""
-    delay_s: float = 0.0
-    """By how much the torque is older than the angle."""
-    tool_inertia_kg_m2: float = 0.0
-    """Inertia between torque sensor and beam."""
-    tip_mass_kg: float = 0.0
-    """Point mass at the tip."""
-    root_compliance_rad_per_nm: float = 0.0
-    """By how much the clamp turns for a torque."""
-    stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
-    uniformity: float = 0.0
-    """Relative standard deviation of each mode's frequency from that of the beam."""
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Take over an estimate from JSON.
-
-        Parameters
-        ----------
-        document
-            ``beam`` with the keys of `Beam`; ``damping`` with zeta, alpha, gamma and lambda;
-            ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and perhaps
-            ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg``, ``root_compliance_rad_per_nm``
-            and ``stiffness_offsets``. Other keys are ignored.
-
-        Raises
-        ------
-        ExcitationError
-            If a key is missing, or its value is of no use.
-        """
-        try:
-            damping, noise = document["damping"], document["noise"]
-            estimate = cls(
-                beam=Beam(
-                    **{
-                        key: float(document["beam"][key])
-                        for key in ("length_m", "density_kg_per_m", "bending_stiffness_n_m2")
-                    }
-                ),
-                damping=Damping(
-                    **{
-                        key: float(damping[key.rstrip("_")])
-                        for key in ("zeta", "alpha", "gamma", "lambda_")
-                    }
-                ),
-                names=tuple(name for name in document["names"] if name in PARAMETERS),
-                noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
-                noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
-                **{key: float(document.get(key, 0.0)) for key in _OF_RIG},
-                stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
-            )
-        except KeyError as error:
-            raise ExcitationError(f"The estimate of the beam has no key {error}.") from None
-        except (TypeError, ValueError, AttributeError) as error:
-            raise ExcitationError(f"The estimate of the beam cannot be read: {error}.") from None
-        estimate.check()
-        return estimate
-
-    @classmethod
-    def stated(
-        cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
-    ) -> "BeamEstimate":
-        """Return a beam that is known beforehand, all parameters of a uniform one free.
-
-        Parameters
-        ----------
-        beam, damping
-            As stated.
-        noise_nm2_per_hz
-            One-sided power spectral density of the torque's noise, white.
-        tip_mass_kg
-            Point mass at the tip, held.
-        """
-        absent = {
-            *(() if damping.zeta else ("zeta", "alpha")),
-            *(() if damping.gamma else ("gamma", "lambda")),
-        }
-        return cls(
-            beam,
-            damping,
-            tuple(name for name in OF_UNIFORM if name not in absent),
-            np.array([1.0]),
-            np.array([noise_nm2_per_hz]),
-            tip_mass_kg=tip_mass_kg,
-        )
-
-    def check(self) -> None:
-        """Refuse what no record can be predicted from.
-
-        Raises
-        ------
-        ExcitationError
-            If a value is not finite or has no meaning, or nothing is free.
-        """
-        beam, damping = self.beam, self.damping
-        for key, value, least, below in (
-            ("beam.length_m", beam.length_m, 1e-6, np.inf),
-            ("beam.density_kg_per_m", beam.density_kg_per_m, 1e-12, np.inf),
-            ("beam.bending_stiffness_n_m2", beam.bending_stiffness_n_m2, 1e-12, np.inf),
-            ("damping.zeta", damping.zeta, 0.0, np.inf),
-            ("damping.alpha", damping.alpha, 0.0, 2.0),
-            ("damping.gamma", damping.gamma, 0.0, np.inf),
-            ("damping.lambda", damping.lambda_, 0.0, 2.0),
-            *((key, getattr(self, key), -np.inf, np.inf) for key in _OF_RIG),
-            *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
-        ):
-            if not (isfinite(value) and least <= value < below):
-                raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
-        frequency_hz, density = self.noise_frequency_hz, self.noise_nm2_per_hz
-        if not (
-            frequency_hz.ndim == 1
-            and frequency_hz.size > 0
-            and density.shape == frequency_hz.shape
-            and bool(np.all(np.diff(frequency_hz) > 0.0))
-            and bool(np.all(np.isfinite(density) & (density > 0.0)))
-        ):
-            raise ExcitationError(
-                "The estimate of the beam needs noise.frequency_hz, increasing, and as many "
-                "positive noise.nm2_per_hz."
-            )
-        if not self.names:
-            raise ExcitationError("The estimate of the beam has no free parameter in names.")
-
-    def with_tolerance(self, uniformity: float) -> "BeamEstimate":
-        """Leave the modes free within a tolerance of the geometry, and the orders of the damping.
-
-        Parameters
-        ----------
-        uniformity
-            Relative standard deviation of each mode's frequency; 0 changes nothing.
-        """
-        if not uniformity:
-            return self
-        orders = [name for name in ("alpha", "lambda") if name not in self.names]
-        present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
-        modes = [mode.number for mode in self.modes()]
-        deviations = [f"{name}_{number}" for number in modes for name in _TOLERATED]
-        free = (*self.names, *(name for name in orders if present[name]), *deviations)
-        return replace(self, names=free, uniformity=uniformity)
-
-    def modal(self) -> "BeamEstimate":
-        """Leave the constants of each mode free and a background, and nothing of the beam."""
-        modes = [mode.number for mode in self.modes()]
-        constants = [f"{name}_{number}" for number in modes for name in _MODAL]
-        background = [f"background_{power}" for power in range(_BACKGROUND)]
-        return replace(self, names=(*constants, *background), uniformity=1.0)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Values of all `PARAMETERS` by name."""
-        beam, damping = self.beam, self.damping
-        return dict(
-            zip(
-                PARAMETERS,
-                (
-                    *(damping.zeta, damping.alpha, damping.gamma, damping.lambda_),
-                    *(beam.density_over_stiffness, beam.bending_stiffness_n_m2),
-                    *(getattr(self, key) for key in _OF_RIG),
-                ),
-                strict=True,
-            )
-        )
-
-    @property
-    def loaded(self) -> LoadedBeam | None:
-        """The beam with what is at its ends; None if nothing is, and nothing of it is free."""
-        at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
-        if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
-            return None
-        return self.loaded_beam
-
-    @property
-    def loaded_beam(self) -> LoadedBeam:
-        """The beam with what is at its ends."""
-        return LoadedBeam(
-            self.beam,
-            self.damping,
-            self.tip_mass_kg,
-            self.root_compliance_rad_per_nm,
-            self.stiffness_offsets,
-        )
-
-    def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
-        """Modes that oscillate below a frequency, with what moves them.
-
-        Parameters
-        ----------
-        highest_hz
-            Upper end of the band.
-        """
-        count = 2
-        while True:
-            z = clamped_free_eigenvalues(count)
-            reached = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
-                self.beam.density_over_stiffness
-            )
-            if reached[-1]:
-                break
-            count *= 2
-        loaded = self.loaded
-        pairs = (
-            poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
-        )
-        parameters = [name for name in self.names if name in PARAMETERS]
-        names = [_BY_PARAMETER.get(name, name) for name in parameters]
-        shown = {
-            number: pole
-            for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
-            if np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz
-        }
-        if loaded is None:
-            stiffness = (z / self.beam.length_m) ** 4
-            moved: Iterable[Complex] = (
-                pole_gradient(pole, float(stiffness[number - 1]), self.beam, self.damping, names)
-                for number, pole in shown.items()
-            )
-        else:
-            moved = loaded.pole_gradients(np.array([*shown.values()], dtype=np.complex128), names)
-        scales = _scales(self)
-        found = []
-        for (number, pole), row in zip(shown.items(), moved, strict=True):
-            gradient = np.zeros(len(self.names), dtype=np.complex128)
-            gradient[: len(parameters)] = row * scales
-            for place, name in enumerate(self.names):
-                if name.endswith(f"_{number}"):
-                    gradient[place] = _CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
-            found.append(EstimatedMode(number, pole, gradient))
-        return tuple(found)
-
-
-_CHANGES: Final[Mapping[str, Callable[[complex, complex], tuple[complex, complex]]]] = {
-    "ln_frequency": lambda pole, _: (pole, 0j),
-    "ln_damping_ratio": lambda pole, _: (complex(pole.real), 0j),
-    "ln_residue": lambda _, residue: (0j, residue),
-    "residue_phase_rad": lambda _, residue: (0j, 1j * residue),
-    "background": lambda *_: (0j, 0j),
-}
-"""Derivatives of the pole and the residue of a mode by its constants."""
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatedMode:
-    """A mode of the estimated beam with locked hub."""
-
-    number: int
-    """From 1 on."""
-    pole_rad_s: complex
-    """Upper one of the pair."""
-    gradient: Complex
-    """Shape (k,): derivatives of the pole by the free parameters."""
-
-    @property
-    def frequency_hz(self) -> float:
-        """Frequency of the free decay."""
-        return self.pole_rad_s.imag / (2 * pi)
-
-    @property
-    def damping_ratio(self) -> float:
-        """Share of the critical damping."""
-        return -self.pole_rad_s.real / abs(self.pole_rad_s)
-
-    @property
-    def frequency_gradient_hz(self) -> Real:
-        """Derivatives of the frequency, shape (k,)."""
-        return np.asarray(self.gradient.imag / (2 * pi), dtype=np.float64)
-
-    @property
-    def damping_gradient(self) -> Real:
-        """Derivatives of the damping ratio, shape (k,)."""
-        p, size = self.pole_rad_s, abs(self.pole_rad_s)
-        of_size = (p.conjugate() * self.gradient).real / size
-        slope = -self.gradient.real / size - self.damping_ratio * of_size / size
-        return np.asarray(slope, dtype=np.float64)
-
-
-def _scales(estimate: BeamEstimate) -> Real:
-    """Return factors from derivatives of the exact model to those by the free parameters."""
-    values = estimate.values
-    names = [name for name in estimate.names if name in PARAMETERS]
-    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])
 
 
 # Whitened derivatives of the torque
@@ -518,7 +173,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         Rate of the samples whose noise is to have variance 1.
     """
     names = [name for name in estimate.names if name in PARAMETERS]
-    wrt = [_BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
+    wrt = [BY_PARAMETER.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")]
     loaded = estimate.loaded
     g = of_beam = np.zeros((0, s.size), dtype=np.complex128)
     if names:
@@ -531,7 +186,9 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
     kernels[len(names) :] = _by_constants(estimate, s) * late
     rows = iter(of_beam)
-    for out, name, scale in zip(kernels[: len(names)], names, _scales(estimate), strict=True):
+    for out, name, scale in zip(
+        kernels[: len(names)], names, parameter_scales(estimate), strict=True
+    ):
         if name == "delay_s":
             out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * late
         elif name == "tool_inertia_kg_m2":
@@ -555,7 +212,7 @@ def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
             continue
         pole = poles[int(number)]
         residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
-        by_pole, by_residue = _CHANGES[kind](pole, residue)
+        by_pole, by_residue = CHANGES[kind](pole, residue)
         upper, lower = s - pole, s - pole.conjugate()
         row = residue * by_pole / upper**2 + by_residue / upper
         other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
@@ -737,8 +394,8 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     kind = name.rpartition("_")[0]
     if kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
-    if kind in _MODAL:
-        return _TOLERATED.get(kind, 1.0) * estimate.uniformity
+    if kind in MODAL:
+        return TOLERATED.get(kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":

@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.excitation._beam_estimate import BAND_HZ, BeamEstimate
 from rigd.excitation._fisher_information import (
-    BAND_HZ,
-    BeamEstimate,
     RecordSoFar,
     TorqueModel,
     covariance_of,

@@ -8,12 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._fisher_information import (
-    BAND_HZ,
-    LOGARITHMIC,
-    BeamEstimate,
-    EstimatedMode,
-)
+from rigd.excitation._beam_estimate import BAND_HZ, LOGARITHMIC, BeamEstimate, EstimatedMode
 from rigd.excitation._signals import ExcitationError
 
 Real = NDArray[np.float64]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, Beam, undamped_frequencies_rad_s
+from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._experiment_design import DesignRig, geometry_floors
-from rigd.excitation._fisher_information import BeamEstimate
 from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
     Excitation,

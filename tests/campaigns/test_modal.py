@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cauchy_residues import modal_constants
 
 from analysis.campaigns import _geometry_sentences as sentences
 from analysis.campaigns._homogeneity import Homogeneity
 from analysis.campaigns._modal import opposite_sweeps, pooled_modal
 from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict
-from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
-from analysis.identify._uniform_beam import modal_constants
+from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant, uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
 PLANT = Plant(PAPER_BEAM, PAPER_DAMPING)
@@ -76,10 +76,10 @@ def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of):
     even, uneven = (pooled_modal(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
     assert even.uniform_beam.status == "passed"
     assert even.leads
-    assert "A uniform beam predicts" in sentences.uniform_beam(even)[0]
+    assert "A uniform beam predicts" in uniformity(even.uniform_beam)[0]
     assert uneven.uniform_beam.status == "refused"
     assert uneven.uniform_beam.p_value < 1e-10
-    assert "does not predict" in sentences.uniform_beam(uneven)[0]
+    assert "does not predict" in uniformity(uneven.uniform_beam)[0]
     # Losses are the same, and the tolerance covers what the places of the modes would say.
     for name, true in PLANT.parameters.items():
         if name in ("alpha", "lambda"):

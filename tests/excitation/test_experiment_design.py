@@ -15,7 +15,8 @@ from rigd.excitation import (
     next_piece,
     parse_target,
 )
-from rigd.excitation._fisher_information import OF_UNIFORM, covariance_of
+from rigd.excitation._beam_estimate import OF_UNIFORM
+from rigd.excitation._fisher_information import covariance_of
 from rigd.excitation._piece_search import SHARE_OF_LIMITS, largest_factor
 
 RATE_HZ = 1000.0

@@ -10,7 +10,8 @@ from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, modes, transfer
 from rigd.excitation import BeamEstimate, ExcitationError, information
-from rigd.excitation._fisher_information import OF_UNIFORM, RecordSoFar, covariance_of, projected
+from rigd.excitation._beam_estimate import OF_UNIFORM
+from rigd.excitation._fisher_information import RecordSoFar, covariance_of, projected
 
 RATE_HZ = 1000.0
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

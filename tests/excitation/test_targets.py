@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import Beam, Damping, modes
 from rigd.excitation import BeamEstimate, ExcitationError, Target, parse_target
-from rigd.excitation._fisher_information import OF_UNIFORM
+from rigd.excitation._beam_estimate import OF_UNIFORM
 from rigd.excitation._targets import Quantities
 
 ESTIMATE = BeamEstimate(

@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from cauchy_residues import modal_constants
 
-from analysis.identify import Plant
+from analysis.identify import ModalEstimate, ModalModel, Plant
 from analysis.identify._altered_beam import GRAVITY_M_S2
 from analysis.identify._causes import CAUSES
 from analysis.identify._explanations import explanations, finding
-from analysis.identify._modal_fit import ModalFit
-from analysis.identify._modal_model import ModalModel
 from analysis.identify._step_in_time import Step
-from analysis.identify._uniform_beam import modal_constants, uniform_beam_test
+from analysis.identify._uniform_beam import uniform_beam_test
 from rigd.beam import Beam, Damping
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -113,23 +112,9 @@ class Elements:
 
 
 def fitted(constants, seed=1):
-    """A fit that gave these constants, with noise of `STD`."""
+    """An estimate of these constants, with noise of `STD`."""
     off = np.random.default_rng(seed).normal(scale=STD)
-    return ModalFit(
-        model=ModalModel((), (), ()),
-        numbers=MODES,
-        constants=constants + off,
-        joint_covariance=np.diag(STD**2),
-        evidence=(1e4,) * len(MODES),
-        residual=np.zeros(0, dtype=complex),
-        deviance=0.0,
-        parameters=0,
-        noise=None,
-        whiteness=None,
-        input_relation=None,
-        ringing=None,
-        span=np.zeros((0, 0)),
-    )
+    return ModalEstimate(ModalModel((), (), ()), MODES, constants + off, np.diag(STD**2))
 
 
 def poles(constants):
@@ -301,7 +286,7 @@ def test_causes_are_named_and_never_facts():
 
 def test_two_modes_leave_nothing_to_compare_causes_by():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
-    two = replace(fit, evidence=(1e4, 1e4, 0.0))
+    two = replace(fit, numbers=(1, 2, 0))  # the third is of something else
     assert explanations(two, NOMINAL) == ()
 
 
