@@ -144,7 +144,7 @@ def test_the_command_line_refuses_before_anything_is_connected(rigd_here, lie, c
     path = lie("limits.missed_ticks_in_a_row", 16)
     what = ("hold",) if command == "run" else ("motor",)
     done = rigd_here(command, *what, "--profile", path)
-    assert (done.returncode, done.stdout) == (1, "")
+    assert (done.returncode, done.stdout) == (1, ""), done.stderr
     assert "rigd check fails (travel_missed_ticks): travel, worst, if ticks are" in done.stderr
     assert done.stderr.count("\n") == 1
     if command == "run":
