@@ -1,10 +1,11 @@
-"""Measured responses that others published, with their modes, and a fit that shares no code.
+"""Measured responses that others published, with their modes, and two fits.
 
 `impact_test` is part of the project (tests/data/impact_test). `blade` and `brake_reuss_beam` read
 files that may not be redistributed here; `bench_published_modes.py` says where they come from.
 
-`fit_poles` is the reference: vector fitting (Gustavsen and Semlyen 1999) in the frequency domain.
-`periodic_record` makes a record in time that has a measured response exactly.
+`fit_poles` is the reference: vector fitting (Gustavsen and Semlyen 1999) in the frequency domain,
+which shares no code with the analyzer. `fit_record` is the modal model of the analyzer, fitted to a
+record. `periodic_record` makes a record in time that has a measured response exactly.
 """
 
 from __future__ import annotations
@@ -15,6 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from analysis.identify import Measurement
+from analysis.identify._comparison import Comparison
+from analysis.identify._modal_fit import fit_modes
+from analysis.identify._noise import Noise
+from rigd.beam import Beam
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -153,6 +160,36 @@ def fit_poles(
         Resonance(float(size * largest / (2 * np.pi)), float(-pole.real / size))
         for pole, size in zip(poles, sizes, strict=True)
     ]
+
+
+def fit_record(
+    record: InputOutput, band_hz: tuple[float, float], starts_hz: Sequence[float]
+) -> list[Resonance]:
+    """Return the modes by the modal model of the analyzer, of those at the starts.
+
+    Input and output take the places of angle and torque.
+    """
+    known = np.ones(record.input.size, dtype=bool)
+    measurement = Measurement(
+        "record",
+        record.input,
+        record.output - record.output[0],
+        record.rate_hz,
+        Beam(1.0, 0.1, 1.0),  # whose modes are not used
+        known,
+        known,
+        rest_angle_rad=0.0,
+    )
+    comparison = Comparison.of(measurement, band_hz)
+    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
+    power = np.full(torque.size, np.mean(np.abs(torque) ** 2))
+    white = Noise(power, np.ones(torque.size, dtype=bool), ())
+    starts = [(number, hz, 0.005) for number, hz in enumerate(starts_hz, start=1)]
+    found = fit_modes(comparison, white, starts)
+    if found is None:
+        raise ValueError("No mode shows in the band.")
+    modes = [found.mode(number) for number in found.visible]
+    return [Resonance(mode.frequency_hz, mode.damping_ratio) for mode in modes]
 
 
 def phase_resonance(measured: MeasuredResponse) -> Resonance:

@@ -261,10 +261,17 @@ class _Search:
                 search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
             ).settled()
             at = replace(search, noise=more.noise, comparison=more.comparison).descended()
-            if at.cost() - more.cost() < _EVIDENCE:
+            if at.cost() - more.cost() < _EVIDENCE or more.last_overlaps():
                 break
             search = more
         return search
+
+    def last_overlaps(self) -> bool:
+        """Whether the last resonance lies within the width of another: they share one peak."""
+        frequencies = np.exp(self.x[::2])
+        half_widths = frequencies * self.x[1::2] / 2
+        reach = _HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
+        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
 
     def without_unexcited_modes(self) -> _Search:
         """Leave out modes that save nothing at first and then follow a line of the noise."""
