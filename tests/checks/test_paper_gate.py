@@ -55,7 +55,7 @@ def lie(tmp_path, can_profile):
         section, _, name = key.partition(".")
         owner = getattr(can_profile, section, None) or getattr(can_profile.rig, section)
         value = type(getattr(owner, name))(getattr(owner, name) * factor)
-        return write_profile(tmp_path, {key: value}, base="antenna_can")
+        return write_profile(tmp_path, {"name": "one_lie", key: value}, base="antenna_can")
 
     return lie
 
