@@ -62,13 +62,11 @@ QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
         "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
         "delay_s": ("τ", "torque-channel delay", "µs", 1e6),
         "tool_inertia_kg_m2": ("J", "tool inertia", "1e-6 kg·m²", 1e6),
-        "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
         "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
         "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
         "second_order_filter_time_constant_s": (
             "T", "second-order filter of the torque", "ms", 1e3,
         ),
-        "clock_rate_difference": ("ε", "torque's clock against the angle's", "ppm", 1e6),
         "drag": ("C_D d", "drag of the air", "mm", 1e3),
     }
 )  # fmt: skip

@@ -64,16 +64,12 @@ class WelchFit:
 
 @dataclass(frozen=True, slots=True)
 class RecordEstimate:
-    """One structure, on a uniform beam or not, fitted to one whole record.
+    """One structure, fitted to one whole record.
 
     Attributes
     ----------
     structure : str
         Its name.
-    uniform : bool
-        Whether all modes follow from one stiffness.
-    beam : str
-        What follows the structure in its name: nothing on a uniform beam without more.
     plant : Plant
     parameters : dict of str to float
         See `analysis.identify.RecordFit`, as for the following.
@@ -96,8 +92,6 @@ class RecordEstimate:
     """
 
     structure: str
-    uniform: bool
-    beam: str
     plant: Plant
     parameters: Mapping[str, float]
     std: Mapping[str, float | None]
@@ -115,7 +109,7 @@ class RecordEstimate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return f"{self.structure}{self.beam}"
+        return self.structure
 
     @property
     def free(self) -> frozenset[str]:
@@ -136,8 +130,6 @@ class RecordEstimate:
         fit = candidate.fit
         return cls(
             structure=fit.structure.name,
-            uniform=candidate.uniform,
-            beam=candidate.name.removeprefix(fit.structure.name),
             plant=fit.plant,
             parameters=dict(fit.parameters),
             std=dict(fit.std),

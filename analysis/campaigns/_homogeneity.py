@@ -162,7 +162,7 @@ def homogeneity(
         The lowest BIC first.
     specimens : sequence of StatedSpecimen
     """
-    name = common_structure(sessions, pooled)
+    name = common_structure(sessions)
     by_name = [
         (session.name, each)
         for session in sessions

@@ -48,50 +48,27 @@ def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
         return None
     best = pooled[0]
     return max(
-        (
-            each
-            for each in pooled
-            if each.beam == best.beam and each.sessions >= _NEARLY_ALL * best.sessions
-        ),
+        (each for each in pooled if each.sessions >= _NEARLY_ALL * best.sessions),
         key=lambda each: len(STRUCTURES[each.structure].free),
     )
 
 
-def common_structure(
-    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
-) -> str | None:
+def common_structure(sessions: Sequence[SessionResult]) -> str | None:
     """Name the structure by which the modes of all sessions are compared.
 
     Parameters
     ----------
     sessions : sequence of SessionResult
-    pooled : sequence of PooledEstimate
-        The lowest BIC first.
 
     Returns
     -------
     str or None
-        The freest of those fitted to every session: on the beam of what is pooled, or with nothing
-        pooled on the one that most sessions select. None without whole-record fits.
+        The freest of those fitted to every session. None without whole-record fits.
     """
     fitted = by_structure(sessions)
     tried = max(map(len, fitted.values()), default=0)
     found = [each[0] for each in fitted.values() if len(each) == tried]
-    if not found:
-        return None
-    beam = pooled[0].beam if pooled else _usual_beam(sessions)
-    on_beam = [each for each in found if each.beam == beam] or found
-    return max(on_beam, key=_freedom).name
-
-
-def _usual_beam(sessions: Sequence[SessionResult]) -> str:
-    """Beam of the structure that most sessions select by themselves."""
-    beams = [
-        min(session.record_estimates, key=lambda each: each.bic).beam
-        for session in sessions
-        if session.record_estimates
-    ]
-    return max(beams, key=beams.count)
+    return max(found, key=_freedom).name if found else None
 
 
 def _freedom(estimate: RecordEstimate) -> int:
@@ -264,14 +241,9 @@ def _judged(
         return "compatible", None
     if free is None or _wide(free.interval) > WIDEST_SHARE:
         return "not identifiable", "the sessions do not determine the order"
-    if not freest.uniform and len(structure.free) > modes:
-        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
-        return "not identifiable", (f"on a non-uniform beam only {modes} loss factors determine it")
     if not _adequate(verdicts):
         return "open", _UNEXPLAINED
     integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
-    if any(each.beam != freest.beam for each in integer):
-        return "open", "order 1 on another kind of beam explains the records about as well"
     low, high = free.interval
     if low <= 1 <= high:
         return "compatible", None

@@ -15,7 +15,7 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -246,10 +246,6 @@ class PooledEstimate:
     ----------
     structure : str
         Name.
-    uniform : bool
-        Whether the beam was taken to be uniform; else each mode has its own stiffness.
-    beam : str
-        As of `RecordEstimate`.
     plant : Plant
         Plant of the pooled parameters.
     parameters : tuple of PooledParameter
@@ -268,8 +264,6 @@ class PooledEstimate:
     """
 
     structure: str
-    uniform: bool
-    beam: str
     plant: Plant
     parameters: tuple[PooledParameter, ...]
     covariance: NDArray[np.float64]
@@ -281,7 +275,7 @@ class PooledEstimate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return f"{self.structure}{self.beam}"
+        return self.structure
 
     @property
     def sizes(self) -> tuple[PooledSize, ...]:
@@ -324,7 +318,7 @@ def by_structure(sessions: Sequence[SessionResult]) -> dict[str, list[RecordEsti
 
 def determines_damping(estimate: RecordEstimate) -> bool:
     """Whether a session determines its structure's damping, and the modes' offsets if free."""
-    return set(_of_specimen(estimate)) <= set(estimate.determined)
+    return set(STRUCTURES[estimate.structure].free) <= set(estimate.determined)
 
 
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
@@ -351,8 +345,6 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
     return PooledEstimate(
         structure=used[0].structure,
-        uniform=used[0].uniform,
-        beam=used[0].beam,
         plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
         parameters=parameters,
         covariance=effects.covariance,
@@ -374,19 +366,13 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
     that some session leaves undetermined cannot be shared: it counts in every session. One session
     shares with none, and loses nothing.
     """
-    of_specimen = _of_specimen(estimates[0])
+    of_specimen = STRUCTURES[estimates[0].structure].free
     shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
     deviance = sum(e.deviance for e in estimates)
     if shared and len(estimates) >= _FEWEST:
         deviance += random_effects(*_stacked(estimates, shared)).deviance
     each_its_own = (len(of_specimen) - len(shared)) * sum(math.log(e.values) for e in estimates)
     return deviance + len(shared) * math.log(sum(e.values for e in estimates)) + each_its_own
-
-
-def _of_specimen(estimate: RecordEstimate) -> tuple[str, ...]:
-    """Name the free parameters that are the specimen's: damping, and offsets of the modes."""
-    offsets = (name for name in estimate.parameters if name.startswith("stiffness_offset"))
-    return (*STRUCTURES[estimate.structure].free, *offsets)
 
 
 def _stacked(
@@ -432,15 +418,12 @@ def _block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64
 def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
     stiffness = values["bending_stiffness_n_m2"]
     free = STRUCTURES[like.structure].free
-    return Plant(
+    return replace(
+        like.plant,
         beam=Beam(
             like.plant.beam.length_m, values["density_over_stiffness"] * stiffness, stiffness
         ),
         damping=STRUCTURES[like.structure].damping({name: values[name] for name in free}),
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
-        stiffness_offsets=tuple(
-            values[name] for name in like.parameters if name.startswith("stiffness_offset")
-        ),
-        **{name: values.get(name, own) for name, own in like.plant.extras.items()},
     )

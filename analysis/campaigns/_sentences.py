@@ -38,7 +38,6 @@ _LEAST: Final = 1e-99
 _OF_MODES: Final = {
     "frequency_hz": ("frequency", 1.0, "Hz"),
     "damping_ratio": ("damping ratio", 100.0, "%"),
-    "stiffness_offset": ("stiffness", 100.0, "% above mode 1"),
 }
 
 
@@ -244,7 +243,6 @@ def answer(
     Parameters
     ----------
     freest : PooledEstimate
-        On the beam that all sessions support.
     alpha, lambda_ : PooledOrder
     validation : sequence of LeftOutError
     """
@@ -252,7 +250,7 @@ def answer(
     dampings = f"{_answered(alpha)}{joint}{_answered(lambda_)}"
     said = f"{dampings[0].upper()}{dampings[1:]}."
     errors: dict[str, list[str]] = {}
-    for name in dict.fromkeys((f"{_CLASSICAL}{freest.beam}", freest.name)):
+    for name in dict.fromkeys((_CLASSICAL, freest.name)):
         its = [e.error for e in validation if e.method == "record" and e.name == name]
         if its:
             errors.setdefault(f"{100 * float(np.mean(its)):.2g} %", []).append(name)
@@ -309,7 +307,6 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     Parameters
     ----------
     freest : PooledEstimate
-        On the beam that all sessions support.
     best : PooledEstimate
         Estimate of the lowest BIC.
     """
@@ -321,12 +318,12 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
         else ", so its intervals hold for any simpler one, too."
     )
     said = (
-        f"The numbers are those of type {freest.name}: {_damping(freest.structure)}"
-        f"{_on_beam(freest)}. It is the freest structure that the sessions determine{so}"
+        f"The numbers are those of type {freest.name}: {_damping(freest.structure)}. "
+        f"It is the freest structure that the sessions determine{so}"
     )
     if best.name != freest.name:
         said += (
-            f" Type {best.name} has the lowest BIC ({_damping(best.structure)}{_on_beam(best)}); "
+            f" Type {best.name} has the lowest BIC ({_damping(best.structure)}); "
             "its intervals are narrower, and valid only if it is true."
         )
     return said
@@ -438,7 +435,6 @@ def welch_bias(
     Parameters
     ----------
     freest : PooledEstimate
-        On the beam that all sessions support.
     biases : sequence of WelchBias
     withheld : collection of str
         Orders that are not reported; their coefficients are not, either.
@@ -558,12 +554,6 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
         f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Prediction errors are averaged "
         "over those predicted."
     ]
-
-
-def _on_beam(estimate: PooledEstimate) -> str:
-    modes = "" if estimate.uniform else ", on a non-uniform beam (stiffness correction per mode)"
-    more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
-    return f"{modes}, with {more}" if more else modes
 
 
 def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:

@@ -76,7 +76,7 @@ class SessionResult:
     welch_fits : tuple of WelchFit
         By type, then by weighting; none if Welch's method does not suit the session.
     record_estimates : tuple of RecordEstimate
-        By type, those of a uniform beam first; empty if none was asked for, or the record could
+        By type; empty if none was asked for, or the record could
         not be used.
     verdict : Verdict or None
         What the whole record says by itself, None without estimates.
@@ -287,4 +287,4 @@ def _estimates(
         for each in whole.selection.candidates
         if each.fit.structure.name in structures or each.fit is whole.fit
     ]
-    return tuple(sorted(asked, key=lambda each: (not each.uniform, order.index(each.structure))))
+    return tuple(sorted(asked, key=lambda each: order.index(each.structure)))

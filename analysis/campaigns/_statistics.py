@@ -253,9 +253,6 @@ class RankedStructure:
     Attributes
     ----------
     structure : str
-    uniform : bool
-    beam : str
-        As of `RecordEstimate`.
     fitted : int
         Sessions to which it was fitted.
     determined : int
@@ -272,8 +269,6 @@ class RankedStructure:
     """
 
     structure: str
-    uniform: bool
-    beam: str
     fitted: int
     determined: int
     selected_alone: int
@@ -284,7 +279,7 @@ class RankedStructure:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return f"{self.structure}{self.beam}"
+        return self.structure
 
 
 def ranked_structures(
@@ -307,8 +302,6 @@ def ranked_structures(
     found = [
         RankedStructure(
             structure=each[0].structure,
-            uniform=each[0].uniform,
-            beam=each[0].beam,
             fitted=len(each),
             determined=sum(map(determines_damping, each)),
             selected_alone=alone[name],

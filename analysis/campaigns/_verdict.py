@@ -134,8 +134,6 @@ class CampaignVerdict:
         Structure that the numbers are of, as tables call it: the freest on the beam selected.
     structure : str
         Structure of the lowest BIC: "I" to "VII".
-    uniform : bool
-        Whether the beam selected is uniform.
     rivals : tuple of str
         Structures, as tables call them, that all data together cannot tell from it.
     sessions : int
@@ -158,7 +156,6 @@ class CampaignVerdict:
 
     headline: str
     structure: str
-    uniform: bool
     rivals: tuple[str, ...]
     sessions: int
     alone: Mapping[str, int]
@@ -223,7 +220,6 @@ def campaign_verdict(
     return CampaignVerdict(
         headline=freest.name,
         structure=best.structure,
-        uniform=best.uniform,
         rivals=tuple(each.name for each in close),
         sessions=len(verdicts),
         alone=alone,

@@ -8,19 +8,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND, PLAIN, Candidate, Kind
+from analysis.identify._candidate import FAR_BEHIND, Candidate
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
-from analysis.identify._knock import knock_in, with_knock
 from analysis.identify._leakage import without_leakage
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import free_settings
-from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
+from analysis.identify._refit import FEW, MANY, MISSED, Refit
 from analysis.identify._residual_tests import whiteness
-from analysis.identify._rivals import with_extras
 from analysis.identify._search import RENEWALS
-from analysis.identify._visible_modes import visible_modes
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
@@ -37,12 +34,12 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 
-FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
-"""Structures always tried on a beam that is not uniform: those of a material of integer order."""
+INTEGER_INTERNAL: Final = (STRUCTURES["III"], STRUCTURES["VII"])
+"""Structures of both dampings whose material has an integer order."""
 
 _DISMISSED: Final = 10.0
-"""Difference of BIC by which another kind of rig must be better to be told instead of a uniform
-beam, and by which orders that are freed must be better for the noise to be estimated again."""
+"""Difference of BIC by which orders that are freed must be better for the noise to be estimated
+again."""
 
 _SHOWS: Final = 4.0
 """Deviance that a damping must save to stay in the freest structure: one that saves less moves no
@@ -98,22 +95,6 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure on every kind of rig that promises something.
-
-        Raises
-        ------
-        MeasurementError
-            The record cannot be used.
-        """
-        return cls.of_uniform(measurement, fixed, band_hz).with_other_rigs(fixed, band_hz)
-
-    @classmethod
-    def of_uniform(
-        cls,
-        measurement: Measurement,
-        fixed: tuple[Setting, ...],
-        band_hz: tuple[float, float],
-    ) -> CandidateSet:
         """Fit every structure on a uniform beam; the freest alone where a sign or a unit is wrong.
 
         Raises
@@ -126,40 +107,6 @@ class CandidateSet:
             return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
         field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
         return field._without_leakage()
-
-    def with_other_rigs(
-        self, fixed: tuple[Setting, ...], band_hz: tuple[float, float]
-    ) -> CandidateSet:
-        """Add what `of_uniform` leaves out: modes with stiffnesses of their own, and extras.
-
-        Parameters
-        ----------
-        fixed : tuple of str
-            As there.
-        band_hz : tuple of float
-            As there.
-        """
-        if self.misread:
-            return self
-        field, measurement = self, self.comparison.measurement
-        likeliest = field.likeliest
-        if not field.all_but_white(likeliest):
-            found = knock_in(field) if not measurement.knocks else None
-            if found is not None and found.obvious:
-                struck = self.of(with_knock(measurement, found), fixed, band_hz)
-                if struck.all_but_white(struck.likeliest):
-                    if struck.best.kind == PLAIN:
-                        return struck
-                    # Obvious beside a uniform beam: this rig may need no knock.
-                    without = self.from_earlier(struck.candidates, measurement, fixed, band_hz)
-                    return without or struck
-        if field.shows_modes:
-            field = (
-                field._with_modes_free(likeliest)
-                if field.all_but_white(likeliest)
-                else field._with_modes_searched(measurement, fixed, band_hz)
-            )
-        return with_extras(field.cross_checked()._renewed())._renewed()
 
     @classmethod
     def from_earlier(
@@ -190,23 +137,16 @@ class CandidateSet:
             The record cannot be used.
         """
         first, *others = earlier
-        plain = first.kind == PLAIN
         if first.columns:
-            return None  # what was not linear is looked for anew, beside what is
-        free = free_settings(fixed)
-        modes = 1 + len(first.fit.plant.stiffness_offsets)
-        unknowns = Unknowns.of(first.structure, measurement.nominal, free, modes, first.extras)
+            return None  # what was not linear is searched for again, in all of the record
+        unknowns = Unknowns.of(first.structure, measurement.nominal, free_settings(fixed))
         found = refit_record(measurement, unknowns, first.fit.plant, band_hz=band_hz)
         if found is None:
             return None
         field = cls._fitted(found, fixed, (replace(first, fit=found.fits[0]),))
         before = replace(field, candidates=tuple(earlier))
-        every = (before._brought_to(field, c, MANY) for c in others if not (plain and c.extras))
+        every = (before._brought_to(field, c, MANY) for c in others)
         field = field.ranked((*field.candidates, *every))._without_leakage().cross_checked()
-        if plain:  # little speaks for anything beside such a beam: more data may change that
-            if field.shows_modes and all(c.uniform for c in field.candidates):
-                field = field._with_modes_free(field.likeliest).cross_checked()
-            field = with_extras(field)
         return field._renewed()
 
     @classmethod
@@ -232,9 +172,7 @@ class CandidateSet:
     @classmethod
     def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
         """Take over what was fitted with a uniform beam."""
-        return cls._fitted(
-            uniform, fixed, (Candidate(fit.structure, True, fit) for fit in uniform.fits)
-        )
+        return cls._fitted(uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits))
 
     @classmethod
     def _fitted(
@@ -257,37 +195,16 @@ class CandidateSet:
 
     @property
     def freest(self) -> Candidate:
-        """The freest structure that the record supports, on the kind of rig that it calls for.
+        """The freest structure that the record supports; a damping that does not show is left out.
 
         All orders are free, so its intervals hold whichever simpler structure is the true one;
-        those of the lowest BIC hold only if that is. For the same reason kinds of rig are compared
-        by their freest structures: with an order fixed, a tip mass or free modes stand for what
-        the order would be. The uniform beam without anything beside it gives way to a BIC that is
-        lower by 10 only.
+        those of the lowest BIC hold only if that is. The best where no structure was fitted with
+        its orders free.
         """
-        plain = self.freest_of(PLAIN)
-        other = self.freest_of(self.best.kind)
-        if plain is None or (other is not None and other.bic < plain.bic - _DISMISSED):
-            return other or self.best
-        return plain
-
-    def freest_of(self, kind: Kind) -> Candidate | None:
-        """Find the freest on one kind of rig; a damping that does not show is left out.
-
-        Parameters
-        ----------
-        kind : tuple of bool and tuple of str
-            As `Candidate.kind`.
-
-        Returns
-        -------
-        Candidate or None
-            None if no structure was fitted with its orders free there.
-        """
-        alike = {c.structure.name: c for c in self.candidates if c.kind == kind}
+        alike = {c.structure.name: c for c in self.candidates}
         freest = alike.get(_FREEST.name)
         if freest is None:
-            return None
+            return self.best
         lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
         least = min(lesser, key=lambda c: c.deviance, default=freest)
         return least if least.deviance - freest.deviance < _SHOWS else freest
@@ -296,42 +213,6 @@ class CandidateSet:
         """Put one candidate first: the one whose numbers are told."""
         others = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *others))
-
-    def other_kinds(self, within: float) -> tuple[Candidate, ...]:
-        """Return the best candidate of each other kind of rig that explains the record as well.
-
-        Parameters
-        ----------
-        within : float
-            By how much the BIC may be above the lowest.
-        """
-        best: dict[Kind, Candidate] = {}
-        for candidate in self.of_other_kinds(within):
-            best.setdefault(candidate.kind, candidate)
-        return tuple(best.values())
-
-    def of_other_kinds(self, within: float) -> tuple[Candidate, ...]:
-        """Return all candidates on other kinds of rig that explain the record as well.
-
-        A rig with nothing beside the beam is none of them where the freest structure has more: with
-        the same orders free that was far better. A simpler structure without it may yet have a low
-        BIC, for it saves on orders what it loses by the rig.
-
-        Parameters
-        ----------
-        within : float
-            By how much the BIC may be above the lowest.
-
-        Returns
-        -------
-        tuple of Candidate
-            The lowest BIC first.
-        """
-        beaten = {PLAIN, self.freest.kind}
-        ranked = _ranked(self.candidates)
-        return tuple(
-            each for each in ranked if each.kind not in beaten and each.bic < ranked[0].bic + within
-        )
 
     @property
     def likeliest(self) -> RecordFit:
@@ -343,33 +224,19 @@ class CandidateSet:
         """The lowest, comparable between fields whose noise has been estimated again."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
-    @property
-    def shows_modes(self) -> bool:
-        """Whether the record shows two modes at least: one alone has no stiffness of its own."""
-        return len(visible_modes(self.comparison, self.noise, self.likeliest)) > 1
-
-    def unknowns(
-        self, structure: Structure, uniform: bool, extras: tuple[str, ...] = ()
-    ) -> Unknowns:
+    def unknowns(self, structure: Structure) -> Unknowns:
         """Search space of a structure on this record."""
-        modes = 1 if uniform else self.comparison.visible_modes
-        nominal = self.comparison.measurement.nominal
-        return Unknowns.of(structure, nominal, self.free, modes, extras)
+        return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
         """Descend from where a candidate is."""
-        plant = candidate.fit.plant
-        return self.descent_from(plant, candidate.structure, candidate.kind, max_evaluations)
+        return self.descent_from(candidate.fit.plant, candidate.structure, max_evaluations)
 
     def descent_from(
-        self,
-        plant: Plant,
-        structure: Structure,
-        kind: Kind = PLAIN,
-        max_evaluations: int = MANY,
+        self, plant: Plant, structure: Structure, max_evaluations: int = MANY
     ) -> Refit:
-        """Descend from a plant, with a structure on a kind of rig."""
-        unknowns = self.unknowns(structure, *kind)
+        """Descend from a plant, with a structure."""
+        unknowns = self.unknowns(structure)
         return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
     def descent(
@@ -419,32 +286,6 @@ class CandidateSet:
         behind = c.bic - min(each.bic for each in self.candidates)
         return other.refit(c, max_evaluations if behind < FAR_BEHIND else _A_STEP).candidate()
 
-    def _with_modes_free(self, uniform: RecordFit) -> CandidateSet:
-        """Free the modes' stiffness from where a uniform beam explains the record."""
-        fits = {candidate.structure.name: candidate.fit for candidate in self.candidates}
-        found = []
-        for structure in FREE_STIFFNESS:
-            unknowns = self.unknowns(structure, uniform=False)
-            start = resonances_kept(unknowns, fits[structure.name], uniform.modes)
-            found.append(self.descent(unknowns, start, MANY).candidate())
-        return self.ranked((*self.candidates, *found))
-
-    def _with_modes_searched(
-        self,
-        measurement: Measurement,
-        fixed: tuple[Setting, ...],
-        band_hz: tuple[float, float],
-    ) -> CandidateSet:
-        """Search for the modes wherever they are; the noise is that of the likelier beam."""
-        loose = fit_record(measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False)
-        found = tuple(Candidate(fit.structure, False, fit) for fit in loose.fits)
-        every = replace(self, candidates=(*self.candidates, *found))
-        noise, closest = loose.noise, min(loose.fits, key=lambda f: f.cost)
-        common = noise.counts & self.noise.counts
-        if _deviance(noise, closest, common) > _deviance(self.noise, self.likeliest, common):
-            return every.under(self.noise)
-        return every.under(without_leakage(noise, self.comparison, closest))
-
     def cross_checked(self) -> CandidateSet:
         """Start each from where the best is: over a flat valley a search may miss what is there."""
         field = self
@@ -466,7 +307,7 @@ class CandidateSet:
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
-        outlook = self.descent_from(plant, structure, candidate.kind, 1)
+        outlook = self.descent_from(plant, structure, 1)
         least = candidate.fit.cost * (1 - MISSED)
         if outlook.promised_cost > least:
             return candidate
@@ -520,7 +361,7 @@ class CandidateSet:
         fixed[order] = 1.0  # type: ignore[index]
         free = tuple(name for name in PARAMETERS if name not in fixed)
         both = replace(structure, free=free, fixed=fixed)
-        unknowns = self.unknowns(both, candidate.uniform, candidate.extras)
+        unknowns = self.unknowns(both)
         place = unknowns.names.index(coefficient)
         little = self.descent(unknowns, unknowns.vector(own.plant), 1)
         growth = 1 + float(little.promised_step[place])  # linear in the loss, not in its logarithm
@@ -537,14 +378,14 @@ class CandidateSet:
         return self.descent(unknowns, x, 1).fit(), True
 
     def with_orders_free(self) -> CandidateSet:
-        """Free the orders too, on a beam of the best's kind, if that was not done."""
+        """Free the orders too, if that was not done."""
         best = self.best
-        alike = {c.structure.name: c.fit for c in self.candidates if c.kind == best.kind}
+        alike = {c.structure.name: c.fit for c in self.candidates}
         found: list[Refit] = []
         added: list[Candidate] = []
 
         def fitted(structure: Structure) -> RecordFit:
-            found.append(self.descent_from(best.fit.plant, structure, best.kind))
+            found.append(self.descent_from(best.fit.plant, structure))
             added.append(found[-1].candidate())
             return added[-1].fit
 
@@ -560,18 +401,9 @@ class CandidateSet:
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
-        """Fit all again, with what is not linear beside the beam.
-
-        Extras that stood for it, and do nothing beside it, are left out.
-        """
+        """Fit all again, with what is not linear in addition to the beam."""
         other = replace(self, columns=columns, noise=noise)
-        other = other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
-        bare = {(c.structure.name, c.uniform): c.bic for c in other.candidates if not c.extras}
-        return other.ranked(
-            c
-            for c in other.candidates
-            if not c.extras or c.bic < bare.get((c.structure.name, c.uniform), math.inf)
-        )
+        return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
 
     def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
         """Hold these candidates, the lowest BIC first."""
@@ -595,9 +427,3 @@ def _may_lack_one(fit: RecordFit) -> list[Structure]:
 
 def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     return tuple(sorted(candidates, key=lambda candidate: candidate.bic))
-
-
-def _deviance(noise: Noise, fit: RecordFit, bins: NDArray[np.bool_]) -> float:
-    """``-2 ln`` likelihood of a fit under its noise, in some of the bins."""
-    squares = float(np.sum(np.abs(fit.residual[bins]) ** 2))
-    return squares + 2 * float(np.sum(np.log(noise.power[bins])))

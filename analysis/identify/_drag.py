@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidates import FREE_STIFFNESS
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.identify._refit import MISSED, Refit
 from analysis.models import STRUCTURES
@@ -31,8 +30,6 @@ from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
@@ -142,15 +139,11 @@ def with_evident_drag(uniform: CandidateSet) -> CandidateSet:
     Returns
     -------
     CandidateSet
-        The one given, unless drag is evident; else with `drag` in all candidates, beams whose modes
-        have stiffnesses of their own among them.
+        The one given, unless drag is evident; else with `drag` in all candidates.
     """
     if uniform.misread or not _is_evident(uniform):
         return uniform
-    kinds = [(c.structure, True) for c in uniform.candidates]
-    if uniform.shows_modes:
-        kinds += [(structure, False) for structure in FREE_STIFFNESS]
-    found = _with_drag(uniform, kinds)
+    found = _with_drag(uniform)
     return found if found.drag is not None and found.all_but_white(found.likeliest) else uniform
 
 
@@ -171,43 +164,34 @@ def with_air_drag(field: CandidateSet) -> CandidateSet:
     Parameters
     ----------
     field : CandidateSet
-        Without drag, on all kinds of rig that promise something.
+        Without drag.
 
     Returns
     -------
     CandidateSet
         The one given, if there is no drag; else with `drag`, the lowest BIC first.
     """
-    if not _promising(field):
-        return field
-    return _with_drag(field, [(c.structure, c.uniform) for c in _without_extras(field)])
+    return _with_drag(field) if _promising(field) else field
 
 
-def _with_drag(field: CandidateSet, kinds: Sequence[tuple[Structure, bool]]) -> CandidateSet:
-    """Fit structures, on uniform beams or not, with drag; the set given if that is no better."""
-    lead = next(
-        (c for c in _without_extras(field) if c.uniform and c.structure.name == _LEAD), None
-    )
+def _with_drag(field: CandidateSet) -> CandidateSet:
+    """Fit all structures with drag; the set given if that is no better."""
+    lead = next((c for c in field.candidates if c.structure.name == _LEAD), None)
     start = None if lead is None else _start(field, lead)
     if start is None:
         return field
-    settled = _settled(field, start, STRUCTURES[_LEAD], uniform=True, tolerance=_ROUGHLY)
+    settled = _settled(field, start, STRUCTURES[_LEAD], tolerance=_ROUGHLY)
     if settled is None:
         return field
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
     known, point = settled.objective.comparison, _Point.of(settled)
     for name in (_FREEST, _LEAD):
-        settled = _settled(field, point, STRUCTURES[name], uniform=True, known=known)
+        settled = _settled(field, point, STRUCTURES[name], known=known)
         if settled is not None:
             break
     else:
         return field
-    found = _all(field, settled, kinds)
-    if not found.best.uniform:
-        best = found.best
-        point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
-        settled = _settled(field, point, best.structure, uniform=False) or settled
-        found = _all(field, settled, kinds)
+    found = _all(field, settled)
     assert found.drag is not None
     return found if found.drag.value_m > 0 and found.bic < field.bic else field
 
@@ -229,19 +213,10 @@ class _Point:
         return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
-def _without_extras(field: CandidateSet) -> tuple[Candidate, ...]:
-    """Candidates beside which drag may stand.
-
-    What has extras is compared with those, and goes with the drag: drag is computed for a bare beam
-    on a rigid clamp, and it shifts modes as extras do.
-    """
-    return tuple(candidate for candidate in field.candidates if not candidate.extras)
-
-
 def _promising(field: CandidateSet) -> bool:
     """Whether some structure with drag could be better than the best without."""
     best = field.best
-    for candidate in _without_extras(field):
+    for candidate in field.candidates:
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
         refit = field.refit(candidate, 1)
@@ -284,7 +259,6 @@ def _settled(
     point: _Point,
     structure: Structure,
     *,
-    uniform: bool,
     tolerance: float = _SETTLED,
     known: Comparison | None = None,
 ) -> Refit | None:
@@ -297,7 +271,6 @@ def _settled(
     point : _Point
         Where to start.
     structure : Structure
-    uniform : bool
     tolerance : float
         Squares that a further step may still save.
     known : Comparison, optional
@@ -308,7 +281,7 @@ def _settled(
     Refit or None
         None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
-    unknowns = field.unknowns(structure, uniform)
+    unknowns = field.unknowns(structure)
     x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
     comparison, roughly, saved = known, tolerance > _SETTLED, math.inf
@@ -355,10 +328,8 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(
-    field: CandidateSet, settled: Refit, kinds: Iterable[tuple[Structure, bool]]
-) -> CandidateSet:
-    """Fit structures with the drag settled in one, and say how large it is."""
+def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
+    """Fit all structures with the drag that one has settled on, and estimate its size."""
     other = replace(
         field,
         comparison=settled.objective.comparison,
@@ -368,8 +339,8 @@ def _all(
     least = other.descent(settled.objective.unknowns, settled.x, 1).cost
     most = least * math.exp(_HOPELESS / field.best.values)
     begun = []
-    for structure, uniform in kinds:
-        unknowns = other.unknowns(structure, uniform)
+    for each in field.candidates:
+        unknowns = other.unknowns(each.structure)
         refit = Refit.descend(
             other.comparison,
             unknowns,
@@ -381,12 +352,8 @@ def _all(
             hopeless=(_A_LOOK, most),
         )
         begun.append((refit.candidate(), refit))
-    best = min((candidate for candidate, _ in begun), key=lambda each: each.bic)
     candidates = [
-        # Of beams of another kind nothing counts but their BIC.
-        refit.further(_MANY).candidate()
-        if candidate.kind == best.kind and refit.promised_cost < most
-        else candidate
+        refit.further(_MANY).candidate() if refit.promised_cost < most else candidate
         for candidate, refit in begun
     ]
     found = other.ranked(candidates).cross_checked()
@@ -395,11 +362,7 @@ def _all(
 
 def _estimate(field: CandidateSet) -> DragEstimate:
     """Drag with its deviation, beside all the damping that the best beam may have."""
-    best = field.best
-    freest = max(
-        (c for c in field.candidates if c.kind == best.kind),
-        key=lambda c: (len(c.structure.free), -c.bic),
-    )
+    freest = max(field.candidates, key=lambda c: (len(c.structure.free), -c.bic))
     refit = field.refit(freest)
     law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom

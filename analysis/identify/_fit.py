@@ -60,7 +60,6 @@ def fit_record(
     *,
     fixed: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
-    uniform: bool = True,
 ) -> RecordAnalysis:
     """Fit structures to a whole record in the band.
 
@@ -81,9 +80,6 @@ def fit_record(
         Settings (`SETTINGS`) that stay at the values the file states.
     band_hz : tuple of float
         First and last frequency compared.
-    uniform : bool
-        Whether the beam is taken to be uniform, as Eq. 25 has it; otherwise the stiffness of each
-        mode in the band but the first is free as well.
 
     Raises
     ------
@@ -102,10 +98,7 @@ def fit_record(
     coarse = CoarseResponse(comparison)
     searches = [
         Search.of(Objective(comparison, unknowns), coarse)
-        for unknowns in (
-            Unknowns.of(structure, nominal, free, 1 if uniform else comparison.visible_modes)
-            for structure in structures
-        )
+        for unknowns in (Unknowns.of(structure, nominal, free) for structure in structures)
     ]
     closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
     reference = searches[closest].lowest()

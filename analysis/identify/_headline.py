@@ -14,14 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._verdict import (
-    ANOTHER_DAMPING,
-    BESIDE_DRAG,
-    EXCLUDED,
-    ORDER_ONE_ELSEWHERE,
-    OTHER_ORDER_ELSEWHERE,
-    STRONG,
-)
+from analysis.identify._verdict import ANOTHER_DAMPING, BESIDE_DRAG, EXCLUDED, STRONG
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -49,13 +42,9 @@ _NOT_APART: Final = "not separable from a damping of unknown order"
 
 ONE_MODE: Final = "one mode alone does not separate internal from external damping"
 
-_BY_RIVALS: Final = (ORDER_ONE_ELSEWHERE, OTHER_ORDER_ELSEWHERE)
-
 _LAW_ASSUMED: Final = (
     "the stiffness depends on the deflection, and only its lowest power was fitted"
 )
-_OF_FREQUENCIES: Final = ("density_over_stiffness", "stiffness_offset")
-
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
 NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
@@ -81,16 +70,12 @@ class Quantity:
         None as above.
     flag : str or None
         Why it is not a property of the antenna or the rig; None if it is.
-    std_any_rig : float or None
-        Standard deviation whichever kind of rig is the true one, where another kind explains the
-        record about as well and nothing else makes the value doubtful; else None.
     """
 
     value: float
     std: float | None
     interval_95: tuple[float, float] | None
     flag: str | None = None
-    std_any_rig: float | None = None
 
     def admits(self, value: float) -> bool:
         """Whether a value lies in the 95 % interval; any does where there is none.
@@ -109,31 +94,7 @@ class Quantity:
         ----------
         flag : str or None
         """
-        if flag is None:
-            return self
-        # With another reason for doubt, no deviation covers it.
-        return replace(self, flag=self.flag or flag, std_any_rig=None)
-
-    def with_rival(self, value: float, std: float | None, flag: str | None) -> Quantity:
-        """Count in what another kind of rig, which explains the record as well, would have.
-
-        Parameters
-        ----------
-        value : float
-            The same quantity there.
-        std : float or None
-            Its standard deviation; None if the data do not tell.
-        flag : str or None
-            The reason for doubt, if that value lies outside the interval here.
-        """
-        told = self if self.admits(value) else self.flagged(flag)
-        so_far = self.std_any_rig
-        if so_far is None:
-            if self.std is None or self.flag not in (None, *_BY_RIVALS):
-                return told
-            so_far = self.std
-        away = math.inf if std is None else math.hypot(std, value - self.value)
-        return replace(told, std_any_rig=max(so_far, away))
+        return self if flag is None else replace(self, flag=self.flag or flag)
 
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it."""
@@ -143,7 +104,6 @@ class Quantity:
             "std": self.std,
             "interval_95": ends,
             "flag": self.flag,
-            "std_any_rig": self.std_any_rig,
         }
 
 
@@ -311,7 +271,7 @@ class Headline(Numbers):
         return replace(
             self,
             parameters={
-                name: each.flagged(_LAW_ASSUMED) if name.startswith(_OF_FREQUENCIES) else each
+                name: each.flagged(_LAW_ASSUMED) if name == "density_over_stiffness" else each
                 for name, each in self.parameters.items()
             },
             modes=tuple(
@@ -376,9 +336,6 @@ def headline(
             drag_speed_m_s=drag.speed_m_s,
         )
     simpler = _simpler(field, fractional) if unexplained is None else None
-    best = field.other_kinds(STRONG)
-    for other in field.of_other_kinds(STRONG):
-        told = _doubted_by(told, other, flagging=any(other is each for each in best))
     return replace(told, structures=structures(field, fractional), simpler=simpler)
 
 
@@ -455,9 +412,9 @@ def structures(
 ) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
-    A special case of the freest structure on the same beam is excluded by the likelihood ratio;
-    any other structure where its likelihood is lower by as much and its BIC is higher
-    than the lowest by 10. One that explains the record with more than it takes is not excluded.
+    A special case of the freest structure is excluded by the likelihood ratio; any other structure
+    where its likelihood is lower by as much and its BIC is higher than the lowest by 10. One that
+    explains the record with more than it takes is not excluded.
     What fixes an order at 1 that the record excludes is excluded with it.
 
     Parameters
@@ -477,7 +434,7 @@ def _status(
     if candidate is freest:
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
-    if not simpler or candidate.kind != freest.kind:
+    if not simpler:
         behind = candidate.deviance - freest.deviance > EXCLUDED[0]
         worse = candidate.bic > field.best.bic + STRONG
         return "excluded" if behind and worse else "compatible"
@@ -492,14 +449,12 @@ def _status(
 
 
 def _simpler(field: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
-    """Find the simplest structure that would do: of those compatible on the same beam."""
+    """Find the simplest structure that would do."""
     freest = field.freest
     would_do = [
         each
         for each in field.candidates
-        if each.kind == freest.kind
-        and each.parameters < freest.parameters
-        and _status(field, each, fractional) == "compatible"
+        if each.parameters < freest.parameters and _status(field, each, fractional) == "compatible"
     ]
     if not would_do:
         return None
@@ -547,47 +502,6 @@ def size_of(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     spread = NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
-
-
-def _doubted_by(told: Headline, other: Candidate, *, flagging: bool) -> Headline:
-    """Count in another kind of rig that explains the record as well; flag what it has elsewhere."""
-    reason = f"type {other.name} fits the record equally well with another value"
-    flag = reason if flagging else None
-    values, std = other.fit.parameters, other.fit.std
-
-    parameters = {
-        name: each.with_rival(values[name], std[name], flag) if name in values else each
-        for name, each in told.parameters.items()
-    }
-    sizes = tuple(
-        each if flag is None or each.size.admits(_loss(values, each)) else each.flagged(flag)
-        for each in told.sizes
-    )
-    theirs = {mode.number: mode for mode in other.fit.modes}
-
-    def moved(mine: Mode) -> Mode:
-        its = theirs[mine.number]
-        return replace(
-            mine,
-            frequency_hz=mine.frequency_hz.with_rival(its.frequency_hz, its.frequency_std_hz, flag),
-            damping_ratio=mine.damping_ratio.with_rival(
-                its.damping_ratio, its.damping_ratio_std, flag
-            ),
-        )
-
-    modes = tuple(moved(mode) if mode.number in theirs else mode for mode in told.modes)
-    return replace(told, parameters=parameters, sizes=sizes, modes=modes)
-
-
-def _loss(values: Mapping[str, float], each: Size) -> float:
-    """Loss factor of a damping at the frequency of a size, or its coefficient."""
-    coefficient, order = NAMES[each.damping]
-    omega = each.omega_rad_s
-    if omega is None:
-        return values[coefficient]
-    stored = 1.0 if each.damping == "internal" else values["density_over_stiffness"] * omega**2
-    lost = values[coefficient] * math.pow(omega, values[order])
-    return lost * math.sin(math.pi / 2 * values[order]) / stored
 
 
 def _bounded(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:

@@ -179,7 +179,7 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
         if not whiteness(fit.residual[counts], analysis.comparison.frequency_hz[counts]).white:
             continue
         plain = comparison.without_hum(()).with_rest_of(fit.plant)
-        unknowns = Unknowns.of(_FREEST, measurement.nominal, field.free, 1)
+        unknowns = Unknowns.of(_FREEST, measurement.nominal, field.free)
         there = partial(
             Refit.descend, plain, unknowns, unknowns.vector(fit.plant), max_evaluations=1
         )

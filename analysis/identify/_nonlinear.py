@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidates import FREE_STIFFNESS
+from analysis.identify._candidates import INTEGER_INTERNAL
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
 from analysis.identify._refit import Refit
@@ -231,14 +231,9 @@ def nonlinear_forces(
 def _leads(field: CandidateSet) -> tuple[Candidate, ...]:
     """Candidates to start from: the best, and before it those that are simpler."""
     best = field.best
-    if best.uniform and "alpha" not in best.structure.free:
+    if "alpha" not in best.structure.free:
         return (best,)
-    simple = (
-        c
-        for c in field.candidates
-        if c.uniform and c.extras == best.extras and c.structure in FREE_STIFFNESS
-    )
-    return (*simple, best)
+    return (*(c for c in field.candidates if c.structure in INTEGER_INTERNAL), best)
 
 
 def _added(

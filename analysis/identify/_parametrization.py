@@ -12,13 +12,7 @@ directly; orders then change alone:
 * the stiffness that counts with its damping, ``EI |1 + z exp(j alpha pi/2)|``, and likewise
   density over stiffness, ``rho/EI |1 - g exp(j lambda pi/2)| / |1 + z exp(j alpha pi/2)|``, both
   as logarithms relative to the nominal beam's;
-* the delay in ms, the tool inertia relative to the nominal beam's, and the relative offsets of
-  the modes' stiffness;
-* of the `EXTRAS` those that a candidate carries: the root's compliance relative to the nominal
-  beam's L/EI, the tip's mass relative to its mass, time constants in ms, the clocks' difference in
-  units of 1e-5. To first order a tip mass does what density and stiffness do, and a filter what a
-  delay does. So where they are free, the other unknowns are those of a bare beam whose first mode
-  and torque are the same, and of the delay with the filter's own.
+* the delay in ms, and the tool inertia relative to the nominal beam's.
 
 Where damping is larger than the stiffness or inertia it adds to, loss and order make up for each
 other: what shows is the phase theta of ``1 ± size exp(j order pi/2)``, and at constant theta they
@@ -30,20 +24,19 @@ in place of ``ln loss`` and the order (`Steps`); where the damping is small the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import EXTRAS, OF_BEAM, SETTINGS, Plant
-from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
+from analysis.identify._plant import SETTINGS, Plant
 from analysis.models import ORDER_RANGE, SIZE_RANGE
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -56,23 +49,6 @@ if TYPE_CHECKING:
 _BEAM_RANGE: Final = math.log(3.0)
 _DELAY_UNIT_S: Final = 1e-3
 _DELAY_RANGE_S: Final = 0.02
-_OFFSET_RANGE: Final = 0.5
-_TIME_CONSTANT_UNIT_S: Final = 1e-3
-_CLOCK_UNIT: Final = 1e-5
-_EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
-    {
-        "root_compliance_rad_per_nm": (0.0, 0.5),
-        "tip_mass_kg": (0.0, 1.0),
-        "filter_time_constant_s": (0.0, 10.0),
-        "second_order_filter_time_constant_s": (0.0, 10.0),
-        "clock_rate_difference": (-100.0, 100.0),
-    }
-)
-_TIP: Final = "tip_mass_kg"
-_FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
-    {"filter_time_constant_s": 1.0, "second_order_filter_time_constant_s": 2**0.5}
-)
-"""Delay of a filter at low frequency over its time constant."""
 
 _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "density_over_stiffness": "ln_density_over_stiffness",
@@ -85,40 +61,27 @@ _SMALL: Final = 1e-5
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Vector of unknowns of one structure: its damping, the free settings, offsets and extras.
+    """Vector of unknowns of one structure: its damping, and the free settings.
 
     Attributes
     ----------
     structure : Structure
     nominal : Plant
-        Settings that are not free stay at its values; its damping does not matter.
+        All that is not free stays at its values; its damping does not matter.
     free : tuple of str
         Free settings, in the order of `SETTINGS`.
-    offsets : tuple of str
-        Free offsets of the modes' stiffness: "stiffness_offset_2", ….
     omega_rad_s : tuple of float
         Undamped first and second mode of the nominal beam.
-    extras : tuple of str
-        Free extras, in the order of `EXTRAS`.
     """
 
     structure: Structure
     nominal: Plant
     free: tuple[Setting, ...]
-    offsets: tuple[str, ...]
     omega_rad_s: tuple[float, float]
-    extras: tuple[str, ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        structure: Structure,
-        nominal: Plant,
-        free: tuple[Setting, ...],
-        modes: int = 1,
-        extras: Collection[str] = (),
-    ) -> Unknowns:
-        """Unknowns of a structure with some settings free, and the stiffness of all but mode 1.
+    def of(cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...]) -> Unknowns:
+        """Unknowns of a structure with some settings free.
 
         Parameters
         ----------
@@ -128,21 +91,15 @@ class Unknowns:
             Beam and rig as the file states them.
         free : tuple of str
             Settings that are estimated.
-        modes : int
-            How many modes count; with 1 the beam is uniform.
-        extras : collection of str
-            Those of the `EXTRAS` that are free.
         """
         first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
         ordered = tuple(name for name in SETTINGS if name in free)
-        offsets = tuple(offset_name(mode) for mode in range(FIRST_OFFSET, modes + 1))
-        free_extras = tuple(name for name in EXTRAS if name in extras)
-        return cls(structure, nominal, ordered, offsets, (first, second), free_extras)
+        return cls(structure, nominal, ordered, (first, second))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in the vector's order."""
-        return (*self.structure.free, *self.free, *self.offsets, *self.extras)
+        return (*self.structure.free, *self.free)
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
@@ -164,8 +121,6 @@ class Unknowns:
             "delay_s": (-delay, delay),
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
-        ranges |= dict.fromkeys(self.offsets, (-_OFFSET_RANGE, _OFFSET_RANGE))
-        ranges |= _EXTRA_RANGES
         low, high = zip(*(ranges[name] for name in self.names), strict=True)
         return np.array(low), np.array(high)
 
@@ -216,13 +171,6 @@ class Unknowns:
             turn = _QUARTER_TURN * damping.lambda_
             at["gamma"], at["lambda"] = math.log(size * math.sin(turn)), damping.lambda_
             ln_ratio += math.log(abs(1 - size * complex(math.cos(turn), math.sin(turn))))
-        if _TIP in self.extras:
-            (more, _), (stiffer, _) = _bare_beam(at[_TIP])
-            ln_ratio -= more
-            ln_stiffness -= stiffer
-        for name, share in _FILTER_DELAYS.items():
-            if name in self.extras:
-                at["delay_s"] += share * plant.extras[name] / _DELAY_UNIT_S
         at |= {"density_over_stiffness": ln_ratio, "bending_stiffness_n_m2": ln_stiffness}
         return np.array([at[name] for name in self.names])
 
@@ -244,19 +192,17 @@ class Unknowns:
 
     def _plant_of(self, values: Mapping[str, float]) -> Plant:
         ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
-        return Plant(
+        return replace(
+            self.nominal,
             beam=Beam(self.nominal.beam.length_m, ratio * stiffness, stiffness),
             damping=self.structure.damping({name: values[name] for name in self.structure.free}),
             delay_s=values["delay_s"],
             tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
-            stiffness_offsets=tuple(values[name] for name in self.offsets),
-            **{name: values[name] for name in EXTRAS},
         )
 
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
-        """All parameters at `x`, those of `names` even where they are neutral."""
-        plant = self.plant(x)
-        return plant.parameters | {name: plant.extras[name] for name in self.extras}
+        """All parameters at `x`."""
+        return self.plant(x).parameters
 
     @cached_property
     def units(self) -> Mapping[str, float]:
@@ -265,12 +211,6 @@ class Unknowns:
         units = {
             "delay_s": _DELAY_UNIT_S,
             "tool_inertia_kg_m2": beam.inertia_kg_m2,
-            **dict.fromkeys(self.offsets, 1.0),
-            "root_compliance_rad_per_nm": beam.length_m / beam.bending_stiffness_n_m2,
-            "tip_mass_kg": beam.density_kg_per_m * beam.length_m,
-            "filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
-            "second_order_filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
-            "clock_rate_difference": _CLOCK_UNIT,
         }
         return MappingProxyType(units)
 
@@ -283,12 +223,12 @@ class Unknowns:
     def _given(self) -> Mapping[str, float]:
         """Parameters before any is set free."""
         fixed = dict(self.structure.fixed.items())
-        return MappingProxyType({**self.nominal.parameters, **self.nominal.extras, **fixed})
+        return MappingProxyType({**self.nominal.parameters, **fixed})
 
     def _linear(self, plant: Plant) -> dict[str, float]:
         """Unknowns of a plant that are linear, by name."""
-        values = plant.parameters | plant.extras
-        return {name: values.get(name, 0.0) / unit for name, unit in self.units.items()}
+        values = plant.parameters
+        return {name: values[name] / unit for name, unit in self.units.items()}
 
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
@@ -320,10 +260,6 @@ class Unknowns:
             inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
             if "lambda" in place:
                 derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
-        for name, (moved, slope) in zip(OF_BEAM, _bare_beam(given.get(_TIP, 0.0)), strict=True):
-            if name in place and _TIP in place:
-                values[name] *= math.exp(moved)
-                derivative[place[name], place[_TIP]] = slope
         for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
             if name in place:
                 added = sign * stiffening - (inertial if sign > 0 else 0.0)
@@ -338,10 +274,6 @@ class Unknowns:
         for name in units.keys() & place.keys():
             values[name] = given[name] * units[name]
             derivative[place[name], place[name]] = units[name]
-        for name, share in _FILTER_DELAYS.items():
-            if name in place and "delay_s" in place:
-                values["delay_s"] -= share * values[name]
-                derivative[place["delay_s"], place[name]] = -share * units[name]
         return values, derivative
 
     def _addition(
@@ -367,60 +299,6 @@ def _size(ln_loss: float, order: float) -> tuple[float, float]:
     """``ln size`` of a damping of that loss, and its slope by the order."""
     angle = _QUARTER_TURN * order
     return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)
-
-
-# Beam with a tip mass, in terms of a bare one
-
-_NEWTON_STEPS: Final = 30
-
-
-def ln_stiffness_with_tip(mode: int, share: float) -> float:
-    """Logarithm of the stiffness of a mode with a tip mass over that without, and all else equal.
-
-    Parameters
-    ----------
-    mode : int
-        From 1.
-    share : float
-        Mass of the tip, relative to the beam's.
-    """
-    return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
-
-
-def _bare_beam(share: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Logarithms of rho/EI and EI of a beam with a tip mass over those of one without, with slopes.
-
-    The bare beam has its first mode at the same frequency, and to first order the same torque.
-
-    Parameters
-    ----------
-    share : float
-        Mass of the tip, relative to the nominal beam's; the slopes are by it.
-    """
-    return _with_tip(float(eigenvalues(1)[0]), share), (share, 1.0)
-
-
-def _with_tip(bare: float, share: float) -> tuple[float, float]:
-    """Fourth power of a mode's root over that of the bare beam: logarithm, and slope by share."""
-    z = bare
-    for _ in range(_NEWTON_STEPS if share else 0):
-        value, by_z, _ = _tip_equation(z, share)
-        z -= value / by_z
-        if abs(value / by_z) < 1e-15 * z:
-            break
-    _, by_z, by_share = _tip_equation(z, share)
-    return 4 * math.log(z / bare), -4 * by_share / (by_z * z)
-
-
-def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
-    """``1 + cos z cosh z - share z (sin z cosh z - cos z sinh z)``, its slopes by z and share."""
-    sine, cosine, sinh, cosh = math.sin(z), math.cos(z), math.sinh(z), math.cosh(z)
-    pinned = sine * cosh - cosine * sinh
-    return (
-        1 + cosine * cosh - share * z * pinned,
-        -pinned - share * (pinned + 2 * z * sine * sinh),
-        -z * pinned,
-    )
 
 
 # Steps

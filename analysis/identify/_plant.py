@@ -38,17 +38,14 @@ Extra = Literal[
     "tip_mass_kg",
     "filter_time_constant_s",
     "second_order_filter_time_constant_s",
-    "clock_rate_difference",
 ]
 EXTRAS: Final[tuple[Extra, ...]] = (
     "root_compliance_rad_per_nm",
     "tip_mass_kg",
     "filter_time_constant_s",
     "second_order_filter_time_constant_s",
-    "clock_rate_difference",
 )
-"""What a rig may have beside a rigid clamp, a bare beam and ideal channels. Neutral at 0, and free
-only in candidates that carry them."""
+"""What a rig may have besides a rigid clamp, a bare beam and ideal channels; 0 if it has not."""
 
 OF_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 """Parameters of the beam without its damping."""
@@ -80,9 +77,6 @@ class Plant:
         Time constant of a low-pass filter of first order in the torque's channel.
     second_order_filter_time_constant_s : float
         Reciprocal corner frequency (rad/s) of a Butterworth low-pass filter of second order there.
-    clock_rate_difference : float
-        By how much the torque's samples lie farther apart than the angle's, relatively: the torque
-        with time stamp t is that of t (1 + difference), t from the record's first sample.
     """
 
     beam: Beam
@@ -94,7 +88,6 @@ class Plant:
     tip_mass_kg: float = 0.0
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
-    clock_rate_difference: float = 0.0
 
     @property
     def extras(self) -> dict[str, float]:

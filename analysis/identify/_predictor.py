@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, TypeGuard
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -137,7 +137,7 @@ class ResponseGrid:
             Where to evaluate.
         wrt : sequence of str
             Names from `rigd.beam.PARAMETERS`, "delay_s", "tool_inertia_kg_m2", those of offsets and
-            `EXTRAS` but the clocks' difference; each derivative holds all others constant.
+            `EXTRAS`; each derivative holds all others constant.
         angle : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
@@ -230,8 +230,6 @@ class ResponseGrid:
 
 # Prediction
 
-CLOCK: Final = "clock_rate_difference"
-
 _PADDED: Final = 1.1
 _DECAY: Final = 6.6
 """sigma times the padded duration. What wraps round shrinks by exp(-6.6), to 1e-3 of what a beam
@@ -319,9 +317,6 @@ class Prediction:
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
-        if _has_other_clock(plant, wrt):
-            places = np.arange(self._kept.start, self._kept.stop)
-            return self._by_other_clock(plant, wrt, places / self.rate_hz)
         spectra = self._spectra(plant, wrt)
         in_time = np.fft.irfft(spectra, self._length)[:, self._kept] * self._growth
         return in_time[0], in_time[1:]
@@ -331,33 +326,6 @@ class Prediction:
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
         return self._response.evaluate(plant, wrt, self._spectrum)
-
-    def _by_other_clock(
-        self, plant: Plant, wrt: Sequence[str], time_s: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict where a clock of another rate than the angle's takes its samples.
-
-        Parameters
-        ----------
-        time_s : ndarray, shape (m,)
-            Equally spaced, by the angle's clock.
-        """
-        of_beam = tuple(name for name in wrt if name != CLOCK)
-        spectra = self._response.evaluate(plant, of_beam, self._spectrum)
-        if CLOCK in wrt:
-            faster = self._response.s * spectra[0]
-            spectra = np.insert(spectra, 1 + wrt.index(CLOCK), faster, axis=0)
-        rate = 1 + plant.clock_rate_difference
-        weights = np.full(spectra.shape[1], 2.0)  # a bin and its mirror image
-        weights[0] = 1.0
-        weights[self._length // 2 :] = 2.0 - (self._length % 2 == 0)
-        step_s = float(time_s[1] - time_s[0]) if time_s.size > 1 else 0.0
-        turn = 2 * np.pi * self.rate_hz / self._length * rate
-        at = _fourier_sums(spectra * weights, turn * float(time_s[0]), turn * step_s, time_s.size)
-        at *= np.exp(self._sigma * rate * time_s) / self._length
-        if CLOCK in wrt:
-            at[1 + wrt.index(CLOCK)] *= time_s
-        return at[0], at[1:]
 
     def torque_between(
         self,
@@ -384,10 +352,6 @@ class Prediction:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        if _has_other_clock(plant, wrt):
-            every = np.arange(factor * self._length) / (factor * self.rate_hz)
-            torque, gradient = self._by_other_clock(plant, wrt, every)
-            return torque[places], gradient[:, places]
         growth = np.exp(self._sigma * places / (factor * self.rate_hz))
         spectra = self._spectra(plant, wrt)
         # As many short transforms, each of them shifted by a tick, as the factor says: they stay
@@ -402,32 +366,3 @@ class Prediction:
             row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
         at *= growth
         return at[0], at[1:]
-
-
-def _has_other_clock(plant: Plant | ModalModel, wrt: Sequence[str]) -> TypeGuard[Plant]:
-    """Whether the torque was sampled by a clock of another rate than the angle."""
-    return isinstance(plant, Plant) and (plant.clock_rate_difference != 0 or CLOCK in wrt)
-
-
-def _fourier_sums(
-    spectra: NDArray[np.complex128], first: float, step: float, count: int
-) -> NDArray[np.float64]:
-    """Real parts of ``sum_k S_k exp(j k (first + step n))``, shape (r, count).
-
-    At any spacing: kn is written as ``(k² + n² - (n - k)²) / 2``, which leaves a convolution
-    (L. I. Bluestein, IEEE Trans. Audio and Electroacoustics 18 (1970) 451-455).
-
-    Parameters
-    ----------
-    spectra : ndarray of complex, shape (r, K)
-    first, step : float
-        In rad.
-    count : int
-    """
-    bins, places = np.arange(spectra.shape[1]), np.arange(count)
-    length = fast_length(bins.size + count)
-    lags = np.concatenate([places, np.zeros(length - count - bins.size + 1), bins[:0:-1]])
-    chirp = np.fft.fft(np.exp(-0.5j * step * lags**2))
-    turned = spectra * np.exp(1j * (first * bins + 0.5 * step * bins**2))
-    sums = np.fft.ifft(np.fft.fft(turned, length) * chirp)[:, :count]
-    return np.ascontiguousarray((sums * np.exp(0.5j * step * places**2)).real)

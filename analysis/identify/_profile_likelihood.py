@@ -119,7 +119,6 @@ class Profiled:
     profile : Profile
     structure : Structure
         With the order free.
-    uniform : bool
     plants : tuple of Plant
         At the bottoms of the valleys, the lowest first.
     cost : float
@@ -128,7 +127,6 @@ class Profiled:
 
     profile: Profile
     structure: Structure
-    uniform: bool
     plants: tuple[Plant, ...]
     cost: float
 
@@ -176,7 +174,6 @@ def profile(
             else candidate.values * math.log(max(candidate.fit.cost / lowest, 1.0)),
         ),
         structure=walk.structure,
-        uniform=candidate.uniform,
         plants=tuple(walk.plant(value) for value in bottoms),
         cost=lowest,
     )
@@ -189,7 +186,7 @@ _ROUNDS: Final = 3
 def profiled(
     field: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
 ) -> tuple[CandidateSet, Profile, Profile]:
-    """Profile alpha and lambda in the freest structure on the best beam.
+    """Profile alpha and lambda in the freest structure.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
     start once more, so that the fit selected and the profile tell of one minimum.
@@ -240,7 +237,7 @@ def _news(field: CandidateSet, found: Profiled) -> bool:
     as_free = [
         candidate.fit.cost
         for candidate in field.candidates
-        if candidate.uniform == found.uniform and free <= set(candidate.structure.free)
+        if free <= set(candidate.structure.free)
     ]
     return bool(as_free) and found.cost < min(as_free) * (1 - MISSED)
 
@@ -288,10 +285,8 @@ class Walk:
     def __init__(self, field: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
         self.structure = with_order(candidate.structure, order)
-        self._field, self._values, self._kind = field, candidate.values, candidate.kind
-        self._unknowns = unknowns = field.unknowns(
-            self.structure, candidate.uniform, candidate.extras
-        )
+        self._field, self._values = field, candidate.values
+        self._unknowns = unknowns = field.unknowns(self.structure)
         self._place = unknowns.names.index(order)
         first = field.descent(unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS)
         self.costs: dict[float, float] = {}
@@ -328,7 +323,7 @@ class Walk:
         coefficient, free = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._field.candidates:
             special = candidate.structure.has(coefficient) and free > set(candidate.structure.free)
-            if candidate.kind != self._kind or not special:
+            if not special:
                 continue
             (low, high), *_ = admitted(*self.curve())
             behind = self._values * math.log(candidate.fit.cost / min(self.costs.values()))

@@ -6,7 +6,6 @@ a column of known shape and unknown size, which is projected out as the free dec
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -17,7 +16,6 @@ from analysis.identify._fit import summary
 from analysis.identify._noise import Noise, smooth_power
 from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps
 from analysis.identify._problem import Objective
-from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,55 +25,9 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
-    from analysis.identify._result import ModeEstimate, RecordFit
+    from analysis.identify._result import RecordFit
     from analysis.optimizer import NormalEquations
 
-
-# Start on a beam that is not uniform
-
-
-def resonances_kept(
-    unknowns: Unknowns, damped_as: RecordFit, modes: Sequence[ModeEstimate]
-) -> NDArray[np.float64]:
-    """Start for a beam that is not uniform with its modes where a uniform one has them, shape (k,).
-
-    A fractional order acts as stiffness, differently at each mode; with another order the modes
-    would lie elsewhere, by more than they are wide.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Unknowns of the beam that is not uniform.
-    damped_as : RecordFit
-        Its damping is where that of the start comes from.
-    modes : sequence of ModeEstimate
-        Those of the uniform beam.
-    """
-    x = unknowns.vector(damped_as.plant)
-    plant = unknowns.plant(x)
-    damping, ratio = plant.damping, plant.beam.density_over_stiffness
-    numbers = range(1, len(unknowns.offsets) + 2)
-    found = {mode.number: mode for mode in modes if mode.frequency_hz > 0}
-    if not all(number in found for number in numbers):
-        return x
-    stiffness = (clamped_free_eigenvalues(len(numbers)) / plant.beam.length_m) ** 4
-    rises = []
-    for k, number in zip(stiffness.tolist(), numbers, strict=True):
-        mode = found[number]
-        s = 2 * np.pi * mode.frequency_hz * complex(-mode.damping_ratio, 1.0)
-        inertial = ratio * s**2 + damping.gamma * s**damping.lambda_
-        elastic = k * (1 + damping.zeta * s**damping.alpha)
-        rises.append((-inertial / elastic).real)
-    if "density_over_stiffness" in unknowns.free:
-        # Mode 1 has no offset: rho/EI puts it where it is.
-        x[unknowns.names.index("density_over_stiffness")] -= math.log(rises[0])
-        rises = [rise / rises[0] for rise in rises]
-    for name, rise in zip(unknowns.offsets, rises[1:], strict=True):
-        x[unknowns.names.index(name)] = rise - 1
-    return x
-
-
-# Refit
 
 FEW: Final = 8
 """Evaluations that settle a fit under slightly other noise, or show that a start leads nowhere."""
@@ -299,7 +251,7 @@ class Refit:
     def candidate(self) -> Candidate:
         """Make a candidate of what was found."""
         of = self.objective.unknowns
-        return Candidate(of.structure, not of.offsets, self.fit(), len(self.columns), of.extras)
+        return Candidate(of.structure, self.fit(), len(self.columns))
 
     def noise_here(self) -> Noise:
         """Take for noise what remains here and no column explains; lines stay left out."""

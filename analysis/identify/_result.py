@@ -95,7 +95,7 @@ class RecordFit:
         What was found, ready for `rigd.beam`.
     parameters : dict of str to float
         zeta, alpha, gamma, lambda, density_over_stiffness (s²/m⁴), bending_stiffness_n_m2, delay_s
-        and tool_inertia_kg_m2, the fixed ones included; stiffness_offset_2, … if modes were free.
+        and tool_inertia_kg_m2, the fixed ones included.
     std : dict of str to (float or None)
         Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
         or that the data do not determine. Of a tool inertia that rests on 0: what it would be

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 # Resonances
 
-_SCANS: Final = {"density_over_stiffness": np.linspace(-0.5, 0.5, 101)}
-_OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
+_SCAN: Final = np.linspace(-0.5, 0.5, 101)
 _MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
 """Damping for these scans, as `Unknowns.start` takes it."""
 
@@ -46,8 +45,7 @@ _MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
 def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
     """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
 
-    With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
-    then one by one where modes have their own offsets.
+    With a resonance off by more than it is wide, no descent would find it.
 
     Parameters
     ----------
@@ -57,14 +55,13 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     """
     moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
     shift = np.zeros(moderate.size)
-    for place, name in enumerate(unknowns.names):
-        if name in _SCANS or name in unknowns.offsets:
-            steps = _SCANS.get(name, _OFFSET_SCAN)
-            costs = []
-            for step in steps:
-                shift[place] = step
-                costs.append(cost(unknowns.plant(moderate + shift)))
-            shift[place] = steps[int(np.argmin(costs))]
+    if "density_over_stiffness" in unknowns.names:
+        place = unknowns.names.index("density_over_stiffness")
+        costs = []
+        for step in _SCAN:
+            shift[place] = step
+            costs.append(cost(unknowns.plant(moderate + shift)))
+        shift[place] = _SCAN[int(np.argmin(costs))]
     return shift
 
 

@@ -46,7 +46,6 @@ from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
     NOT_DETERMINED,
-    STRONG,
     Row,
     Verdict,
     order_verdict,
@@ -62,7 +61,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._candidate import Candidate, Kind
+    from analysis.identify._candidate import Candidate
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
@@ -115,16 +114,9 @@ class Selection:
         """The fit that the headline's numbers are of."""
         return self.headline.fit
 
-    def settled(self, kind: Kind) -> frozenset[Order]:
-        """Orders that the record determines on a kind of rig: it admits one valley alone.
-
-        Parameters
-        ----------
-        kind : tuple of bool and tuple of str
-            As `Candidate.kind`; of any other than that of `fit` nothing is known.
-        """
-        if kind != next(each.kind for each in self.candidates if each.fit is self.fit):
-            return frozenset()
+    @property
+    def settled(self) -> frozenset[Order]:
+        """Orders that the record determines: it admits a single minimum along each."""
         orders = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(each.order for each in orders if each.profile.identifiable)
 
@@ -218,7 +210,7 @@ def _selected(
     """Choose the structure with what is known to have struck the beam."""
     before = earlier.candidates if earlier else ()
     again = CandidateSet.from_earlier(before, measurement, fixed, band_hz) if before else None
-    linear = again or CandidateSet.of_uniform(measurement, fixed, band_hz)
+    linear = again or CandidateSet.of(measurement, fixed, band_hz)
     modal = _modal(linear)
     field, small = linear, None
     forces: tuple[NonlinearForce, ...] = ()
@@ -227,7 +219,7 @@ def _selected(
     if modal is not None and plain:
         small = small_effect(linear.comparison, modal, linear.likeliest.plant)
     if not plain or (small is not None and small.large):
-        field, forces, changes = _with_effects(linear, fixed, band_hz, again=bool(again))
+        field, forces, changes = _with_effects(linear, again=again is not None)
         modal, small = _modal(field), None
     elif small is not None:
         modal = _modal(linear, small.column[None])
@@ -236,7 +228,7 @@ def _selected(
     test = _uniform_beam_test(measurement, modal)
     refused = test is not None and test.status == "refused"
     # Another valley that a part of the record excludes, all of it does as well.
-    settled = earlier.settled(field.freest.kind) if earlier and again else ()
+    settled = earlier.settled if earlier and again else ()
     walk = untold_reason(field, visible) is None and not refused
     field, *profiles = profiled(field, settled, walk=walk)
     told = field.led_by(field.freest)
@@ -274,8 +266,7 @@ def _selected(
             found += _explanation(measurement, told, modal, test)
         found = _as_sure(found, along, wrong, doubt, numbers.flags, explained=explained)
         found = _with_knocks_and_rest(told, found, white, related)
-        alone = doubt is None and not field.other_kinds(STRONG)
-        said = of_headline(numbers, orders, alone=alone)
+        said = of_headline(numbers, orders, alone=doubt is None)
         advice = experiments(field, orders, visible, found, close)
     advice += [each.remedy for each in found if each.remedy]
     best = field.best
@@ -288,7 +279,6 @@ def _selected(
         verdict=Verdict(
             name=measurement.name,
             structure=best.structure.name,
-            uniform=best.uniform,
             rivals=tuple(c.name for c in close),
             parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
             adequate=wrong is None,
@@ -410,7 +400,7 @@ def _linear_and_constant(
 
 
 def _with_effects(
-    linear: CandidateSet, fixed: tuple[Setting, ...], band_hz: tuple[float, float], *, again: bool
+    linear: CandidateSet, *, again: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[Change, ...]]:
     """Look for what no linear constant antenna does.
 
@@ -424,7 +414,6 @@ def _with_effects(
     """
     field = linear if again else with_evident_drag(linear)
     if field is linear:
-        linear = linear if again else linear.with_other_rigs(fixed, band_hz)
         field = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
@@ -444,8 +433,8 @@ def freest_alone(
     """Fit the freest structure on a uniform beam, in a quarter of `select`'s time.
 
     The modes are those of `select` where that selects such a beam with all orders free. Where it
-    selects anything else (modes free, drag, forces that are not linear), the residual shows it, and
-    every number carries a flag. Orders are not profiled: that one is not identifiable is told by
+    selects anything else (drag, forces that are not linear), the residual shows it, and every
+    number carries a flag. Orders are not profiled: that one is not identifiable is told by
     the modes that show and by the width of its interval.
 
     Parameters
@@ -613,7 +602,6 @@ def _table(field: CandidateSet) -> tuple[Row, ...]:
     return tuple(
         Row(
             structure=c.structure.name,
-            uniform=c.uniform,
             parameters=c.parameters,
             cost=c.fit.cost,
             delta_bic=c.bic - best.bic,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._candidate import MODES_FREE
 from analysis.identify._headline import EXACT_CONDITION, ONE_MODE
 from analysis.identify._verdict import ANOTHER_DAMPING, deviance_of_one
 from analysis.identify._visible_modes import driven
@@ -95,14 +94,10 @@ def _of_damping(told: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> li
         excluded = told.with_status("excluded")
         return [f"Excluded by the losses: {_types(excluded)}."] if excluded else []
     free = told.fit.structure
-    kind = told.name.partition(", ")[2]
-    beam = f", beside {kind}" if kind else ""
-    if kind == MODES_FREE:
-        beam = ", on a non-uniform beam (stiffness correction per mode)"
     dampings = _DAMPING[free.name]
     if any(each.reason == ANOTHER_DAMPING for each in orders):
         dampings = dampings.replace("only", "alone would do")
-    said = [f"{dampings}{beam}. Numbers are those of type {told.name}, all orders free."]
+    said = [f"{dampings}. Numbers are those of type {told.name}, all orders free."]
     excluded = told.with_status("excluded")
     if told.explained and excluded:
         said.append(f"Excluded: {_types(excluded)}.")
@@ -185,15 +180,8 @@ def order(verdict: OrderVerdict) -> str:
 
 
 def _types(names: tuple[str, ...]) -> str:
-    """List structures, those of a uniform beam first."""
-    plain = sorted(name for name in names if "," not in name)
-    others: dict[str, list[str]] = {}
-    for name in sorted(set(names) - set(plain)):
-        structure, beam = name.split(", ", 1)
-        others.setdefault(beam, []).append(structure)
-    groups = [listed(plain)] if plain else []
-    groups += [f"with {beam} {listed(each)}" for beam, each in others.items()]
-    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
+    """List structures."""
+    return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
 
 
 def _condition(simpler: Simpler) -> str:

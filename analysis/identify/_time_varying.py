@@ -1,10 +1,11 @@
-"""Changes along the record (damping, stiffness, gain), and backlash.
+"""Changes along the record (damping, stiffness, gain), clocks of different rates, and backlash.
 
 Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
 would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
 follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
-damping that drifts competes with an order of the damping, and a gain that drifts with a filter. A
-delay that rises so is what clocks of different rates make: see `analysis.identify._rivals`.
+damping that drifts competes with an order of the damping, and a gain that drifts with a filter.
+Where torque and angle were sampled by clocks of different rates, the torque's delay changes along
+the record.
 
 A mode that rings for seconds remembers the damping and the stiffness that it had: at 0.4 % of
 stiffness in 22 s, one of 2.6 Hz is 0.03 rad out of phase with what its frequency of the moment
@@ -29,7 +30,7 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
-from analysis.identify._predictor import eigenvalues, torque_channel
+from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
 from analysis.identify._refit import MANY, Refit
 from analysis.identify._residual_tests import SURE
 from analysis.identify._verdict import STRONG
@@ -50,18 +51,23 @@ if TYPE_CHECKING:
 
 # Search for changes
 
-What = Literal["damping", "stiffness", "gain", "play"]
+What = Literal["damping", "stiffness", "gain", "clock", "play"]
 
 _LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
 _GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
 _GAIN: Final = SURE**2 + 2 * math.log(20)
-"""Deviance that a column must save: four of them are tried on four candidates."""
+"""Deviance that a column must save: five of them are tried on four candidates."""
 
 _IN_SIGHT: Final = 0.75
 """Share of a rival's lower BIC that a column has to promise. The first order foretells it to a
 tenth."""
 
 UNIT_PLAY_RAD: Final = 1e-4
+_CLOCK_UNIT: Final = 1e-5
+_UNITS: Final[Mapping[What, float]] = {"play": UNIT_PLAY_RAD, "clock": _CLOCK_UNIT}
+_TERMS: Final = 16
+"""Terms of a Taylor series in time: enough for three radians."""
+
 _ROUNDS: Final = 8
 _SETTLED: Final = 0.01
 
@@ -74,7 +80,8 @@ class Change:
     ----------
     what : str
     size, std : float
-        Change from the first sample to the last, relative; the backlash in rad.
+        Change from the first sample to the last, relative; of clocks the relative difference of
+        their rates; the backlash in rad.
     behind : float
         BIC with it above the lowest without it.
     """
@@ -128,7 +135,7 @@ def along_time(
     found = []
     for what, (bic, refit) in tried.items():
         sizes, std = refit.amplitudes()
-        unit = UNIT_PLAY_RAD if what == "play" else 1.0
+        unit = _UNITS.get(what, 1.0)
         change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
         if change.behind < STRONG and _possible(change):
             found.append((change, refit))
@@ -151,7 +158,7 @@ def _leads(field: CandidateSet) -> Iterator[Candidate]:
     """Give the best candidate, and the simple ones that something may stand beside instead."""
     yield field.best
     for candidate in field.candidates[1:]:
-        if candidate.uniform and not candidate.extras and candidate.structure in _LEADS:
+        if candidate.structure in _LEADS:
             yield candidate
 
 
@@ -224,11 +231,44 @@ def _column(
     """
     if what == "play":
         return comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
+    if what == "clock":
+        return comparison.spectrum(_sampled_late(comparison, plant, size))
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
     change = ramp * (slopes or _slopes(comparison, plant))[what]
     if what != "gain":
         change += remembered(comparison, plant, ramp, what, size)
     return comparison.spectrum(change)
+
+
+def _sampled_late(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
+    """Torque that a faster clock adds to the samples, over the difference of the rates.
+
+    The torque with time stamp t is that of t plus the difference times the time since the middle of
+    the record, by its Taylor series.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    plant : Plant
+    size : float
+        Difference of the rates, in `_CLOCK_UNIT`.
+
+    Returns
+    -------
+    ndarray, shape (samples,)
+        For one unit.
+    """
+    prediction, time_s = comparison.prediction, comparison.times_s()
+    since_s = _CLOCK_UNIT * (time_s - time_s.mean())
+    grid = ResponseGrid(prediction.s)
+    derivative = grid.evaluate(plant)[0]
+    factor = since_s
+    added = np.zeros(since_s.size)
+    for number in range(1, _TERMS + 1 if size else 2):
+        derivative = derivative * grid.s
+        added += factor * prediction.in_time(derivative)
+        factor = factor * size * since_s / (number + 1)
+    return added
 
 
 def play(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
@@ -337,12 +377,14 @@ _NAMES: Final[dict[What, str]] = {
     "damping": "Damping that changes along the record",
     "stiffness": "Stiffness that changes along the record",
     "gain": "A torque gain that changes along the record",
+    "clock": "Clocks of different rates",
     "play": "Backlash between encoder and beam",
 }
 _KINDS: Final[dict[What, Kind]] = {
     "damping": "drifting damping",
     "stiffness": "drifting stiffness",
     "gain": "drifting gain",
+    "clock": "clock rate difference",
     "play": "play",
 }
 
@@ -392,18 +434,33 @@ def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Findin
 def _size(change: Change) -> str:
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
+    if change.what == "clock":
+        return f"the torque's by {1e6 * change.size:+.3g} ppm"
     return f"{100 * change.size:+.2g} % from beginning to end"
+
+
+_SHOWN: Final[Mapping[What, float]] = {"play": 1e3, "clock": 1e6}
+"""Factor in which a size is shown; that of a change in % otherwise."""
+
+_THERE_AND_BACK: Final = (
+    "weep up and down in one session (rigd run chirp --there-and-back): that separates changes "
+    "with time from those with frequency."
+)
 
 
 def _finding(change: Change) -> Finding:
     half = NORMAL_95 * change.std
     of_play = change.what == "play"
-    scale = 1e3 if of_play else 100.0
+    remedy = f"S{_THERE_AND_BACK}"
+    if of_play:
+        remedy = "Remove the backlash in gear and clamp."
+    elif change.what == "clock":
+        remedy = f"Sample angle and torque by one clock, or s{_THERE_AND_BACK}"
     return Finding(
         kind=_KINDS[change.what],
         sentence=(
-            f"{_NAMES[change.what]}: {_size(change)} (± {scale * half:.1g}; 95 %). It was fitted "
-            "too"
+            f"{_NAMES[change.what]}: {_size(change)} "
+            f"(± {_SHOWN.get(change.what, 100.0) * half:.1g}; 95 %). It was fitted too"
             + (
                 ", to first order in its size."
                 if of_play
@@ -413,10 +470,5 @@ def _finding(change: Change) -> Finding:
         value=change.size,
         interval=(change.size - half, change.size + half),
         unit="rad" if of_play else "1",
-        remedy=(
-            "Remove the backlash in gear and clamp."
-            if of_play
-            else "Sweep up and down in one session (rigd run chirp --there-and-back): that "
-            "separates changes with time from those with frequency."
-        ),
+        remedy=remedy,
     )

@@ -46,11 +46,6 @@ _MODES_FOR_ONE_DAMPING: Final = 3
 """Modes from which on it shows that there is no second damping: two loss factors are explained by
 coefficient and order of one damping as well as by two dampings."""
 
-ORDER_ONE_ELSEWHERE: Final = "order 1 on another kind of rig explains the record about as well"
-OTHER_ORDER_ELSEWHERE: Final = (
-    "another order on another kind of rig explains the record about as well"
-)
-
 ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
 
 
@@ -119,13 +114,7 @@ def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
     visible : tuple of int
         Modes that the record shows.
     """
-    freest = field.freest
-    if few := too_few_modes(freest.structure, len(visible)):
-        return few
-    if not freest.uniform and len(freest.structure.free) > len(visible):
-        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
-        return f"on a non-uniform beam only {len(visible)} loss factors determine it"
-    return None
+    return too_few_modes(field.freest.structure, len(visible))
 
 
 def too_few_modes(structure: Structure, modes: int) -> str | None:
@@ -172,26 +161,9 @@ def _judged(
         return "open", doubt
     if order == "lambda" and field.drag is not None:
         return "open", BESIDE_DRAG
-    for rival in field.of_other_kinds(STRONG):
-        if _integer(rival, order):
-            return "open", ORDER_ONE_ELSEWHERE
-        if _elsewhere(rival, profile):
-            return "open", OTHER_ORDER_ELSEWHERE
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
-
-
-def _integer(candidate: Candidate, order: Order) -> bool:
-    """Whether a structure has this damping with an order of 1."""
-    return candidate.structure.fixed.get(order) == 1.0
-
-
-def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
-    """Whether a candidate with this damping has its order where the profile excludes it."""
-    low, high = profile.interval
-    here = low <= candidate.fit.parameters[profile.order] <= high
-    return candidate.structure.has(profile.order) and not here
 
 
 # Verdict on a record
@@ -205,8 +177,6 @@ class Row:
     ----------
     structure : str
         "I" to "VII".
-    uniform : bool
-        Whether the beam was taken to be uniform; else each mode has its own stiffness.
     parameters : int
     cost : float
         Sum of squares of the whitened residual.
@@ -215,7 +185,6 @@ class Row:
     """
 
     structure: str
-    uniform: bool
     parameters: int
     cost: float
     delta_bic: float
@@ -232,13 +201,10 @@ class Verdict:
         The file.
     structure : str
         Structure of the lowest BIC: "I" to "VII".
-    uniform : bool
-        Whether its beam is uniform.
     rivals : tuple of str
         Structures that the data cannot tell from it.
     parameters : mapping of str to float
-        Those of the freest structure on that beam, as `RecordFit` names them, but for those that
-        carry a flag.
+        Those of the freest structure, as `RecordFit` names them, but for those that carry a flag.
     adequate : bool
         Whether what remains of that is noise.
     alpha, lambda_ : OrderVerdict
@@ -261,7 +227,6 @@ class Verdict:
 
     name: str
     structure: str
-    uniform: bool
     rivals: tuple[str, ...]
     parameters: Mapping[str, float]
     adequate: bool

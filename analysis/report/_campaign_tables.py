@@ -157,7 +157,6 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
         {
             "file": str(session.path),
             "type": each.structure,
-            "uniform": each.uniform,
             **each.parameters,
             **{
                 _std_key(name): value if name in each.free else None

@@ -126,17 +126,9 @@ def _of_beam(structure: Structure) -> tuple[Formula, Formula]:
 
 
 def _measured(fit: RecordFit) -> Formula:
-    """Torque over angle as measured: beam, clamp and channels."""
+    """Torque over angle as measured: beam, tool and channels."""
     beam = _G + _OF_S
     names = fit.parameters
-    if any(name.startswith("stiffness_offset") for name in names):
-        i = _name("i")
-        some = Formula(
-            f"<munder><mo>∑</mo>{i.row.mathml}</munder>", rf"\sum_{i.row.tex}"
-        ) + _indexed(_G, i)
-        beam = _joined(_OPEN, beam, _PLUS, some, _OF_S, _CLOSE)
-    if "root_compliance_rad_per_nm" in names:
-        beam = _over(beam, _joined(_ONE, _PLUS, _name("c"), beam))
     inside = _joined(beam, _PLUS, _name("J"), _power(_S, _TWO))
     late = _power(_name("e"), _joined(_MINUS, _name("τ", r"\tau"), _S))
     found = _joined(_sign("[", r"\left["), inside, _sign("]", r"\right]"), late)
@@ -193,13 +185,10 @@ def _structure(whole: WholeRecord) -> Structure:
 
 
 _EXTRAS: Final = {
-    "stiffness_offset": "Gᵢ replaces mode i by one whose stiffness is 1 + δᵢ times as large",
-    "root_compliance_rad_per_nm": "c is the compliance of the clamp",
     "tip_mass_kg": "G is that of a beam with the mass m at its tip",
     "filter_time_constant_s": "T is the time constant of the torque channel's filter",
     "second_order_filter_time_constant_s": "T is the reciprocal corner of the torque channel's "
     "filter (Butterworth)",
-    "clock_rate_difference": "the torque with the time stamp t is that of t (1 + ε)",
     "drag": "the drag ½ ρ_air C_D d v |v| per length also acts on the beam (ρ_air 1.2 kg/m³)",
 }
 
@@ -217,11 +206,7 @@ def definitions(whole: WholeRecord) -> str:
             "of, below it the beam's, which the parameters are of",
         ]
     names = whole.headline.parameters
-    parts += [
-        words
-        for start, words in _EXTRAS.items()
-        if any(name == start or name.startswith(f"{start}_") for name in names)
-    ]
+    parts += [words for name, words in _EXTRAS.items() if name in names]
     return f"{'; '.join(parts)}. The numbers are in the table of the parameters."
 
 

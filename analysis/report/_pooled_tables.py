@@ -65,7 +65,6 @@ def structures_table(campaign: CampaignResult) -> Table:
         grey: Callable[[Cell], Cell] = (lambda cell: cell) if each.pooled else greyed
         return {
             "type": Cell(each.structure, each.name),
-            "uniform": each.uniform,
             "fitted": grey(count(each.fitted)),
             "sessions": grey(count(each.determined)),
             "bic_above_lowest": grey(number(each.bic_above_lowest, ".1f")),
@@ -141,7 +140,6 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         rows += [
             {
                 "type": each.structure,
-                "uniform": each.uniform,
                 "name": each.name,
                 "headline": False,
                 "sessions": each.determined,
@@ -193,7 +191,6 @@ def _pooled_row(
         value = greyed(value) if found.is_mixed(each.name) else replace(value, strong=True)
     return {
         "type": pooled.structure,
-        "uniform": pooled.uniform,
         "name": pooled.name,
         "headline": pooled is campaign.headline,
         "sessions": pooled.sessions,
