@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns._pooling import PooledSize
-from analysis.campaigns._sentences import LOSSES, in_single_sessions, probability
-from analysis.identify import EXACT_CONDITION, tolerant_sizes
+from analysis.campaigns._sentences import in_single_sessions, probability
+from analysis.identify import EXACT_CONDITION, LOSSES, slope_of_loss
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
 from rigd.units import to_uncertainty
@@ -30,17 +29,6 @@ def chance(p_value: float) -> str:
     """Write a p-value."""
     written = probability(p_value)
     return f"p {written}" if written.startswith("<") else f"p = {written}"
-
-
-def sizes(estimate: TolerantEstimate) -> list[PooledSize]:
-    """Loss factors at the frequencies where they depend least on the orders."""
-    return [
-        PooledSize(
-            each.damping, "alpha" if each.damping == "internal" else "lambda", each.omega_rad_s,
-            each.size.value, each.size.std or 0.0, each.size.interval_95 or (0.0, 0.0),
-        )
-        for each in tolerant_sizes(estimate, None, None)
-    ]  # fmt: skip
 
 
 def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
@@ -79,32 +67,18 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
     """
     estimate = modal.tolerant
     assert estimate is not None
-    loss = LOSSES[found.order]
     counts = {f"“{status}”": count for status, count in found.alone.items()}
     alone = in_single_sessions(counts, sum(counts.values()))
     if found.value is None or found.interval is None:
         return (
-            f"The slope of the {loss} ({found.order}) is not identifiable: {found.reason}. {alone}"
+            f"The slope of the {LOSSES[found.order]} ({found.order}) is not identifiable: "
+            f"{found.reason}. {alone}"
         )
-    std = (found.interval[1] - found.interval[0]) / (2 * NORMAL_95)
-    value, low, high = to_uncertainty((found.value, *found.interval), std)
-    shown = [mode.frequency_hz for mode in modal.modes]
-    condition, alone_excludes = f"by {_BASES['losses']}", "1 is excluded"
-    if estimate.basis == "geometry":
-        condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
-        alone_excludes = "damping ratios and residue phases alone exclude 1"
-    said = (
-        f"Between {min(shown):.3g} and {max(shown):.3g} Hz the {loss} grows as f^{value} "
-        f"({found.order}; 95 %: {low} to {high}), {condition}"
+    shown_hz = [mode.frequency_hz for mode in modal.modes]
+    said = slope_of_loss(
+        found.order, found.value, found.interval, shown_hz, estimate, found.status, found.reason
     )
-    if found.reason is not None:
-        return f"{said}; not established, because {found.reason}. {alone}"
-    end = {
-        "compatible": "consistent with 1",
-        "fractional": alone_excludes,
-        "open": "not 1 then, but damping ratios and residue phases alone do not exclude 1",
-    }
-    return f"{said}: {end[found.status]}. {alone}"
+    return f"{said} {alone}"
 
 
 def if_exact(

@@ -177,14 +177,7 @@ def _sizes(
     pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
 ) -> tuple[Size, ...]:
     flags = _flags(orders)
-    return tuple(
-        Size(
-            each.damping,
-            each.omega_rad_s,
-            Quantity(each.value, each.std, each.interval, every or flags.get(each.order)),
-        )
-        for each in pooled.sizes
-    )
+    return tuple(each.flagged(every or flags.get(each.order)) for each in pooled.sizes)
 
 
 def _modes(campaign: CampaignResult, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
+from analysis.identify import LOGARITHMIC, SETTINGS, Plant, Quantity, Size, damping_size
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import Beam, undamped_frequencies_rad_s
@@ -213,32 +213,6 @@ class PooledParameter:
 
 
 @dataclass(frozen=True, slots=True)
-class PooledSize:
-    """Size of one damping over all sessions, where it depends least on its order.
-
-    Attributes
-    ----------
-    damping : str
-        "internal" or "external".
-    order : str
-        "alpha" or "lambda".
-    omega_rad_s : float or None
-        That frequency; None if the order is fixed: then the size is the coefficient.
-    value, std : float
-        Loss factor, or without that frequency the coefficient: see `DampingSize`.
-    interval : (float, float)
-        95 %.
-    """
-
-    damping: Damping
-    order: Order
-    omega_rad_s: float | None
-    value: float
-    std: float
-    interval: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
 class PooledEstimate:
     """One structure over all sessions.
 
@@ -278,7 +252,7 @@ class PooledEstimate:
         return self.structure
 
     @property
-    def sizes(self) -> tuple[PooledSize, ...]:
+    def sizes(self) -> tuple[Size, ...]:
         """Sizes of the dampings that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
         t, found = student_t_quantile(0.95, self.sessions - 1), []
@@ -289,8 +263,8 @@ class PooledEstimate:
             if size is not None:
                 factor = math.exp(t * size.std / size.value)
                 ends = size.value / factor, size.value * factor
-                at = PooledSize(damping, order, size.omega_rad_s, size.value, size.std, ends)
-                found.append(at)
+                quantity = Quantity(size.value, size.std, ends)
+                found.append(Size(damping, size.omega_rad_s, quantity))
         return tuple(found)
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 from analysis.campaigns._experiment import in_dispute, told
 from analysis.campaigns._statistics import BEST
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
+from analysis.identify import LOSSES
 from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
 from analysis.statistics import student_t_quantile
 from rigd.printable import listed
@@ -20,10 +21,10 @@ if TYPE_CHECKING:
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate, PooledMode, PooledSize
+    from analysis.campaigns._pooling import PooledEstimate, PooledMode
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
-    from analysis.identify import Order
+    from analysis.identify import Order, Size
 
 
 # Names and numbers
@@ -220,7 +221,6 @@ def _files(names: Sequence[str]) -> str:
 # Verdict
 
 _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
-LOSSES: Final = {"alpha": "internal loss", "lambda": "external damping torque"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _CLASSICAL: Final = "III"
 """Type of integer orders with both dampings."""
@@ -329,16 +329,17 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     return said
 
 
-def sizes(found: Sequence[PooledSize]) -> list[str]:
+def sizes(found: Sequence[Size]) -> list[str]:
     """Say how large each damping is where it depends least on its order."""
     said = []
     for each in found:
-        if each.omega_rad_s is None:
+        if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
             continue
-        value, low, high = to_uncertainty((each.value, *each.interval), each.std)
+        value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
+        flag = f", {each.size.flag}" if each.size.flag else ""
         said.append(
             f"{each.damping} {value} (95 %: {low} to {high}) at "
-            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
+            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{flag}"
         )
     return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
 

@@ -19,7 +19,7 @@ from analysis.campaigns._orders import (
     rivals,
     tolerant_pooled_order,
 )
-from analysis.identify import EVEN, STRONG, refused_reason, uniformity
+from analysis.identify import EVEN, STRONG, refused_reason, tolerant_sizes, uniformity
 from rigd.units import interval_text
 
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ def _numbers(
         geometry.tolerance(modal, modal.tolerant),
         *gate,
         left,
-        *sentences.sizes(geometry.sizes(modal.tolerant)),
+        *sentences.sizes(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
     )
 
 

@@ -64,6 +64,8 @@ from ._select import INTEGER as INTEGER
 from ._select import Selection as Selection
 from ._select import freest_alone as freest_alone
 from ._select import select as select
+from ._sentences import LOSSES as LOSSES
+from ._sentences import slope_of_loss as slope_of_loss
 from ._sentences import uniformity as uniformity
 from ._uncertainty import damping_size as damping_size
 from ._uniform_beam import PARAMETERS as PARAMETERS

@@ -125,12 +125,17 @@ class Size:
     omega_rad_s: float | None
     size: Quantity
 
-    def flagged(self, flag: str) -> Size:
+    @property
+    def order(self) -> str:
+        """Name of its order: "alpha" or "lambda"."""
+        return NAMES[self.damping][1]
+
+    def flagged(self, flag: str | None) -> Size:
         """Give it a flag, unless it has one.
 
         Parameters
         ----------
-        flag : str
+        flag : str or None
         """
         return replace(self, size=self.size.flagged(flag))
 

@@ -90,7 +90,7 @@ def with_modal_model(
             },
             **_parameters(tolerant, doubt, effective),
         },
-        sizes=tolerant_sizes(tolerant, doubt, effective),
+        sizes=tuple(each.flagged(doubt) for each in tolerant_sizes(test, tolerant)),
         structures=_structures(condition, tolerant),
         simpler=None,
         exact=Numbers(
@@ -199,20 +199,16 @@ def _structures(
     return tuple((name, status(name, before)) for name, before in exact.structures)
 
 
-def tolerant_sizes(
-    estimate: TolerantEstimate, doubt: str | None, effective: str | None
-) -> tuple[Size, ...]:
+def tolerant_sizes(test: UniformBeamTest, estimate: TolerantEstimate) -> tuple[Size, ...]:
     """Return the loss factors where they depend least on their orders.
 
-    That of external damping is relative to the inertia, which may be an effective value.
+    That of external damping is relative to the inertia, which is an effective value where the test
+    refuses a uniform beam.
 
     Parameters
     ----------
+    test : UniformBeamTest
     estimate : TolerantEstimate
-    doubt : str or None
-        Why no number of the record is to be believed.
-    effective : str or None
-        Why the inertia is not that of the beam alone.
     """
     values = dict(estimate.values)
     found = []
@@ -222,8 +218,9 @@ def tolerant_sizes(
         )
         if size is None:
             continue
-        flag = doubt or (NO_ORDER if estimate.basis == "none" else None)
-        flag = flag or (effective if damping == "external" else None)
+        flag = NO_ORDER if estimate.basis == "none" else None
+        if damping == "external" and test.status == "refused":
+            flag = flag or NOT_UNIFORM
         found.append(size_of(damping, size, flag))
     return tuple(found)
 

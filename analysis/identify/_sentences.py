@@ -13,12 +13,15 @@ from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Headline, Quantity, Simpler
-    from analysis.identify._uniform_beam import UniformBeamTest
-    from analysis.identify._verdict import OrderVerdict
+    from analysis.identify._profile_likelihood import Order
+    from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify._verdict import OrderVerdict, Status
 
 # Sentences
 
@@ -33,6 +36,11 @@ _DAMPING: Final = {
 }
 _SEVERAL: Final = 2
 _OF: Final = {"alpha": "internal damping", "lambda": "external damping"}
+LOSSES: Final[Mapping[Order, str]] = {
+    "alpha": "internal loss",
+    "lambda": "external damping torque",
+}
+"""What an order is the slope of."""
 
 
 def of_headline(
@@ -113,28 +121,54 @@ def slope(told: Headline, verdict: OrderVerdict) -> str:
     name, of = verdict.order, _OF[verdict.order]
     if verdict.value is None or verdict.interval is None:
         return f"The order {name} of the {of} is not identifiable: {verdict.reason}."
-    low, high = verdict.interval
-    std = (high - low) / (2 * NORMAL_95)
-    value, first, last = to_uncertainty((verdict.value, low, high), std)
     shown = [mode.frequency_hz.value for mode in told.modes if mode.shown]
-    grows = "internal loss" if name == "alpha" else "external damping torque"
-    text = (
-        f"Between {min(shown):.3g} and {max(shown):.3g} Hz the {grows} grows as f^{value} "
-        f"({name}; 95 %: {first} to {last})"
+    return slope_of_loss(
+        name, verdict.value, verdict.interval, shown, estimate, verdict.status, verdict.reason
     )
+
+
+def slope_of_loss(
+    order: Order,
+    value: float,
+    interval: tuple[float, float],
+    shown_hz: Sequence[float],
+    estimate: TolerantEstimate,
+    status: Status,
+    reason: str | None,
+) -> str:
+    """Say how a loss grows over the modes in sight, on which assumption, and whether as f.
+
+    Parameters
+    ----------
+    order : str
+    value : float
+    interval : (float, float)
+        95 %.
+    shown_hz : sequence of float
+        Frequencies of the modes.
+    estimate : TolerantEstimate
+        What the order is of.
+    status : str
+        "compatible", "fractional" or "open".
+    reason : str or None
+        Why the order is not established; None if it is.
+    """
+    std = (interval[1] - interval[0]) / (2 * NORMAL_95)
+    written, low, high = to_uncertainty((value, *interval), std)
+    condition = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
-        text += (
-            f", if each mode lies where that of a uniform beam does, to "
-            f"{100 * estimate.uniformity:g} %"
-        )
-    else:
-        text += ", by damping ratios and phases alone"
-    if verdict.reason is not None:
-        return f"{text}; not established, because {verdict.reason}."
-    return text + {
-        "compatible": ": consistent with order 1.",
-        "fractional": ": damping ratios and phases alone exclude order 1.",
-    }.get(verdict.status, ": order 1 is doubtful, but damping ratios and phases do not exclude it.")
+        condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
+    said = (
+        f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSSES[order]} grows as "
+        f"f^{written} ({order}; 95 %: {low} to {high}), {condition}"
+    )
+    if reason is not None:
+        return f"{said}; not established, because {reason}."
+    end = {
+        "compatible": "consistent with order 1",
+        "fractional": "damping ratios and residue phases alone exclude order 1",
+    }.get(status, "order 1 is doubtful, but damping ratios and residue phases do not exclude it")
+    return f"{said}: {end}."
 
 
 def _if_exact(told: Headline) -> list[str]:

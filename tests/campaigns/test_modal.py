@@ -208,7 +208,7 @@ def test_an_order_is_the_slope_of_a_loss_and_an_exact_value_a_condition(sessions
         assert high - low > 5 * (exact.interval[1] - exact.interval[0])
     text = " ".join(found.sentences)
     assert "Between 2.57 and 44.8 Hz the internal loss grows as f^" in text
-    assert "if frequencies are those of a uniform beam to 0.1 %: consistent with 1." in text
+    assert "if frequencies are those of a uniform beam to 0.1 %: consistent with order 1." in text
     (condition,) = (each for each in found.sentences if each.startswith("If the beam is uniform"))
     assert "to 1e-5 (type VI): alpha 0.99" in condition
     assert "lambda 0.59" in condition
