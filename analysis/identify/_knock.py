@@ -102,12 +102,18 @@ class FoundKnock:
         return self.share > _ALL and self.before < _LOUDER
 
 
-def knocks_in(field: CandidateSet) -> Iterator[FoundKnock]:
+def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[FoundKnock]:
     """Search for one more knock; each found may be the one, the likeliest first.
 
     A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
     But one half of the record it has spared, or left a free decay at its start: so it is searched
     also in what a beam leaves that was fitted to one half.
+
+    Parameters
+    ----------
+    field : CandidateSet
+    obvious : bool
+        Whether to search for an obvious one only.
     """
     if field.misread or len(field.comparison.measurement.knocks) == MOST_KNOCKS:
         return
@@ -115,6 +121,8 @@ def knocks_in(field: CandidateSet) -> Iterator[FoundKnock]:
     if first is not None and first.obvious:
         yield first
         first = None
+    if obvious:
+        return
     for start in _from_halves(field):
         found = _knock_in(start)
         if found is not None:

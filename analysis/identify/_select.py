@@ -82,9 +82,8 @@ INTEGER: Final = STRUCTURES["III"]
 no valleys there, and no damping that is a stiffness or an inertia in truth."""
 
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop", "harmonics"})
-"""What makes a search for knocks idle: a sweep has harmonics all along. Settings at an edge may be
-a loud knock's doing."""
+_NOT_SEARCHED: Final = frozenset({"sign", "unit", "clipping", "stop"})
+"""What makes a search for knocks idle. Settings at an edge may be a loud knock's doing."""
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
 """All that is said where the record contradicts its file."""
 
@@ -189,7 +188,8 @@ def _with_knocks(measurement: Measurement, tell: Callable[[Measurement], _Told[_
         if told.explained or not _NOT_SEARCHED.isdisjoint(told.kinds):
             break
         better = None
-        for found in knocks_in(told.field):
+        # A sweep with harmonics has them all along; but a loud knock may pass for some.
+        for found in knocks_in(told.field, obvious="harmonics" in told.kinds):
             again = tell(with_knock(told.field.comparison.measurement, found))
             if again.explained or found.evident:
                 better = again
@@ -216,6 +216,11 @@ def _selected(
     forces: tuple[NonlinearForce, ...] = ()
     changes: tuple[Change, ...] = ()
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
+    if not (plain or measurement.knocks):
+        for knock in knocks_in(linear, obvious=True):
+            struck = _selected(with_knock(measurement, knock), fixed, band_hz, None)
+            if struck.explained:
+                return struck
     if modal is not None and plain:
         small = small_effect(linear.comparison, modal, linear.likeliest.plant)
     if not plain or (small is not None and small.large):
