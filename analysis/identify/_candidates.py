@@ -400,6 +400,12 @@ class CandidateSet:
             return freed.cross_checked()
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
+    def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
+        """Fit all with spectra of unknown size, under the noise that the best then leaves."""
+        every = np.concatenate([self.columns, columns])
+        best = replace(self, columns=every).refit(self.best)
+        return self.with_columns(every, best.noise_here())
+
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
         """Fit all again, with what is not linear in addition to the beam."""
         other = replace(self, columns=columns, noise=noise)

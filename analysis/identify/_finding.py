@@ -30,6 +30,7 @@ Kind = Literal[
     "drifting gain",
     "clipping",
     "play",
+    "friction",
     "nonlinear gain",
     "knock",
     "stop",

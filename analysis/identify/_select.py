@@ -39,7 +39,7 @@ from analysis.identify._residual_tests import (
 )
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._sentences import experiments, of_headline
-from analysis.identify._small_effects import small_effect
+from analysis.identify._small_effects import LARGE, small_effect
 from analysis.identify._step_in_time import step_score
 from analysis.identify._time_varying import along_time, changing, established
 from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
@@ -221,13 +221,22 @@ def _selected(
             struck = _selected(with_knock(measurement, knock), fixed, band_hz, None)
             if struck.explained:
                 return struck
-    if modal is not None and plain:
-        small = small_effect(linear.comparison, modal, linear.likeliest.plant)
-    if not plain or (small is not None and small.large):
+    if modal is not None:
+        small = small_effect(linear.comparison, modal, modal.plant_like(linear.likeliest.plant))
+    alone = modal if small is None else _modal(linear, small.column[None])
+    suffices = alone is not None and _linear_and_constant(linear, alone, band_hz)
+    if not (plain or suffices) or (small is not None and small.large):
         field, forces, changes = _with_effects(linear, again=again is not None)
-        modal, small = _modal(field), None
-    elif small is not None:
-        modal = _modal(linear, small.column[None])
+        modal = _modal(field)
+        if suffices and not (modal is not None and _linear_and_constant(field, modal, band_hz)):
+            field, forces, changes, modal = linear, (), (), alone
+        else:
+            small = None
+    elif small is not None and small.saved > LARGE:
+        field = linear.with_effect(small.column[None])
+        modal = _modal(field)
+    else:
+        modal = alone
     field = field.with_orders_free()
     visible = _visible(field, modal)
     test = _uniform_beam_test(measurement, modal)

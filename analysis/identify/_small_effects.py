@@ -1,7 +1,8 @@
 """Small effects that are not linear, as columns beside the modal model.
 
 To first order in its size each adds to the torque a column of known shape: stiffness that rises
-with the deflection, air drag, backlash, a sensor whose gain depends on the torque. One that
+with the deflection, air drag, backlash, dry friction, a sensor whose gain depends on the torque.
+One that
 improves the modal model is fitted with it, so that it biases no mode; it is named, and no fact: of
 several small effects a record seldom tells which it is.
 """
@@ -33,7 +34,14 @@ SIGNIFICANT: Final = 16.0
 """Deviance that an effect must save: by chance one of nine does in two records of a thousand."""
 
 LARGE: Final = 100.0
-"""Deviance from which the first order may not suffice, and the effect is looked for by itself."""
+"""Deviance from which the first order may not suffice, and the effect is searched for by itself."""
+
+_LINEAR: Final[frozenset[Kind]] = frozenset({"nonlinear gain", "friction"})
+"""Effects that do not change the motion of the beam: the first order is exact."""
+
+_SLIDING_RAD_S: Final = 0.01
+"""Speed of the motor at which 70 % of the dry friction is reached; what it is exactly matters at
+the turning points alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +66,14 @@ class SmallEffect:
     saved: float
 
     @property
+    def linear(self) -> bool:
+        """Whether the first order in its size is exact."""
+        return self.kind in _LINEAR
+
+    @property
     def large(self) -> bool:
-        """Whether it needs a model of its own; the gain of a sensor does not."""
-        return self.saved > LARGE and self.kind != "nonlinear gain"
+        """Whether it needs a model of its own."""
+        return self.saved > LARGE and not self.linear
 
     def finding(self) -> Finding:
         """Name it, as no fact."""
@@ -112,6 +125,7 @@ def _effects(
     (drag,) = small_drag(comparison, plant)
     yield "air drag", "Air drag", drag
     yield "play", "Backlash between encoder and beam", play(comparison, plant) / UNIT_PLAY_RAD
+    yield "friction", "Dry friction between sensor and beam", _friction(comparison)
     torque = comparison.prediction.torque(modal.model)[0]
     largest = float(np.abs(torque).max())
     if largest > 0 and math.isfinite(largest):
@@ -119,3 +133,12 @@ def _effects(
                              (2, "A gain of the torque that depends on its sign")):  # fmt: skip
             column = comparison.spectrum(torque * (torque / largest) ** (power - 1))
             yield "nonlinear gain", words, column
+
+
+def _friction(comparison: Comparison) -> NDArray[np.complex128]:
+    """Spectrum of a dry friction of 1 N·m against the motion of the motor, shape (K,)."""
+    measurement = comparison.measurement
+    angle = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
+    speed = np.gradient(angle) * measurement.rate_hz
+    torque = comparison.decimation.apply(speed / np.hypot(speed, _SLIDING_RAD_S))
+    return comparison.spectrum(torque[comparison.kept])
