@@ -42,7 +42,7 @@ from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values
 from rigd.excitation import chirp
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S, Limits
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 
 # Modules of devices that a rig does not have are not loaded: these checks precede every session.
 if TYPE_CHECKING:

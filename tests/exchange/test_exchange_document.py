@@ -13,7 +13,8 @@ import scipy  # whose parts come on first use
 from analysis.exchange._channels import UNITS
 from analysis.exchange._source import MAX_MEMORY
 from analysis.exchange._specimen import read_specimen
-from rigd.session import MAX_SAMPLES, read_session
+from rigd.session import read_session
+from rigd.session.limits import MAX_SAMPLES
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "exchange.md").read_text(encoding="utf-8")
 

@@ -14,7 +14,8 @@ from analysis.exchange._source import ExchangeError
 from analysis.exchange._specimen import Specimen, read_specimen
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, transfer
-from rigd.session import SessionError, SessionExistsError, Status, read_session
+from rigd.session import SessionError, SessionExistsError, read_session
+from rigd.session.layout import Status
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 N = 4000

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from analysis.exchange._source import ExchangeError, read_source
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 
 NUMBERS = arrays(np.float64, st.integers(2, 40), elements=st.floats(width=64))
 

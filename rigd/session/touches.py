@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite, nan
 from typing import Any, Final
 
-from rigd.session._format import pack_touch
+from rigd.session.layout import pack_touch
 from rigd.units import with_half_width
 
 _TOLD: Final = {

@@ -26,8 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.printable import listed
-from rigd.session._format import Buffer, SessionError, decode_samples
+from rigd.session._errors import SessionError
 from rigd.session._validity import Validity
+from rigd.session.layout import Buffer, decode_samples
 from rigd.units import decimals, with_half_width
 
 _VERSION: Final = 1
@@ -191,7 +192,7 @@ def mode_line(mode: Mapping[str, Any]) -> str:
 
     Examples
     --------
-    >>> from rigd.session import mode_line
+    >>> from rigd.session.online_fit import mode_line
     >>> hz = {"value": 2.5699, "interval_95": [2.5687, 2.5711]}
     >>> print(mode_line({"mode": 1, "frequency_hz": hz,
     ...                  "damping_ratio": {"value": 0.00909, "interval_95": None}}))
@@ -249,7 +250,7 @@ def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
 
     Examples
     --------
-    >>> from rigd.session import unseen_modes
+    >>> from rigd.session.online_fit import unseen_modes
     >>> unseen_modes([{"mode": n, "shown": n == 1} for n in (1, 2, 3)])
     'modes 2 and 3'
     """

@@ -45,7 +45,7 @@ def look_path(path: Path) -> Path:
     Examples
     --------
     >>> from pathlib import Path
-    >>> from rigd.session import look_path
+    >>> from rigd.session.quick_look import look_path
     >>> print(look_path(Path("sessions/20261120-101500-chirp.mcap")))
     sessions/20261120-101500-chirp.look.json
     """
