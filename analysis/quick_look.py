@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.library import change_between
+from rigd.library.trend import change_between
 from rigd.printable import listed
 from rigd.runtime import begin_background, raise_on
 from rigd.session import SessionError, Validity

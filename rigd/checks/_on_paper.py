@@ -35,7 +35,8 @@ from math import degrees, inf, isfinite, isinf, log1p, log10, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.beam import Beam, RealisationError, undamped_frequencies_rad_s
+from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam.realisation import RealisationError
 from rigd.checks._rows import Row, Verdict, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values

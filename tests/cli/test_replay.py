@@ -22,7 +22,7 @@ from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
 
 from analysis.models import WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.session import SessionError, SessionWriter, read_session
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into

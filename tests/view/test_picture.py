@@ -10,7 +10,7 @@ import pytest
 from cases import further
 
 from analysis.models import PAPER_BAND_HZ, WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import read_session
