@@ -99,7 +99,7 @@ class Realisation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateOutput:
-    """Another response to the root's angle, told by the states of a realisation.
+    """Another response to the root's angle, as an output of a realisation's states.
 
     It is ``c x + D θ'' + V θ' + K θ``, as the torque of a `Realisation`.
     """
@@ -121,7 +121,7 @@ def state_output(
     inertial: bool,
     small: float = 0.0,
 ) -> StateOutput:
-    """Tell a response of the beam, such as its base shear, by the states of its realisation.
+    """Fit a response of the beam, such as its base shear, as an output of its realisation.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def realise(
     stiffness_offsets: tuple[float, ...] = (),
     modes_of: Beam | None = None,
 ) -> Realisation:
-    """Real-time realisation of the beam.
+    """Return a state space of the beam that runs in real time.
 
     Parameters
     ----------
@@ -614,7 +614,7 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
 
 
 def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
-    """State that inputs of 1, held over a duration, leave behind, shape (n, inputs).
+    """Return the state after inputs of 1 held over a duration, shape (n, inputs).
 
     Parameters
     ----------

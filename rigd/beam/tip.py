@@ -148,7 +148,7 @@ def tip_motion(
 
 
 def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
-    """Motion of the tip over the angle.
+    """Return the transfer functions from the angle to the tip's displacement and slope.
 
     Parameters
     ----------

@@ -143,25 +143,25 @@ SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
 SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
 """A decoded sample."""
 SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
-"""A sample as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A sample as it is in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
 
 CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
 """A decoded message of the controller's terms."""
 CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
-"""A control message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A control message as it is in the file: each field after its tag byte ``tag_NAME``."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 
 TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
 """A decoded message of the readings' ages."""
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
-"""A timing message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A timing message as it is in the file: each field after its tag byte ``tag_NAME``."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
 
 TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
 """A decoded touch."""
 TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
-"""A touch as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A touch as it is in the file: each field after its tag byte ``tag_NAME``."""
 TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
 
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
@@ -198,7 +198,7 @@ def pack_sample_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -259,7 +259,7 @@ def pack_control_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -294,7 +294,7 @@ def pack_timing_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -370,7 +370,7 @@ def _encode(
 
 
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
-    """Tell which messages have every tag of the fixed layout in its place.
+    """Return which messages have every tag of the fixed layout at its offset.
 
     Parameters
     ----------

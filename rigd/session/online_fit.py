@@ -67,7 +67,7 @@ class EstimateRequest:
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
-    """Begin a stream.
+    """Write the start of a stream: metadata and segments of the session.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def write_start(stream: BinaryIO, start: StreamStart) -> None:
 
 
 def write_samples(stream: BinaryIO, block: Buffer) -> None:
-    """Send consecutive samples.
+    """Write consecutive samples to the stream.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def write_samples(stream: BinaryIO, block: Buffer) -> None:
 
 
 def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
-    """Ask for an estimate.
+    """Write a request for an estimate to the stream.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def _write(stream: BinaryIO, kind: bytes, content: Buffer) -> None:
 
 
 def read_start(stream: BinaryIO) -> StreamStart:
-    """Read what a stream begins with.
+    """Read the start of a stream.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def read_start(stream: BinaryIO) -> StreamStart:
 
 
 def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateRequest]:
-    """Read what follows, until the stream ends.
+    """Read samples and requests until the stream ends.
 
     Yields
     ------

@@ -40,7 +40,7 @@ _BAND: Final = ("magnitude_low_95", "magnitude_high_95")
 
 
 def look_path(path: Path) -> Path:
-    """Return where the quick look at a session is, which is written beside its file.
+    """Return the path of a session's quick look, in the same folder as its file.
 
     Examples
     --------

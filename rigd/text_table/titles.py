@@ -71,7 +71,7 @@ def stated_unit_of(title: str) -> str:
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell of a row of units is one, with brackets or without."""
+    """Return whether a cell of a row of units is one, with brackets or without."""
     return _plain_unit(cell) in TIME_UNITS_S or _plain_unit(cell) in _OTHER_UNITS
 
 
@@ -86,7 +86,7 @@ def _plain_unit(cell: str) -> str:
 
 
 def is_title_of_times(title: str) -> bool:
-    """Whether a title is that of a column of times."""
+    """Return whether a title is that of a column of times."""
     return _TIME_TITLE.match(title.strip()) is not None
 
 
