@@ -31,11 +31,8 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, TransferGrid, undamped_frequencies_rad_s
 from rigd.spectral import (
-    PAPER_NFFT,
-    PAPER_OVERLAP,
     PAPER_OVERLAP_FRACTION,
     PAPER_RATE_HZ,
-    PAPER_SEGMENT_LENGTH,
     Segmentation,
 )
 
@@ -405,16 +402,16 @@ class WelchSettings:
         >>> WelchSettings().segmentation(rate_hz=500)
         Segmentation(segment_length=8633, overlap=1295, nfft=80000)
         """
-        scale = rate_hz / PAPER_RATE_HZ
+        scale, paper = rate_hz / PAPER_RATE_HZ, Segmentation()
         length, overlap, nfft = self.segment_length, self.overlap, self.nfft
         if overlap is None:
             overlap = round(
-                PAPER_OVERLAP * scale if length is None else PAPER_OVERLAP_FRACTION * length
+                paper.overlap * scale if length is None else PAPER_OVERLAP_FRACTION * length
             )
         if length is None:
-            length = round(PAPER_SEGMENT_LENGTH * scale)
+            length = round(paper.segment_length * scale)
         if nfft is None:
-            nfft = max(round(PAPER_NFFT * scale), length)
+            nfft = max(round(paper.nfft * scale), length)
         return Segmentation(length, overlap, nfft)
 
 

@@ -2,8 +2,8 @@
 
 `OnlineFit` is fed with samples and fits as often as it is asked, by the very functions of
 `analyze`, so that the last estimate of a session is that of its file. As a program,
-``python -m analysis.online``, it takes the samples on standard input (`rigd.session.write_start`
-and what follows) and answers on standard output, one line of JSON per estimate
+``python -m analysis.online``, it takes the samples on standard input, as `rigd.session.online_fit`
+writes them, and answers on standard output, one line of JSON per estimate
 (docs/online_fit.md).
 """
 
@@ -22,15 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.runtime import begin_background, give_way, ignore
-from rigd.session import (
-    EstimateRequest,
-    Session,
-    SessionError,
-    Validity,
-    read_frames,
-    read_start,
-    segments_until,
-)
+from rigd.session import Session, SessionError, Validity, segments_until
+from rigd.session.online_fit import EstimateRequest, read_frames, read_start
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -48,7 +41,7 @@ if TYPE_CHECKING:
         Selection,
     )
     from analysis.record import Record
-    from rigd.session import StreamStart
+    from rigd.session.online_fit import StreamStart
 
 _NOISE_POINTS: Final = 40
 _NICE: Final = 5
@@ -245,7 +238,7 @@ class OnlineFit:
 
         Parameters
         ----------
-        samples : ndarray of `rigd.session.SAMPLE_DTYPE`, shape (n,)
+        samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
             In the order of their ticks.
         """
         from analysis.record import MAX_SAMPLES, RECORD_FIELDS

@@ -20,18 +20,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.library import change_between
+from rigd.library.trend import change_between
 from rigd.printable import listed
 from rigd.runtime import begin_background, raise_on
-from rigd.session import (
-    LOOK_VERSION,
-    SessionError,
-    Validity,
-    last_look,
-    look_path,
-    mode_line,
-    read_look,
-)
+from rigd.session import SessionError, Validity
+from rigd.session.online_fit import mode_line
+from rigd.session.quick_look import LOOK_VERSION, last_look, look_path, read_look
 from rigd.units import decimals
 
 if TYPE_CHECKING:

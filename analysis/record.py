@@ -32,7 +32,8 @@ from analysis.record_checks import (
     stated_uncertainty,
     stated_uniformity,
 )
-from rigd.session import Session, Status, read_session, readable_texts
+from rigd.session import Session, read_session, readable_texts
+from rigd.session.layout import Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

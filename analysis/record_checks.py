@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rigd.beam import Beam
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:

@@ -27,7 +27,8 @@ from analysis.record_checks import (
 )
 from analysis.validity import record_validity
 from rigd.beam import Damping
-from rigd.session import Session, SessionError, Status, Validity, read_session, readable_texts
+from rigd.session import Session, SessionError, Validity, read_session, readable_texts
+from rigd.session.layout import Status
 from rigd.touch import (
     CONTACT_S,
     FINAL_S,

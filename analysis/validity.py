@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.beam import linear_model_error, tip_motion
+from rigd.beam.tip import linear_model_error, tip_motion
 from rigd.session import Validity
 
 if TYPE_CHECKING:

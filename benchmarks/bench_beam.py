@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from timing import least_s
 
-from rigd.beam import Beam, Damping, TransferGrid, couple, propagator, realise
+from rigd.beam import Beam, Damping, TransferGrid
+from rigd.beam.realisation import couple, propagator, realise
 from rigd.sim import SimulatedPlant
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from analysis.identify import Measurement, Plant, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import tip_motion
+from rigd.beam.tip import tip_motion
 from rigd.excitation import (
     BeamEstimate,
     Piece,

@@ -14,6 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from scipy.optimize import differential_evolution, least_squares
 from timing import least_s
 
 from analysis.models import STRUCTURES, Structure
-from analysis.paper import FrfFit, fit_frf, fit_many
+from analysis.paper import fit_frf, fit_many
 from rigd.beam import Beam, Damping, TransferGrid
 from rigd.session import read_session
 from rigd.spectral import FrequencyResponse, welch_response
@@ -97,10 +99,10 @@ class Peer:
             for _ in range(STARTS)
         ]
 
-    def local_grid(self, fit: FrfFit) -> float:
+    def local_grid(self, parameters: Mapping[str, float]) -> float:
         """Lowest cost on a grid of ±5 % in size at the modes, and ±0.05 in the orders."""
         names = self.structure.free
-        centre = [fit.parameters[n] if n in ORDERS else math.log(fit.parameters[n]) for n in names]
+        centre = [parameters[n] if n in ORDERS else math.log(parameters[n]) for n in names]
         axis = np.linspace(-0.05, 0.05, GRID_STEPS[len(names)])
         lowest = math.inf
         for steps in itertools.product(axis, repeat=len(names)):
@@ -130,10 +132,7 @@ def main() -> None:
     rng = np.random.default_rng(161_803)
     for structure in STRUCTURES.values():
         for weighting in ("const", "omega"):
-
-            def ours(s: Structure = structure, w: str = weighting) -> FrfFit:
-                return fit_frf(frf.frequency_hz, frf.response, LINK, s, w)
-
+            ours = partial(fit_frf, frf.frequency_hz, frf.response, LINK, structure, weighting)
             fit, spent = ours(), least_s(ours, 3)
             peer = Peer(frf, structure, weighting)
             start = time.perf_counter()
@@ -144,7 +143,7 @@ def main() -> None:
                 f"{structure.name:4} {weighting:6} {fit.cost:12.7f} {spent * 1e3:7.1f} "
                 f"{random_spent * 1e3:11.0f} {random_spent / spent:6.0f} "
                 f"{ends.min() / fit.cost - 1:14.1e} {reached:8.0%} "
-                f"{peer.local_grid(fit) / fit.cost - 1:12.1e}"
+                f"{peer.local_grid(fit.parameters) / fit.cost - 1:12.1e}"
             )
 
 

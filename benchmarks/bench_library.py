@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.library import INDEX_NAME, list_sessions
+from rigd.library import list_sessions
 from rigd.testing import Signals, write_session
 
 SESSIONS = 1000
@@ -67,7 +67,7 @@ def main() -> None:
             timed(lambda: subprocess.run([RIGD, "list", folder], check=True, capture_output=True))
             for _ in range(5)
         )
-        (folder / INDEX_NAME).unlink()
+        (folder / "library.sqlite").unlink()
         same = list_sessions(folder) == grown
     print(f"library of {SESSIONS} sessions, {TICKS} samples each")
     print(f"  index rebuilt      {anew_s:7.2f} s (must be below 60)")

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from analysis.identify import Measurement, Plant, RecordFit, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import SMALL_SLOPE_RAD, transfer
+from rigd.beam import transfer
+from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview

@@ -22,7 +22,7 @@ from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_rec
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
 from rigd.beam import Beam, Damping, modes
-from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, segment_count
+from rigd.spectral import FrequencyResponse, Segmentation, segment_count
 
 DAMPING = Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=0.594)
 NOT_UNIFORM = Plant(
@@ -208,7 +208,7 @@ def segment_trap() -> dict[int, FrequencyResponse]:
     truth = ResponseGrid(2j * np.pi * near_hz).evaluate(PLANTS["uniform"])[0]
     level_db = peak_of(near_hz, truth)[0]
     print(f"\nSegments: third peak (true {level_db:.2f} dB), cost and parameters of type VI")
-    for overlap in (PAPER_OVERLAP, PAPER_OVERLAP - 1):
+    for overlap in (Segmentation().overlap, Segmentation().overlap - 1):
         count = segment_count(120_000, 17_266, overlap)
         h1 = estimates[overlap] = noisy.h1(overlap)
         third_db = 20 * np.log10(np.abs(made.h1(overlap).band(44, 46).response).max())

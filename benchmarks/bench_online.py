@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from analysis.models import STRUCTURES
 from analysis.online import OnlineEstimate, OnlineFit
-from rigd.session import SAMPLE_DTYPE
+from rigd.session.layout import SAMPLE_DTYPE
 
 Real = NDArray[np.float64]
 

@@ -10,20 +10,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
+from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
-from rigd.session import (
+from rigd.session import SessionWriter, read_session
+from rigd.session.layout import (
     CONTROL_SIZE,
     SAMPLE_FIELDS,
-    SAMPLE_SCHEMA,
     SAMPLE_SIZE,
-    SessionWriter,
-    message_class,
     pack_control_into,
     pack_sample_into,
-    read_session,
-    schema_data,
 )
 
 SAMPLES = 120_000
@@ -62,14 +63,26 @@ def write(path: Path, samples: memoryview, controls: memoryview) -> float:
     return time.perf_counter() - started
 
 
-def write_plainly(path: Path, table: list[tuple[float, ...]]) -> float:
-    """Write the samples (without controls) with protobuf objects and the mcap package."""
-    cls = message_class(SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA))
+def message_class(schema: Schema) -> type[Message]:
+    """Return protobuf's class of the messages of a schema."""
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(schema.data).file:
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(schema.name))
+
+
+def write_plainly(path: Path, table: list[tuple[float, ...]], like: Path) -> float:
+    """Write the samples (without controls) with protobuf objects, by the schema of a session."""
+    with like.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (stated,) = (each for each in summary.schemas.values() if each.name == "rigd.Sample")
+    cls = message_class(stated)
     started = time.perf_counter()
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.LZ4)
         writer.start()
-        schema = writer.register_schema(SAMPLE_SCHEMA, "protobuf", schema_data(SAMPLE_SCHEMA))
+        schema = writer.register_schema(stated.name, "protobuf", stated.data)
         channel = writer.register_channel("/rig/sample", "protobuf", schema)
         for row in table:
             data = cls(**dict(zip(SAMPLE_FIELDS, row, strict=True))).SerializeToString()
@@ -86,7 +99,8 @@ def read_plainly(path: Path) -> float:
         cls = None
         for schema, _, message in make_reader(stream).iter_messages(topics=["/rig/sample"]):
             if cls is None:
-                cls = message_class(schema.name, schema.data)
+                assert schema is not None
+                cls = message_class(schema)
             sample = cls.FromString(message.data)
             for name, column in zip(SAMPLE_FIELDS, columns, strict=True):
                 column.append(getattr(sample, name))
@@ -121,7 +135,7 @@ def main() -> None:
         )
         path = folder / "0.mcap"
         read_s = min(timed(lambda: read_session(path)) for _ in range(10))
-        plain_write_s = min(write_plainly(folder / "plain.mcap", table) for _ in range(2))
+        plain_write_s = min(write_plainly(folder / "plain.mcap", table, path) for _ in range(2))
         plain_read_s = min(read_plainly(path) for _ in range(2))
         size_mb = path.stat().st_size / 1e6
     scale = 1e6 / SAMPLES

@@ -5,14 +5,13 @@ import scipy.signal
 from timing import least_s
 
 from rigd.spectral import (
-    PAPER_NFFT,
-    PAPER_OVERLAP,
-    PAPER_SEGMENT_LENGTH,
+    Segmentation,
     fft_response,
     welch_response,
 )
 
 RATE_HZ = 1000.0
+PAPER = Segmentation()
 REPEATS = 15
 
 
@@ -23,10 +22,10 @@ def main() -> None:
     y = np.convolve(x, [0.1, 0.4, -0.3])[: x.size] + 0.1 * rng.normal(size=x.size)
     options = {
         "fs": RATE_HZ,
-        "window": scipy.signal.windows.hamming(PAPER_SEGMENT_LENGTH, sym=True),
-        "nperseg": PAPER_SEGMENT_LENGTH,
-        "noverlap": PAPER_OVERLAP,
-        "nfft": PAPER_NFFT,
+        "window": scipy.signal.windows.hamming(PAPER.segment_length, sym=True),
+        "nperseg": PAPER.segment_length,
+        "noverlap": PAPER.overlap,
+        "nfft": PAPER.nfft,
         "detrend": False,
     }
 
@@ -39,7 +38,7 @@ def main() -> None:
 
     ours = least_s(lambda: welch_response(x, y, RATE_HZ), REPEATS)
     theirs = least_s(peer, REPEATS)
-    whole = least_s(lambda: fft_response(x, y, RATE_HZ, PAPER_NFFT), REPEATS)
+    whole = least_s(lambda: fft_response(x, y, RATE_HZ, PAPER.nfft), REPEATS)
     difference = np.abs(welch_response(x, y, RATE_HZ).response / peer()[0] - 1)[1:-1].max()
     print(f"Best of {REPEATS}, 120 000 samples, 8 segments of 17 266 padded to 160 000")
     print(f"  welch_response         {ours * 1e3:7.1f} ms")

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from bench_touch_sessions import BIN, Meeting, draw_meeting
 
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 
 WANTED_S = {"first": 0.3, "last": 1.0}
 RIG = 9000

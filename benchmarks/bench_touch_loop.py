@@ -27,7 +27,8 @@ from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview, Order, SessionProgress
 from rigd.runner._touch_search import touch_search
 from rigd.runtime import StopRequest, use_one_thread
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 
 RATE_HZ = 1000.0
 WITHOUT, WITH = "without detector", "with detector"

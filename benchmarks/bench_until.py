@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify import Plant, mode_poles
-from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping, LoadedBeam, modes, tip_motion
+from rigd.beam import Beam, Damping, LoadedBeam, modes
+from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
 from rigd.excitation import BeamEstimate, chirp, expected_precisions, parse_target
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from analysis.identify import Measurement, Plant, ResponseGrid
 from rigd.beam import Beam, Damping
-from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, welch_response
+from rigd.spectral import FrequencyResponse, Segmentation, welch_response
 
 RATE_HZ = 1000.0
 SWEEP = slice(1000, 121_000)
@@ -40,7 +40,7 @@ class Session:
             np.round((self.torque_nm + noise) / 1.25e-4) * 1.25e-4,
         )
 
-    def h1(self, overlap: int = PAPER_OVERLAP) -> FrequencyResponse:
+    def h1(self, overlap: int = Segmentation().overlap) -> FrequencyResponse:
         """Take the paper's estimate in its band."""
         return welch_response(
             self.angle_rad[SWEEP], self.torque_nm[SWEEP], RATE_HZ, overlap=overlap

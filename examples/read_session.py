@@ -7,7 +7,8 @@ import sys
 
 import numpy as np
 
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 
 
 def main(path: str) -> None:

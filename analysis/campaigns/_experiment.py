@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rigd.session import added_metadata
+from rigd.session.user_metadata import added_metadata
 from rigd.units import unit_of
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from ._export import export_record as export_record
 from ._import_record import ImportPlan as ImportPlan
 from ._import_record import import_record as import_record
 from ._import_record import write_session as write_session
-from ._model_files import MODEL_FORMATS as MODEL_FORMATS
 from ._source import ExchangeError as ExchangeError
 from ._source import TargetError as TargetError
+from ._source import read_source as read_source
 from ._specimen import read_specimen as read_specimen

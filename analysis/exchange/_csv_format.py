@@ -13,7 +13,7 @@ from analysis.exchange._source import (
     SourceChannel,
     check_samples,
 )
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 from rigd.text_table import TableError, read_table
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from analysis.exchange._file_statements import FileStatements, place_samples
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
-from rigd.session import SessionWriter, Status, encode_samples
+from rigd.session import SessionWriter
+from rigd.session.layout import Status, encode_samples
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -363,7 +364,7 @@ def hold(
     -------
     columns : dict of str to ndarray of float, shape (n - first,)
     status : ndarray of uint32, shape (n - first,)
-        Bits of `rigd.session.Status`.
+        Bits of `rigd.session.layout.Status`.
     first : int
         Samples at the beginning that had to be left out, having nothing to hold.
 

@@ -17,7 +17,8 @@ from analysis.exchange._source import (
     check_samples,
     no_such_channel,
 )
-from rigd.session import MAX_SAMPLES, META_PREFIX, NOTES
+from rigd.session.limits import MAX_SAMPLES
+from rigd.session.user_metadata import META_PREFIX, NOTES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import ExchangeError, FileTimes
-from rigd.text_table import is_title_of_times, time_unit_s
+from rigd.text_table.titles import is_title_of_times, time_unit_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

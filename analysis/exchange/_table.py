@@ -12,7 +12,8 @@ from analysis.exchange._source import ExchangeError
 from analysis.paper import estimate
 from analysis.record import load_record
 from analysis.suited import welch_settings
-from rigd.session import SAMPLE_FIELDS, read_session
+from rigd.session import read_session
+from rigd.session.layout import SAMPLE_FIELDS
 from rigd.units import unit_of
 
 if TYPE_CHECKING:

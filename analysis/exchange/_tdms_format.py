@@ -20,7 +20,7 @@ from analysis.exchange._source import (
     missing_library,
     no_such_channel,
 )
-from rigd.text_table import is_title_of_times, time_unit_s
+from rigd.text_table.titles import is_title_of_times, time_unit_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

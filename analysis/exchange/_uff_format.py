@@ -24,7 +24,7 @@ from analysis.exchange._source import (
     place_of,
 )
 from rigd.printable import printable
-from rigd.text_table import stated_unit_of, time_unit_s
+from rigd.text_table.titles import stated_unit_of, time_unit_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -1,10 +1,8 @@
 from ._estimate import EstimateError as EstimateError
 from ._estimate import SettingsError as SettingsError
 from ._estimate import estimate as estimate
-from ._fit import FrfFit as FrfFit
 from ._fit import fit_frf as fit_frf
 from ._fit import fit_many as fit_many
-from ._fit import starts as starts
 from ._fit import thinned as thinned
 from ._route import LARGEST_SHIFT as LARGEST_SHIFT
 from ._route import FittedModel as FittedModel

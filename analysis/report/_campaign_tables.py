@@ -23,7 +23,7 @@ from analysis.report._pooled_tables import (
     uniform_beam_table,
 )
 from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
-from rigd.session import META_PREFIX
+from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:

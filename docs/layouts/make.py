@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.session import EVENT_TOPIC, SAMPLE_SCHEMA, SAMPLE_TOPIC
 from rigd.view import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
 
 if TYPE_CHECKING:
@@ -19,6 +18,9 @@ if TYPE_CHECKING:
 
 RERUN: Final = "rigd.rbl"
 FOXGLOVE: Final = "foxglove.json"
+
+SAMPLE_TOPIC: Final = "/rig/sample"
+EVENT_TOPIC: Final = "/rig/event"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +171,7 @@ def _rerun_plot(panel: Panel) -> "rrb.TimeSeriesView":
                 VisualizerComponentMapping(
                     "Scalars:scalars",
                     ComponentSourceKind.SourceComponent,
-                    source_component=f"{SAMPLE_SCHEMA}:message",
+                    source_component="rigd.Sample:message",
                     selector=f".{field}",
                 )
             ]

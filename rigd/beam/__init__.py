@@ -1,10 +1,10 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper).
 
 Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
-modes and their poles (`modes`, `poles`), a state-space realisation that runs in real time
-(`realise`, `couple`), the deflection and the tip's motion (`DeflectionFilter`, `tip_motion`), a
-force at a point of the beam (`PointForceGrid`), a beam with a tip mass (`LoadedBeam`) and the air's
-drag (`DragGrid`). It knows of no rig and no file.
+modes and their poles (`modes`, `poles`), the deflection (`DeflectionFilter`), a force at a point of
+the beam (`PointForceGrid`, `realise_force`), a beam with a tip mass (`LoadedBeam`) and the air's
+drag (`DragGrid`). Its public module `realisation` has the state space that runs in real time, and
+`tip` the motion of the free end. It knows of no rig and no file.
 """
 
 import lazy_loader as lazy

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import clamped_free_eigenvalues, mode_mean, mode_shape, poles_for_eigenvalues
 from rigd.beam._point_force import PointForceGrid
-from rigd.beam._realisation import RealisationError
+from rigd.beam.realisation import RealisationError
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

@@ -20,7 +20,8 @@ from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
 from rigd.runner import Order, ProcessGroup, Rig, SessionProgress
 from rigd.runtime import StopRequest
-from rigd.session import decode_samples, read_session
+from rigd.session import read_session
+from rigd.session.layout import decode_samples
 
 LOOK_S = 0.1
 AROUND_S = 3.5

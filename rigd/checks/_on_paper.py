@@ -35,14 +35,15 @@ from math import degrees, inf, isfinite, isinf, log1p, log10, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.beam import Beam, RealisationError, undamped_frequencies_rad_s
+from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam.realisation import RealisationError
 from rigd.checks._rows import Row, Verdict, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values
 from rigd.excitation import chirp
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S, Limits
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 
 # Modules of devices that a rig does not have are not loaded: these checks precede every session.
 if TYPE_CHECKING:

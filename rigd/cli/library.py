@@ -21,7 +21,8 @@ from rigd.printable import printable, readable_message
 from rigd.units import with_half_width
 
 if TYPE_CHECKING:
-    from rigd.library import Change, ModeTrend, Quantity, SessionRow, TrendPoint
+    from rigd.library import SessionRow
+    from rigd.library.trend import Change, ModeTrend, Quantity, TrendPoint
 
 _WIDEST: Final = 24
 """Characters of a text in a table."""
@@ -68,7 +69,7 @@ def list_sessions(
     Example: rigd list --specimen "antenna 3" --trend
     """
     from rigd.library import list_sessions as sessions_of
-    from rigd.library import mode_trends
+    from rigd.library.trend import mode_trends
 
     rows: list[SessionRow] = []
     for folder in folders or [SESSIONS]:

@@ -164,7 +164,7 @@ def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None
 ) -> dict[str, str]:
     """Return what is to go into the file, by its keys there; what cannot ends the command."""
-    from rigd.session import metadata_keys
+    from rigd.session.user_metadata import metadata_keys
 
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():

@@ -105,7 +105,7 @@ def start_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Have the daemon run sessions, and report how they ended."""
-    from rigd.session import META_PREFIX
+    from rigd.session.user_metadata import META_PREFIX
 
     notes: dict[str, Any] = {}
     for key, text in session_notes(operator, specimen, note, meta).items():

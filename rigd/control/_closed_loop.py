@@ -13,16 +13,8 @@ from math import exp, floor, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Beam,
-    Damping,
-    LoadedBeam,
-    Realisation,
-    couple,
-    propagator,
-    realise,
-    undamped_frequencies_rad_s,
-)
+from rigd.beam import Beam, Damping, LoadedBeam, undamped_frequencies_rad_s
+from rigd.beam.realisation import Realisation, couple, propagator, realise
 from rigd.control._pid import (
     ControlDesignError,
     ControlSettings,

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.errors import RigdError
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
-from rigd.session import NOTES, MetadataError, metadata_keys
+from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
 LONGEST_LINE = 65_536

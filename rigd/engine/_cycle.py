@@ -32,7 +32,7 @@ from rigd.safety import (
     SensorWatch,
     Violation,
 )
-from rigd.session import WRENCH_FIELDS, Status
+from rigd.session.layout import WRENCH_FIELDS, Status
 
 REMEDY = (
     "The zero of the angle and its limits are invalid: check the encoder, its cable and shield, "

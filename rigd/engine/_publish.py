@@ -11,7 +11,7 @@ from rigd.engine._ring import Ring
 from rigd.engine._shared_state import UNKNOWN, SharedState, Word
 from rigd.engine._timing import Clock, TickScheduler
 from rigd.engine._topics import CONTROL, Channels
-from rigd.session import Status, pack_control_into, pack_sample_into, pack_timing_into
+from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 
 class Display:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from rigd.engine._cycle import Cycle
 from rigd.engine._messages import TouchOrder
 from rigd.excitation import after_touch
-from rigd.session import Status
+from rigd.session.layout import Status
 from rigd.touch import TouchDetector
 
 _ANGLE_STALE = int(Status.ANGLE_STALE)

@@ -53,7 +53,7 @@ from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest, name_this_process
 from rigd.safety import LOOK_EVERY
-from rigd.session import WRENCH_FIELDS
+from rigd.session.layout import WRENCH_FIELDS
 
 _SILENCE_S = 1.0
 """Time for which a device may be silent between sessions."""

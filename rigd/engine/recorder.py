@@ -30,13 +30,8 @@ from rigd.engine._topics import (
     attach_channels,
 )
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import (
-    SAMPLE_SIZE,
-    SessionError,
-    SessionExistsError,
-    SessionWriter,
-    segments_until,
-)
+from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
+from rigd.session.layout import SAMPLE_SIZE
 
 _BLOCK = 250
 _IDLE_S = 0.005

@@ -19,7 +19,7 @@ from rigd.engine._ring import Observer
 from rigd.engine._shared_state import Word
 from rigd.engine._topics import attach_channels
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import Status, decode_samples
+from rigd.session.layout import Status, decode_samples
 from rigd.touch import (
     CONTACT_S,
     FINAL_S,

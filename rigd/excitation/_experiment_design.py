@@ -21,7 +21,8 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, LoadedBeam
+from rigd.beam import LoadedBeam
+from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
 from rigd.excitation._piece_search import (

@@ -23,7 +23,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import tip_response, transfer, transfer_and_gradient
+from rigd.beam import transfer, transfer_and_gradient
+from rigd.beam.tip import tip_response
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
     BY_PARAMETER,

@@ -15,8 +15,9 @@ from rigd.excitation._signals import (
     within_a_turn,
 )
 from rigd.runtime import open_plain_file
-from rigd.session import MAX_SAMPLES
-from rigd.text_table import MissingColumnError, TableError, TextTable, read_table, time_unit_s
+from rigd.session.limits import MAX_SAMPLES
+from rigd.text_table import MissingColumnError, TableError, TextTable, read_table
+from rigd.text_table.titles import time_unit_s
 
 MOST_BYTES: Final = 256_000_000
 TIME: Final = "time_s"

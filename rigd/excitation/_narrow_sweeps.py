@@ -21,14 +21,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from rigd.beam import (
-    PARAMETERS,
-    SMALL_SLOPE_RAD,
-    Beam,
-    Damping,
-    transfer_and_gradient,
-    undamped_frequencies_rad_s,
-)
+from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
-from rigd.session import MAX_SAMPLES, sweep_frequency_hz
+from rigd.session import sweep_frequency_hz
+from rigd.session.limits import MAX_SAMPLES
 from rigd.units import is_usable_size
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, undamped_frequencies_rad_s
+from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._experiment_design import DesignRig, geometry_floors
 from rigd.excitation._moves import quintic

@@ -8,7 +8,8 @@ import numpy as np
 
 from rigd.identification._estimate import EstimateError, Timing, Window
 from rigd.identification._experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
-from rigd.session import Session, Status, read_session, sample_digests
+from rigd.session import Session, read_session, sample_digests
+from rigd.session.layout import Status
 
 _USELESS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF

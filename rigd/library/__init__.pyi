@@ -1,11 +1,4 @@
-from ._index import INDEX_NAME as INDEX_NAME
+from . import trend as trend
 from ._row import REPORT_PAGE as REPORT_PAGE
 from ._row import SessionRow as SessionRow
-from ._sessions import LibraryError as LibraryError
 from ._sessions import list_sessions as list_sessions
-from ._trend import Change as Change
-from ._trend import ModeTrend as ModeTrend
-from ._trend import Quantity as Quantity
-from ._trend import TrendPoint as TrendPoint
-from ._trend import change_between as change_between
-from ._trend import mode_trends as mode_trends

@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from rigd.printable import printable
 from rigd.runtime import read_plain_file
-from rigd.session import Validity, modes_of, read_look
+from rigd.session import Validity
+from rigd.session.quick_look import modes_of, read_look
 
 SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
@@ -116,7 +117,8 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[Sessio
     FileNotFoundError
         If the file has gone meanwhile.
     """
-    from rigd.session import SessionAccessError, SessionError, added_metadata, read_summary
+    from rigd.session import SessionAccessError, SessionError, read_summary
+    from rigd.session.user_metadata import added_metadata
 
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)

@@ -17,7 +17,7 @@ from rigd.library._row import (
     SessionRow,
     read_row,
 )
-from rigd.session import LOOK_SUFFIX
+from rigd.session.quick_look import LOOK_SUFFIX
 
 _NS_PER_S: Final = 1_000_000_000
 _DATE_CHARACTERS: Final = len("2026-11-20")

@@ -16,7 +16,7 @@ from rigd.engine import (
     Ring,
     read_events,
 )
-from rigd.session import decode_samples, decode_timings
+from rigd.session.layout import decode_samples, decode_timings
 from rigd.view import LastResponse, Note, Scene, Subject
 
 if TYPE_CHECKING:

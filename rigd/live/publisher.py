@@ -41,7 +41,8 @@ from rigd.live._ring_reader import (
 )
 from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import last_look, look_path, read_look, touch_line
+from rigd.session.quick_look import last_look, look_path, read_look
+from rigd.session.touches import touch_line
 from rigd.view import (
     FINISHING,
     RETURNING,

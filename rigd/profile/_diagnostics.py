@@ -28,7 +28,7 @@ from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
 from rigd.printable import printable
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
 from rigd.safety import BUFFERED_S
-from rigd.session import NOTES, MetadataError, check_name
+from rigd.session.user_metadata import NOTES, MetadataError, check_name
 from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 
 _UNITS_OF_SIX = {

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from rigd.engine import Phase
 from rigd.printable import counts_text, progress_bar
-from rigd.session import touch_line
+from rigd.session.touches import touch_line
 
 _REDRAWN_S: Final = 0.05
 """Shortest time after which progress alone has the line drawn anew: 2 ms of a processor."""

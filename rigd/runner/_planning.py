@@ -11,13 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Beam,
-    LoadedBeam,
-    RealisationError,
-    TipMotion,
-    tip_motion,
-)
+from rigd.beam import Beam, LoadedBeam
+from rigd.beam.realisation import RealisationError
+from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import Clearance, check_on_paper
 from rigd.control import (
     ClosedLoop,

@@ -21,7 +21,7 @@ from typing import Any, Final
 from rigd.printable import printable
 from rigd.runner._session import SessionResult
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
-from rigd.session import look_path, read_look
+from rigd.session.quick_look import look_path, read_look
 
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0

@@ -36,7 +36,8 @@ from rigd.profile import Profile, load_profile
 from rigd.runner._planning import RefusedError
 from rigd.runner._touch_search import TouchSearch
 from rigd.safety import Limits
-from rigd.session import META_PREFIX, NOTES, PART_SUFFIX
+from rigd.session import PART_SUFFIX
+from rigd.session.user_metadata import META_PREFIX, NOTES
 from rigd.units import unit_of
 
 # Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rigd.engine import Channels, Observer, Phase, Ring, Word
 from rigd.profile import Profile
 from rigd.runner._live_view import gauge_limits
-from rigd.session import decode_samples
+from rigd.session.layout import decode_samples
 from rigd.view import Gauge, Gauges
 
 _FIELDS: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")

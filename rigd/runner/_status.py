@@ -25,7 +25,7 @@ from rigd.engine import (
 )
 from rigd.live import LiveAddress
 from rigd.runner._process_group import ProcessGroup
-from rigd.session import decode_samples
+from rigd.session.layout import decode_samples
 
 _WINDOW_S: Final = 1.0
 """Window of samples from which lateness and rate are computed."""

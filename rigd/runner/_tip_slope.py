@@ -8,7 +8,8 @@ import math
 from dataclasses import asdict, replace
 from typing import Any, Final
 
-from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, linear_model_error
+from rigd.beam import Beam
+from rigd.beam.tip import SMALL_SLOPE_RAD, TipMotion, linear_model_error
 from rigd.errors import UserError
 from rigd.excitation import KINDS, Excitation
 from rigd.profile import Profile

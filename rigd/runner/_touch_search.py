@@ -25,7 +25,7 @@ from rigd.engine import (
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.runner._process_group import await_ready
-from rigd.session import packed_touches, touch_line
+from rigd.session.touches import packed_touches, touch_line
 
 if TYPE_CHECKING:
     from rigd.profile import RealtimeSettings

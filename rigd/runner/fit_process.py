@@ -32,11 +32,10 @@ from rigd.engine import (
 from rigd.runner._precision_search import Search
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
-from rigd.session import (
-    SAMPLE_SIZE,
+from rigd.session.layout import SAMPLE_SIZE, decode_samples
+from rigd.session.online_fit import (
     EstimateRequest,
     StreamStart,
-    decode_samples,
     estimate_lines,
     write_request,
     write_samples,

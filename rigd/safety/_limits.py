@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from rigd.beam import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_SLOPE_RAD
 
 Positive = Annotated[float, Gt(0)]
 BelowAll = Annotated[float, Gt(0), Lt(100)]

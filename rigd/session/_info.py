@@ -12,11 +12,13 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from rigd.printable import counts_text, grouped, listed, printable
-from rigd.session._format import SessionError, Status
-from rigd.session._online_fit import mode_line
-from rigd.session._quick_look import fit_of
-from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
-from rigd.session._touches import touch_line, touches_of
+from rigd.session import limits
+from rigd.session._errors import SessionError
+from rigd.session._reader import SURVEY_FIELDS, Event, Session, read_session
+from rigd.session.layout import Status
+from rigd.session.online_fit import mode_line
+from rigd.session.quick_look import fit_of
+from rigd.session.touches import touch_line, touches_of
 from rigd.units import suffix_of, unit_of
 
 _RECOVERED: Final = "recovered_"
@@ -156,7 +158,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     (1000.0, 21500, 'complete')
     """
     path = Path(path)
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED)
+    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:
         raise SessionError(

@@ -13,22 +13,9 @@ import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
 
-from rigd.session._format import Buffer
+from rigd.session import limits
+from rigd.session.layout import Buffer
 
-MAX_CHUNK_BYTES: Final = 256 << 20
-MAX_TOTAL_BYTES: Final = 2 << 30
-"""Most bytes of all chunks, unpacked: two hours and a half at 1 kHz."""
-MAX_FILE_BYTES: Final = 2 << 30
-MAX_DECLARED_BYTES: Final = 64 << 20
-"""Most memory for schemas, channels, metadata and attachments together."""
-MAX_TEXT_BYTES: Final = 32 << 20
-"""Most of that for all but the attachments: as text it takes up to four times as much."""
-MAX_ENTRIES: Final = 100_000
-"""Most keys in all metadata."""
-MAX_MESSAGE_BYTES: Final = 16 << 20
-"""Longest message that is read where it is wanted."""
-MAX_STEPS: Final = 6_000_000
-"""Most work on a file, in what a run of messages costs: about a microsecond."""
 MAX_SKIPPED: Final = 20
 """Most damaged records that are told one by one."""
 
@@ -76,10 +63,11 @@ class Allowance:
             If that is more than the file may take.
         """
         self._steps += steps
-        if self._steps > MAX_STEPS:
+        if self._steps > limits.MAX_STEPS:
             raise McapTooLargeError(
                 "is made of so many small parts that reading it would take too long: more than "
-                f"{MAX_STEPS} runs of messages, chunks and other records, each weighed by its work"
+                f"{limits.MAX_STEPS} runs of messages, chunks and other records, each weighed by "
+                "its work"
             )
 
     def unpack(self, size: int, where: str) -> None:
@@ -91,10 +79,11 @@ class Allowance:
             If they are more than a chunk or a file may have.
         """
         self._unpacked += size
-        if size > MAX_CHUNK_BYTES or self._unpacked > MAX_TOTAL_BYTES:
+        if size > limits.MAX_CHUNK_BYTES or self._unpacked > limits.MAX_TOTAL_BYTES:
             raise McapDamageError(
-                f"claims {size} bytes{where}, which is more than the {MAX_CHUNK_BYTES >> 20} MiB "
-                f"for a chunk or the {MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
+                f"claims {size} bytes{where}, which is more than the "
+                f"{limits.MAX_CHUNK_BYTES >> 20} MiB for a chunk or the "
+                f"{limits.MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
 
     def declare(self, opcode: int, content: Buffer, where: str) -> None:
@@ -116,18 +105,22 @@ class Allowance:
         if opcode != Opcode.ATTACHMENT:
             self._declared_text += len(content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._entries += _entries(content, opcode, MAX_ENTRIES)
+            self._entries += _entries(content, opcode, limits.MAX_ENTRIES)
         for amount, most, of_what in (
-            (self._declared, MAX_DECLARED_BYTES, "MiB of channels, schemas, metadata and files"),
-            (self._declared_text, MAX_TEXT_BYTES, "MiB of channels, schemas and metadata"),
+            (
+                self._declared,
+                limits.MAX_DECLARED_BYTES,
+                "MiB of channels, schemas, metadata and files",
+            ),
+            (self._declared_text, limits.MAX_TEXT_BYTES, "MiB of channels, schemas and metadata"),
         ):
             if amount > most:
                 raise McapError(
                     "declares channels, schemas, metadata and attachments without limit: more than "
                     f"{most >> 20} {of_what}{where}"
                 )
-        if self._entries > MAX_ENTRIES:
-            raise McapError(f"has more than {MAX_ENTRIES} keys in its metadata{where}")
+        if self._entries > limits.MAX_ENTRIES:
+            raise McapError(f"has more than {limits.MAX_ENTRIES} keys in its metadata{where}")
 
 
 def zstd_decompressor() -> zstandard.ZstdDecompressor:

@@ -25,14 +25,11 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
-from rigd.session._format import Buffer
+from rigd.session import limits
 from rigd.session._mcap_limits import (
     CHUNK_STEPS,
     DECLARATION_STEPS,
-    MAX_FILE_BYTES,
-    MAX_MESSAGE_BYTES,
     MAX_SKIPPED,
-    MAX_TEXT_BYTES,
     PIECE_BYTES,
     Allowance,
     McapDamageError,
@@ -44,6 +41,7 @@ from rigd.session._mcap_limits import (
     zstd_decompressor,
 )
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
+from rigd.session.layout import Buffer
 
 RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
@@ -175,9 +173,10 @@ def read_mcap(
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
-    if len(data) > MAX_FILE_BYTES:
+    if len(data) > limits.MAX_FILE_BYTES:
         raise McapTooLargeError(
-            f"has {len(data) >> 20} MiB, more than the {MAX_FILE_BYTES >> 20} MiB that are read"
+            f"has {len(data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB that are "
+            "read"
         )
     reader = _Reader(data, topics, take, salvage=salvage)
     contents = reader.contents
@@ -424,7 +423,7 @@ class _Reader:
         """Return the length of the record that `records` begin with if it is not needed, else 0."""
         opcode, length, channel = _RUN_HEAD.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            if length > MAX_TEXT_BYTES:
+            if length > limits.MAX_TEXT_BYTES:
                 raise _torn(base, where)
             return 0
         if opcode == Opcode.MESSAGE:
@@ -435,11 +434,11 @@ class _Reader:
 
     def _is_short(self, length: int, where: str) -> bool:
         """Tell whether a message can be taken; what cannot is left out to save the others."""
-        if length <= MAX_MESSAGE_BYTES:
+        if length <= limits.MAX_MESSAGE_BYTES:
             return True
         damage = (
-            f"has a message of {length} bytes{where}, more than the {MAX_MESSAGE_BYTES >> 20} MiB "
-            "that are accepted"
+            f"has a message of {length} bytes{where}, more than the "
+            f"{limits.MAX_MESSAGE_BYTES >> 20} MiB that are accepted"
         )
         if not self._salvage:
             raise McapDamageError(damage)

@@ -1,6 +1,6 @@
 """Decoder of messages: samples, controls, timings and touches as arrays, from any writer.
 
-Messages of the fixed layout (`rigd.session._format`) are taken as they are. Any other protobuf
+Messages of the fixed layout (`rigd.session.layout`) are taken as they are. Any other protobuf
 library may put the fields in another order, leave out zeros, number or type them differently: the
 places of the fields in one such message are found by its schema, and all others that have the same
 tags in the same places are taken together. What is left is decoded one by one, but not without end.
@@ -14,24 +14,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session._format import (
-    CONTROL_DTYPE,
-    CONTROL_TYPES,
-    CONTROL_WIRE_DTYPE,
-    SAMPLE_DTYPE,
-    SAMPLE_TYPES,
-    SAMPLE_WIRE_DTYPE,
-    TIMING_DTYPE,
-    TIMING_TYPES,
-    TIMING_WIRE_DTYPE,
-    TOUCH_DTYPE,
-    TOUCH_TYPES,
-    TOUCH_WIRE_DTYPE,
-    Buffer,
-    SessionError,
-    is_fixed_layout,
-    to_native,
-)
+from rigd.session import limits
+from rigd.session._errors import SessionError
 from rigd.session._mcap_reader import McapContents, Stretch, message_starts
 from rigd.session._mcap_writer import MESSAGE_HEAD
 from rigd.session._schema import (
@@ -46,18 +30,29 @@ from rigd.session._schema import (
     message_class,
     schema_data,
 )
+from rigd.session.layout import (
+    CONTROL_DTYPE,
+    CONTROL_TYPES,
+    CONTROL_WIRE_DTYPE,
+    SAMPLE_DTYPE,
+    SAMPLE_TYPES,
+    SAMPLE_WIRE_DTYPE,
+    TIMING_DTYPE,
+    TIMING_TYPES,
+    TIMING_WIRE_DTYPE,
+    TOUCH_DTYPE,
+    TOUCH_TYPES,
+    TOUCH_WIRE_DTYPE,
+    Buffer,
+    is_fixed_layout,
+    to_native,
+)
 
 if TYPE_CHECKING:
     from google._upb._message import FieldDescriptor as UpbFieldDescriptor
     from google.protobuf.descriptor import FieldDescriptor
     from google.protobuf.message import Message
 
-MAX_SINGLE_MESSAGES: Final = 200_000
-"""Most messages of a topic that are decoded one by one, at some 20 µs each."""
-MAX_CHANNELS: Final = 16
-"""Most channels of a topic."""
-MAX_MESSAGE_BYTES: Final = 1 << 14
-"""Longest message that is decoded; the fixed layout takes 119."""
 
 _BLOCK_BYTES: Final = 1 << 18
 """Size of the messages that are decoded together: they stay in a processor's cache."""
@@ -294,11 +289,11 @@ class MessageDecoder:
         """Decode message records of one channel and length."""
         contents, layout = self._contents, self._layout
         assert contents is not None
-        if size > MAX_MESSAGE_BYTES:
+        if size > limits.MAX_DECODED_BYTES:
             raise SessionError(
                 f"{self._path}: a message of {layout.topic} has {size} bytes, more than the "
-                f"{MAX_MESSAGE_BYTES} that are read. The writing program must write one sample per "
-                "message."
+                f"{limits.MAX_DECODED_BYTES} that are read. The writing program must write one "
+                "sample per message."
             )
         if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
             wire = np.frombuffer(records, layout.record_dtype)["wire"]
@@ -406,12 +401,12 @@ class MessageDecoder:
     ) -> None:
         """Decode messages with protobuf, absent fields as 0."""
         self._single += len(messages)
-        if self._single > MAX_SINGLE_MESSAGES:
+        if self._single > limits.MAX_SINGLE_MESSAGES:
             raise SessionError(
-                f"{self._path}: more than {MAX_SINGLE_MESSAGES} messages of {self._layout.topic} "
-                "differ so much from one another that they would have to be decoded one by one, "
-                "which would take too long. The writing program must write all fields of every "
-                "message, in one order."
+                f"{self._path}: more than {limits.MAX_SINGLE_MESSAGES} messages of "
+                f"{self._layout.topic} differ so much from one another that they would have to be "
+                "decoded one by one, which would take too long. The writing program must write all "
+                "fields of every message, in one order."
             )
         decode = self._class(channel).FromString
         decoded = [decoded_message(self._path, self._layout.topic, decode, m) for m in messages]
@@ -455,10 +450,10 @@ class MessageDecoder:
         layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
         schema = contents.schemas.get(channel.schema_id)
-        if len(self._fixed) >= MAX_CHANNELS:
+        if len(self._fixed) >= limits.MAX_CHANNELS:
             raise SessionError(
-                f"{path} has more than {MAX_CHANNELS} channels {layout.topic}. The writing program "
-                "must put all such messages into one."
+                f"{path} has more than {limits.MAX_CHANNELS} channels {layout.topic}. The writing "
+                "program must put all such messages into one."
             )
         if (
             channel.message_encoding == "protobuf"

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session._format import SessionAccessError, SessionError, to_native
+from rigd.session import limits
+from rigd.session._errors import SessionAccessError, SessionError
 from rigd.session._mcap_limits import McapError, McapTooLargeError
 from rigd.session._mcap_reader import McapContents, Stretch, Taker, read_mcap
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
 from rigd.session._message_decoder import (
     CONTROLS,
-    MAX_CHANNELS,
     SAMPLES,
     TIMINGS,
     TOUCHES,
@@ -30,9 +30,9 @@ from rigd.session._message_decoder import (
     decoded_message,
     quoted,
 )
-from rigd.session._record_limits import MAX_SAMPLES
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
+from rigd.session.layout import to_native
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 
 SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
 """Fields that tell how many samples there are, whether they are in order, and their flags."""
-MAX_SURVEYED: Final = 7_200_000
-"""Most samples of which only that is read: two hours at 1 kHz, the longest that an earlier version
-recorded."""
 MAX_EVENTS: Final = 100_000
 """Most lines of a session's log that are read."""
 MAX_EVENT_BYTES: Final = 1 << 20
@@ -132,7 +129,7 @@ def read_session(
     path: str | PathLike[str],
     *,
     fields: Sequence[str] | None = None,
-    max_samples: int = MAX_SAMPLES,
+    max_samples: int = limits.MAX_SAMPLES,
     on_samples: Callable[[npt.NDArray[np.void]], None] | None = None,
 ) -> Session:
     """Read a whole session file.
@@ -237,7 +234,7 @@ def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
 
 
 def _read_topic(path: Path, layout: Layout) -> npt.NDArray[np.void]:
-    kept = Kept(path, layout, None, MAX_SAMPLES)
+    kept = Kept(path, layout, None, limits.MAX_SAMPLES)
     return kept.finish(_load(path, (layout.topic,), kept.decoder.take))
 
 
@@ -361,9 +358,9 @@ class _Log:
                 events.append(Event(t_ns, "unknown", "", f"(a message of {data} bytes, not read)"))
                 continue
             if channel not in decoders:
-                if len(decoders) == MAX_CHANNELS:
+                if len(decoders) == limits.MAX_CHANNELS:
                     raise SessionError(
-                        f"{path} has more than {MAX_CHANNELS} channels {EVENT_TOPIC}. The "
+                        f"{path} has more than {limits.MAX_CHANNELS} channels {EVENT_TOPIC}. The "
                         "writing program must put all such messages into one."
                     )
                 decoders[channel] = class_of_channel(path, contents, channel).FromString

@@ -23,19 +23,13 @@ import numpy.typing as npt
 from mcap.records import Channel
 
 import rigd
-from rigd.session._format import (
-    SAMPLE_DTYPE,
-    SAMPLE_FIELDS,
-    SessionError,
-    SessionExistsError,
-    Status,
-)
+from rigd.session import limits
+from rigd.session._errors import SessionError, SessionExistsError
 from rigd.session._mcap_limits import McapError
 from rigd.session._mcap_reader import McapContents, Stretch, message_starts, read_mcap
 from rigd.session._mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session._message_decoder import SAMPLES, MessageDecoder
 from rigd.session._reader import (
-    MAX_SURVEYED,
     SURVEY_FIELDS,
     Kept,
     load_contents,
@@ -50,6 +44,7 @@ from rigd.session._writer import (
     is_being_written,
     rename_new,
 )
+from rigd.session.layout import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
 
 RECOVERED_FROM: Final = "recovered_from"
 """Key of the record ``outcome`` that marks a recovered file: the name of the one it is from."""
@@ -60,7 +55,7 @@ _LEAST_CHUNK_BYTES: Final = 1 << 14
 _LONG_CHUNK: Final = 4 << 20
 _MOST_CHUNKS: Final = 10_000
 """About so many chunks are written before they are made longer."""
-MAX_CHANNELS: Final = 32
+_MOST_CHANNELS: Final = 32
 """Most channels that are taken over, of the session's own topics and of others each."""
 _READING_SHARE: Final = 0.3
 """Share of reading in the time that recovery takes."""
@@ -182,7 +177,10 @@ def recover(
         written = SampleDigest()
         try:
             read_session(
-                temporary, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED, on_samples=written.take
+                temporary,
+                fields=SURVEY_FIELDS,
+                max_samples=limits.MAX_SURVEYED,
+                on_samples=written.take,
             )
         except SessionError as error:
             named = str(error).replace(str(temporary), str(path))
@@ -221,7 +219,7 @@ class _Survey:
         """Whether each sample in the file is kept."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
         """Tick and status of those that are."""
-        self._samples = Kept(path, SAMPLES, SURVEY_FIELDS, MAX_SURVEYED)
+        self._samples = Kept(path, SAMPLES, SURVEY_FIELDS, limits.MAX_SURVEYED)
         self._units: dict[int, int] = {}
 
     def take(self, contents: McapContents, stretch: Stretch) -> None:
@@ -337,7 +335,7 @@ def _part(
 
 def _recover_sound(path: Path, target: Path) -> Recovery:
     """Give a file that is complete its name, if it has not got one."""
-    session = read_session(path, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED)
+    session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
         _refuse_taken(path, target)
@@ -642,5 +640,5 @@ def _channels(contents: McapContents, records: Mapping[str, Mapping[str, str]]) 
         replace(channel, metadata={**channel.metadata, **metadata})
         if channel.topic == SAMPLE_TOPIC
         else channel
-        for channel in (*ours[:MAX_CHANNELS], *others[:MAX_CHANNELS])
+        for channel in (*ours[:_MOST_CHANNELS], *others[:_MOST_CHANNELS])
     ]

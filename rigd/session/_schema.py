@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
-from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES, TOUCH_TYPES
+from rigd.session import limits
+from rigd.session.layout import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES, TOUCH_TYPES
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -30,8 +31,6 @@ TIMING_SCHEMA: Final = "rigd.Timing"
 TOUCH_SCHEMA: Final = "rigd.Touch"
 EVENT_SCHEMA: Final = "foxglove.Log"
 
-MAX_SCHEMA_BYTES: Final = 1 << 17
-"""Longest schema that is interpreted; those of this package take some hundred bytes."""
 
 EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
 """Names of the values 0…5 of ``foxglove.Log.Level``."""
@@ -130,9 +129,10 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     from google.protobuf.message import DecodeError
 
     shown = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
-    if len(data) > MAX_SCHEMA_BYTES:
+    if len(data) > limits.MAX_SCHEMA_BYTES:
         raise ValueError(
-            f"schema {shown} has {len(data)} bytes, more than the {MAX_SCHEMA_BYTES} that are read"
+            f"schema {shown} has {len(data)} bytes, more than the {limits.MAX_SCHEMA_BYTES} that "
+            "are read"
         )
     try:
         remaining = {file.name: file for file in FileDescriptorSet.FromString(data).file}

@@ -21,19 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 import rigd
-from rigd.session._format import (
-    CONTROL_SIZE,
-    CONTROL_WIRE_DTYPE,
-    SAMPLE_SIZE,
-    SAMPLE_WIRE_DTYPE,
-    TIMING_SIZE,
-    TIMING_WIRE_DTYPE,
-    TOUCH_SIZE,
-    TOUCH_WIRE_DTYPE,
-    Buffer,
-    SessionError,
-    SessionExistsError,
-)
+from rigd.session._errors import SessionError, SessionExistsError
 from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
 from rigd.session._schema import (
     CONTROL_SCHEMA,
@@ -51,6 +39,17 @@ from rigd.session._schema import (
     event_class,
     protected_metadata,
     schema_data,
+)
+from rigd.session.layout import (
+    CONTROL_SIZE,
+    CONTROL_WIRE_DTYPE,
+    SAMPLE_SIZE,
+    SAMPLE_WIRE_DTYPE,
+    TIMING_SIZE,
+    TIMING_WIRE_DTYPE,
+    TOUCH_SIZE,
+    TOUCH_WIRE_DTYPE,
+    Buffer,
 )
 
 try:

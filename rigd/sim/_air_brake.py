@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from rigd.beam import (
     AIR_DENSITY_KG_PER_M3,
     Beam,
-    CoupledModel,
     Damping,
     DragGrid,
-    Realisation,
     clamped_free_eigenvalues,
     mode_mean,
 )
+from rigd.beam.realisation import CoupledModel, Realisation
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

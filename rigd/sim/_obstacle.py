@@ -21,17 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Beam,
-    CoupledModel,
-    Damping,
-    PointForceGrid,
-    Realisation,
-    held_inputs,
-    propagator,
-    realise_force,
-    state_output,
-)
+from rigd.beam import Beam, Damping, PointForceGrid, realise_force
+from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
 from rigd.devices import Encounter, Knock, Obstacle
 
 Real = NDArray[np.float64]

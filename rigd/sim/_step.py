@@ -10,10 +10,9 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import (
-    Beam,
+from rigd.beam import Beam, LoadedBeam
+from rigd.beam.realisation import (
     CoupledModel,
-    LoadedBeam,
     Realisation,
     RealisationError,
     couple,

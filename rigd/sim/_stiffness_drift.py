@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import CoupledModel, Realisation
+from rigd.beam.realisation import CoupledModel, Realisation
 
 Real = NDArray[np.float64]
 

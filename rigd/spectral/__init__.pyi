@@ -1,8 +1,5 @@
-from ._frf import PAPER_NFFT as PAPER_NFFT
-from ._frf import PAPER_OVERLAP as PAPER_OVERLAP
 from ._frf import PAPER_OVERLAP_FRACTION as PAPER_OVERLAP_FRACTION
 from ._frf import PAPER_RATE_HZ as PAPER_RATE_HZ
-from ._frf import PAPER_SEGMENT_LENGTH as PAPER_SEGMENT_LENGTH
 from ._frf import PAPER_SEGMENTS as PAPER_SEGMENTS
 from ._frf import Estimator as Estimator
 from ._frf import FrequencyResponse as FrequencyResponse

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam import Beam, Damping, transfer
-from rigd.session import SessionWriter, encode_samples
+from rigd.session import SessionWriter
+from rigd.session.layout import encode_samples
 
 PAPER_BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 """The paper's antenna (Table 1)."""

@@ -2,7 +2,8 @@
 
 `read_table` finds separator, decimal sign, titles, row of units and first line of numbers, reads
 some columns, and refuses every line that is not of that table, with its number. `decode_text` reads
-a text that may begin with a byte order mark. The ground floor: it knows nothing of rigs.
+a text that may begin with a byte order mark. The public module `titles` has what titles of columns
+state of units and times. The ground floor: it knows nothing of rigs.
 """
 
 import lazy_loader as lazy

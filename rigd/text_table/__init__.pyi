@@ -1,10 +1,6 @@
-from ._cells import is_title_of_times as is_title_of_times
-from ._cells import stated_unit_of as stated_unit_of
-from ._cells import time_unit_s as time_unit_s
+from . import titles as titles
 from ._encoding import decode_text as decode_text
 from ._errors import MissingColumnError as MissingColumnError
 from ._errors import TableError as TableError
-from ._reader import TableColumn as TableColumn
-from ._reader import TableTimes as TableTimes
 from ._reader import TextTable as TextTable
 from ._reader import read_table as read_table

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from typing import Final
 
-from rigd.text_table._cells import time_unit_s
+from rigd.text_table.titles import time_unit_s
 
 _NUMBER: Final = r"(?P<number>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)"
 _RATE: Final = re.compile(

@@ -9,17 +9,16 @@ from typing import Final
 from rigd.text_table import _labview
 from rigd.text_table._cells import (
     are_split_decimals,
-    bare_unit,
     is_any_number,
     is_comment,
     is_date,
     is_row_of_units,
-    is_unit,
     without_comment_mark,
 )
 from rigd.text_table._errors import MissingColumnError, TableError
 from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
+from rigd.text_table.titles import bare_unit, is_unit
 
 HEAD_LINES: Final = 500
 """Lines in which the first line of numbers must come."""

@@ -19,11 +19,8 @@ from rigd.text_table._cells import (
     ThousandsWatch,
     is_any_number,
     is_number,
-    is_title_of_times,
     number_of,
     quick_reader,
-    stated_unit_of,
-    time_unit_s,
 )
 from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
@@ -39,6 +36,7 @@ from rigd.text_table._layout import (
     wrong_width,
 )
 from rigd.text_table._stamps import StampReader, is_stamp
+from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
 MAX_LINE: Final = 65_536
 """Longest line, characters: hundreds of columns. A longer one is not split into its cells."""

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.session import WRENCH_FIELDS
+from rigd.session.layout import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
@@ -54,7 +54,7 @@ def touch_record(
     Parameters
     ----------
     samples
-        Shape (n,) of `rigd.session.SAMPLE_DTYPE`, in the order of their ticks.
+        Shape (n,) of `rigd.session.layout.SAMPLE_DTYPE`, in the order of their ticks.
     tick
         Tick of the detection.
     rate_hz
@@ -85,7 +85,7 @@ def base_shear_n(
     Parameters
     ----------
     samples
-        Shape (n,) of `rigd.session.SAMPLE_DTYPE`.
+        Shape (n,) of `rigd.session.layout.SAMPLE_DTYPE`.
     shear_projection
         Six numbers: base shear = projection · wrench.
     """

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, transfer
-from rigd.session import Status
+from rigd.session.layout import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
 from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
 from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session import WRENCH_FIELDS, Status
+from rigd.session.layout import WRENCH_FIELDS, Status
 
 Records = npt.NDArray[Any]
 

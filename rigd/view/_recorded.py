@@ -10,7 +10,10 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.documents import DocumentError, parse_toml
-from rigd.session import Session, SessionError, Status, fit_of, touch_line, touches_of
+from rigd.session import Session, SessionError
+from rigd.session.layout import Status
+from rigd.session.quick_look import fit_of
+from rigd.session.touches import touch_line, touches_of
 from rigd.text_table import decode_text
 from rigd.units import unit_of
 from rigd.view._banner import ended

@@ -15,7 +15,7 @@ from typing import Any, Final
 from aiohttp import web
 
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
-from rigd.session import LOOK_SUFFIX, last_look, read_look
+from rigd.session.quick_look import LOOK_SUFFIX, last_look, read_look
 from rigd.web._access import REPORT_POLICY, Access, object_of, refused
 from rigd.web._jobs import JobError, Jobs
 

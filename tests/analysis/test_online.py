@@ -16,11 +16,11 @@ from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, modes
-from rigd.session import (
+from rigd.session import read_session
+from rigd.session.layout import encode_samples
+from rigd.session.online_fit import (
     EstimateRequest,
     StreamStart,
-    encode_samples,
-    read_session,
     write_request,
     write_samples,
     write_start,

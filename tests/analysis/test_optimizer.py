@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import scipy  # whose parts come on first use
 
-from analysis.identify._parametrization import Steps
 from analysis.optimizer import Box, NormalEquations, descend
 
 T = np.linspace(0.0, 4.0, 200)
@@ -159,7 +158,7 @@ def test_what_was_learnt_wrongly_does_no_harm():
 
 
 def free(k):
-    return Steps(np.full(k, -10.0), np.full(k, 10.0), ())
+    return Box(np.full(k, -10.0), np.full(k, 10.0))
 
 
 class Counted:
@@ -216,7 +215,7 @@ def test_on_a_bound_the_others_make_the_best_of_it():
     matrix = np.array([[2.0, 1.9], [1.9, 2.0], [0.3, 0.1]])
     target = np.array([1.0, -2.0, 0.5])
     problem = Counted(lambda x: matrix @ x - target, lambda x: matrix)
-    bounded = Steps(np.array([-10.0, -0.5]), np.array([1.2, 10.0]), ())
+    bounded = Box(np.array([-10.0, -0.5]), np.array([1.2, 10.0]))
     found = descend(problem, np.array([0.0, 0.0]), bounded, relative_tolerance=1e-13)
     other = scipy.optimize.least_squares(
         lambda x: matrix @ x - target, [0.0, 0.0], bounds=(bounded.lower, bounded.upper), xtol=1e-14

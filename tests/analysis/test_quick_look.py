@@ -17,7 +17,7 @@ from analysis.quick_look import LookError, look_at, write_look
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam import transfer
-from rigd.session import look_path
+from rigd.session.quick_look import look_path
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from analysis.identify import Measurement
 from analysis.record import MAX_UNKNOWN_SHARE, RecordError, load_record
 from rigd.session import SessionError
-from rigd.session._format import Status
+from rigd.session.layout import Status
 
 
 def test_arrays_units_and_segments_come_through(tmp_path, write_session, short_signals):

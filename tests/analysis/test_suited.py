@@ -12,7 +12,7 @@ import pytest
 from analysis.identify import Measurement
 from analysis.identify._comparison import Comparison
 from analysis.models import WelchSettings
-from analysis.paper._estimate import EstimateError, SettingsError
+from analysis.paper import EstimateError, SettingsError
 from analysis.record import load_record
 from analysis.suited import (
     against_welch,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.record import RecordError
-from analysis.touch import TouchAnalysis, _detections, _model
+from analysis.touch import TouchAnalysis
 from analysis.touch import _sensor_filter as sensor_filter_of
 from rigd.identified_beam import IdentifiedBeamError
 from rigd.profile import load_profile
@@ -37,13 +37,13 @@ def test_the_map_shows_it_where_the_obstacle_stands(touched, touch_file):
     assert touch.antenna_m[0] == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-def test_one_that_is_not_marked_is_found(touch_file, tmp_path):
-    path = touch_file.write(tmp_path / "a.mcap", marked=False)
-    session = read_session(path)
-    model = _model(session, 1000.0, None)
-    for shear in ((0.0, 1.0, 0.0, 0.0, 0.0, 0.0), None):
-        ((tick, _),) = _detections(session, model, 1000.0, shear)
-        assert 0 < tick - 1000 * touch_file.time_s < 40
+@pytest.mark.parametrize("metadata", [{}, {"shear_projection": "0,0,0,0,0,0"}])
+def test_one_that_is_not_marked_is_found(touch_file, touch_analysis, tmp_path, metadata):
+    path = touch_file.write(tmp_path / "a.mcap", marked=False, metadata=metadata)
+    session = touch_analysis.session(path)
+    (touch,) = session.touches
+    assert (session.found, session.has_shear) == ("record", not metadata)
+    assert 0 < touch.tick - 1000 * touch_file.time_s < 40
 
 
 def test_before_the_touch_nothing_is_found(touch_file, touch_analysis, tmp_path):

@@ -12,7 +12,7 @@ import analysis
 from analysis import api
 from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import RecordError, load_record
 from rigd.session import SessionError
 

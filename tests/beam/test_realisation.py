@@ -5,7 +5,8 @@ import pytest
 from cases import further
 from paper_table import table_3
 
-from rigd.beam import Beam, Damping, RealisationError, couple, modes, realise, transfer
+from rigd.beam import Beam, Damping, modes, transfer
+from rigd.beam.realisation import RealisationError, couple, realise
 
 PAPER_BEAM = Beam(0.98, 4.7e-3, 0.090275)
 
@@ -115,7 +116,7 @@ def test_refusal_names_the_error_achieved():
 
 def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
     """No damping is known that fails this check; the undamped beam does under a stricter limit."""
-    monkeypatch.setattr("rigd.beam._realisation.MAX_GROWTH_PER_S", 1e-6)
+    monkeypatch.setattr("rigd.beam.realisation.MAX_GROWTH_PER_S", 1e-6)
     with pytest.raises(RealisationError, match="without friction would be unstable"):
         realise(PAPER_BEAM, Damping())
 

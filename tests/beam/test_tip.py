@@ -3,15 +3,8 @@
 import numpy as np
 import pytest
 
-from rigd.beam import (
-    Beam,
-    Damping,
-    DeflectionFilter,
-    clamped_free_eigenvalues,
-    mode_shape,
-    tip_motion,
-    tip_response,
-)
+from rigd.beam import Beam, Damping, DeflectionFilter, clamped_free_eigenvalues, mode_shape
+from rigd.beam.tip import tip_motion, tip_response
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 VI = Damping(0.71e-4, 0.996, 0.055, 0.594)

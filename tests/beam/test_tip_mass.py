@@ -11,10 +11,10 @@ from rigd.beam import (
     LoadedBeam,
     clamped_free_eigenvalues,
     poles,
-    realise,
     root_shear_ratio,
     transfer,
 )
+from rigd.beam.realisation import realise
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 DAMPINGS = {

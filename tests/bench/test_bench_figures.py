@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rigd.bench._measure import UsageMeter, figures, measurement, pooled, usage_of, wake_ups_us
 from rigd.bench._report import counts_of, edges_us, histogram_lines
 from rigd.engine._shared_state import Phase
-from rigd.session._format import SAMPLE_DTYPE
+from rigd.session.layout import SAMPLE_DTYPE
 
 
 def samples(ticks, lateness_ns, work_ns=1000):

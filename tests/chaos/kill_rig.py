@@ -33,7 +33,8 @@ import numpy as np
 from rigd.devices import ask_simulator
 from rigd.devices._simulator import find_simulator
 from rigd.safety._limits import OVERLOADED
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 
 BIN = Path(sys.executable).parent
 PROFILES = Path(__file__).parents[2] / "hw_profiles"

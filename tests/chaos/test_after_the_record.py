@@ -17,7 +17,7 @@ from rigd.runner._request import Order
 from rigd.runner._rig import Rig
 from rigd.runtime._stop_signals import StopRequest
 from rigd.session import SessionWriter, read_session
-from rigd.session._format import pack_sample_into
+from rigd.session.layout import pack_sample_into
 
 
 @pytest.fixture

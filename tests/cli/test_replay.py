@@ -22,15 +22,10 @@ from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
 
 from analysis.models import WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
-from rigd.session import SessionError, SessionWriter, Status, read_session
-from rigd.session._format import (
-    SAMPLE_SIZE,
-    TIMING_SIZE,
-    pack_sample_into,
-    pack_timing_into,
-)
+from rigd.session import SessionError, SessionWriter, read_session
+from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
 from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
 from rigd.view._plots import AGES, GREEN, GREY, HEALTH, LOOP, ORANGE, SKY_BLUE
 from rigd.view._recorded import nominal_damping, subject_of_session

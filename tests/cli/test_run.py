@@ -25,7 +25,8 @@ from analysis.record import record_of
 from analysis.suited import against_welch, remarks, welch_settings
 from rigd.beam import modes
 from rigd.profile import load_profile
-from rigd.session import Status, read_controls, read_session
+from rigd.session import read_controls, read_session
+from rigd.session.layout import Status
 
 RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.session import TOUCH_KINDS, Status, read_session, read_touches
+from rigd.session import read_session, read_touches
+from rigd.session.layout import TOUCH_KINDS, Status
 
 OBSTACLE = "x=0.62,angle=0.4,stiffness=3000"
 RIGD = Path(sys.executable).parent / "rigd"

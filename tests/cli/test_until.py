@@ -15,7 +15,7 @@ from processes import child_running
 
 from analysis.record import load_record
 from analysis.results import whole_record
-from rigd.beam import SMALL_SLOPE_RAD, tip_motion
+from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
 from rigd.profile import load_profile
 from rigd.session import read_session
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.beam import Damping, couple, propagator, realise
+from rigd.beam import Damping
+from rigd.beam.realisation import couple, propagator, realise
 from rigd.control import (
     ControlDesignError,
     PidController,

@@ -15,13 +15,14 @@ import matplotlib.image
 import numpy as np
 import pytest
 from graphics import viewer_ended
+from session_schemas import message_class
 
-from rigd.session._schema import EVENT_TOPIC, SAMPLE_TOPIC, message_class
-from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
+from rigd.view import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAYOUTS = DOCS / "layouts"
 PAGE = (DOCS / "opening_sessions.md").read_text("utf-8")
+SAMPLE_TOPIC, EVENT_TOPIC = "/rig/sample", "/rig/event"
 EXAMPLE = "sessions/20261120-101500-chirp.mcap"
 BIN = Path(sys.executable).parent
 

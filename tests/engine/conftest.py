@@ -17,7 +17,7 @@ from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.engine.control_process import attend
 from rigd.excitation import chirp
 from rigd.runtime._stop_signals import StopRequest
-from rigd.session._format import decode_controls, decode_samples
+from rigd.session.layout import decode_controls, decode_samples
 
 
 @dataclass

@@ -10,7 +10,7 @@ from rigd.engine._messages import Ended, Finished, Measured, Ready, Refused, Tar
 from rigd.engine._shared_state import Phase, Word
 from rigd.engine._timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
-from rigd.session._format import Status
+from rigd.session.layout import Status
 
 
 class FakeRealClock(VirtualClock):

@@ -16,7 +16,7 @@ from rigd.engine._timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety import INTERLOCKS, Action
-from rigd.session._format import Status
+from rigd.session.layout import Status
 from rigd.sim import Stuck
 
 MIDDLE_NS = 3_000_000_000

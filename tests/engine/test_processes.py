@@ -14,7 +14,7 @@ from rigd.engine._messages import Ended, MessageReader, Ready, SessionJob, encod
 from rigd.engine._reference import map_reference, put_reference
 from rigd.engine._ring import shared_memory_fd
 from rigd.profile import load_profile
-from rigd.session import MAX_SAMPLES
+from rigd.session.limits import MAX_SAMPLES
 
 PIPE_BYTES = 65_536
 

@@ -14,8 +14,8 @@ from rigd.engine._messages import Connected, Finished, Ready
 from rigd.engine._shared_state import Phase, Stop, Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import hold
-from rigd.session import MAX_SAMPLES
-from rigd.session._format import Status, decode_samples
+from rigd.session.layout import Status, decode_samples
+from rigd.session.limits import MAX_SAMPLES
 
 
 def books(**counts):

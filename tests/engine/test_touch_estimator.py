@@ -7,7 +7,7 @@ import pytest
 
 from rigd.engine._messages import TouchJob
 from rigd.engine.touch_estimator import TouchFollower
-from rigd.session import SAMPLE_DTYPE, Status
+from rigd.session.layout import SAMPLE_DTYPE, Status
 
 TOUCH = 2000
 RATE_HZ = 1000.0

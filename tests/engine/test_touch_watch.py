@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rigd.engine._messages import TouchOrder
 from rigd.engine._touch_watch import TouchWatch
 from rigd.excitation import Approach, Pass, after_touch, braking_path, quintic
-from rigd.session import Status
+from rigd.session.layout import Status
 
 RATE_HZ = 1000.0
 BRAKING = braking_path(0.05, RATE_HZ)

@@ -7,9 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
-from analysis.exchange._channels import parse_choice
-from analysis.exchange._import_record import ImportPlan, write_session
-from analysis.exchange._specimen import Specimen
+from analysis.exchange import ImportPlan, parse_choice, read_specimen, write_session
 from rigd.beam import Beam
 
 PROJECT = Path(__file__).parents[2]
@@ -59,7 +57,7 @@ def make_plan():
             options["time"] = parse_choice(time, "time")
         elif "rate_hz" not in options:
             options["rate_hz"] = 1000.0
-        return ImportPlan(channels, Specimen(BEAM), **options)
+        return ImportPlan(channels, read_specimen(PROFILE), **options)
 
     return make
 

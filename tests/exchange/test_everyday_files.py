@@ -5,7 +5,8 @@ import pytest
 from everyday_files import everyday_file
 
 from analysis.exchange import ExchangeError, import_record
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 
 pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
 pytest.importorskip("pyuff", reason="UFF58 needs pyuff")

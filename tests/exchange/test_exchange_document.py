@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import scipy  # whose parts come on first use
 
-from analysis.exchange._channels import UNITS
-from analysis.exchange._source import MAX_MEMORY
-from analysis.exchange._specimen import read_specimen
-from rigd.session import MAX_SAMPLES, read_session
+from analysis.exchange import ExchangeError, parse_choice, read_specimen
+from rigd.session import read_session
+from rigd.session.limits import MAX_SAMPLES
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "exchange.md").read_text(encoding="utf-8")
 
@@ -112,11 +111,14 @@ def test_the_example_for_octave_reads_a_model(exported_models):
 
 
 def test_the_document_has_every_unit_and_the_limits(tmp_path):
-    for quantity, units in UNITS.items():
+    for quantity in ("angle", "torque", "force", "time"):
         (row,) = re.findall(rf"^\| {quantity} \| (.*) \|$", DOCUMENT, re.MULTILINE)
-        assert re.findall(r"`([^`]+)`", row) == list(units)
+        with pytest.raises(ExchangeError) as refusal:
+            parse_choice("channel:furlong", quantity)
+        units = ", ".join(re.findall(r"`([^`]+)`", row))
+        assert f"choose from {units}. " in str(refusal.value)
     assert f"more than {MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
-    assert f"no more than {MAX_MEMORY / 1e6:.0f} MB" in DOCUMENT
+    assert "no more than 800 MB" in DOCUMENT  # as test_hostile_files.py has it
     (profile,) = blocks("toml")
     (tmp_path / "beam.toml").write_text(profile)
     assert read_specimen(tmp_path / "beam.toml").beam.length_m == 0.98

@@ -1,7 +1,6 @@
 """Files that claim what they do not hold, or hold what nobody can: refused, in bounded memory."""
 
 import os
-import resource
 import struct
 import subprocess
 import sys
@@ -11,18 +10,19 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.exchange._source import ExchangeError, bounded_memory, read_source
+from analysis.exchange import ExchangeError, read_source
 
 READ = """
-import sys
+import resource, sys
 from pathlib import Path
-from analysis.exchange._source import ExchangeError
-from analysis.exchange._source import read_source
+from analysis.exchange import ExchangeError, read_source
+bound = resource.getrlimit(resource.RLIMIT_AS)
 try:
     read_source(Path(sys.argv[1]), [sys.argv[2]])
     print("read")
 except ExchangeError as error:
     print(error)
+assert resource.getrlimit(resource.RLIMIT_AS) == bound
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 print(int(status["VmHWM"].split()[0]) // 1024)
 """
@@ -66,7 +66,7 @@ def mat_element(dims, claimed, payload):
 MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49)
 
 
-@pytest.mark.parametrize("dims", [(1, 2**28), further((1, 1000))])
+@pytest.mark.parametrize("dims", [(1, 2**28), (1, 1000)])
 def test_two_gigabytes_in_two_megabytes(tmp_path, dims):
     """Zeros, compressed; the dimensions say so, or do not."""
     size = 2**31
@@ -169,11 +169,3 @@ def test_a_tdms_file_that_claims_a_text_of_four_gigabytes(tmp_path):
     path.write_bytes(lead_in(6, 100) + struct.pack("<II", 1, 0xFFFFFFF0) + b"abc")
     _, megabytes = refused(path, "g/c1")
     assert megabytes < 200
-
-
-def test_the_bound_on_memory_holds_and_goes():
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    with pytest.raises(MemoryError), bounded_memory(200_000_000):
-        bytearray(400_000_000)
-    assert resource.getrlimit(resource.RLIMIT_AS) == before
-    bytearray(400_000_000)

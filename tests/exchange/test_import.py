@@ -8,13 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.exchange._channels import parse_choice
-from analysis.exchange._import_record import ImportPlan, import_record, write_session
-from analysis.exchange._source import ExchangeError
-from analysis.exchange._specimen import Specimen, read_specimen
+from analysis.exchange import (
+    ExchangeError,
+    ImportPlan,
+    import_record,
+    parse_choice,
+    read_specimen,
+    write_session,
+)
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, transfer
-from rigd.session import SessionError, SessionExistsError, Status, read_session
+from rigd.session import SessionError, SessionExistsError, read_session
+from rigd.session.layout import Status
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 N = 4000
@@ -177,10 +182,36 @@ def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path
     np.testing.assert_array_equal(session.samples["angle_rad"], ANGLE)
 
 
-def test_a_name_that_sounds_like_another_unit_is_told(csv_of, make_plan, tmp_path):
-    source = csv_of(angle_deg=ANGLE, torque=TORQUE)
-    done = import_record(source, tmp_path / "a.mcap", make_plan(angle="angle_deg:rad"))
-    assert "suggests deg" in done.warnings[0]
+@pytest.mark.parametrize(
+    ("title", "unit"), [("Tz (N·mm) ", "N.mm"), ("Tz [mNm]", "mN.m"), ("Tz (raw)", None)]
+)
+def test_a_unit_in_brackets_is_the_file_s_word(csv_of, make_plan, tmp_path, title, unit):
+    source = csv_of(**{"angle": ANGLE, title: TORQUE})
+    plan = make_plan(torque=f"{title}:N.m")
+    if unit is None:
+        assert import_record(source, tmp_path / "a.mcap", plan).warnings == ()
+    else:
+        with pytest.raises(ExchangeError, match=f"is in {unit}, and N.m was stated"):
+            import_record(source, tmp_path / "a.mcap", plan)
+
+
+@pytest.mark.parametrize(
+    ("angle", "torque", "suggestions"),
+    [
+        ("angle_deg:rad", "torque:N.m", ["suggests deg"]),
+        ("angle_rad:rad", "coupling_torque_nm:mN.m", ["suggests N.m"]),
+        ("motor_angle:rad", "coupling_torque_nm:N.m", []),
+    ],
+)
+def test_a_name_that_sounds_like_another_unit_is_told(
+    csv_of, make_plan, tmp_path, angle, torque, suggestions
+):
+    names = (choice.rpartition(":")[0] for choice in (angle, torque))
+    source = csv_of(**dict(zip(names, (ANGLE, TORQUE), strict=True)))
+    done = import_record(source, tmp_path / "a.mcap", make_plan(angle=angle, torque=torque))
+    assert len(done.warnings) == len(suggestions)
+    for suggestion, warning in zip(suggestions, done.warnings, strict=True):
+        assert suggestion in warning
 
 
 def test_what_a_file_says_of_rate_and_unit_is_compared(make_plan, tmp_path):
@@ -265,18 +296,20 @@ def test_nothing_is_overwritten_and_nothing_left_behind(csv_of, make_plan, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "record.csv"]
 
 
-def test_a_plan_is_complete():
+def test_a_plan_is_complete(profile):
+    specimen = read_specimen(profile)
     choice = parse_choice("a:rad", "angle")
     both = {"angle_rad": choice, "coupling_torque_nm": choice}
     with pytest.raises(ValueError, match="coupling_torque_nm"):
-        ImportPlan({"angle_rad": choice}, Specimen(BEAM), rate_hz=1.0)
+        ImportPlan({"angle_rad": choice}, specimen, rate_hz=1.0)
     for times in ({}, {"rate_hz": 1.0, "time": choice}):
         with pytest.raises(ValueError, match="either"):
-            ImportPlan(both, Specimen(BEAM), **times)
+            ImportPlan(both, specimen, **times)
 
 
 def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
-    assert read_specimen(profile) == Specimen(BEAM, 0.0)
+    specimen = read_specimen(profile)
+    assert (specimen.beam, specimen.tool_inertia_kg_m2) == (BEAM, 0.0)
     path = tmp_path / "beam.toml"
     path.write_text(
         "[beam]\nlength_m = 1\ndensity_kg_per_m = 5e-3\nbending_stiffness_n_m2 = 0.1\n"
@@ -305,7 +338,8 @@ def test_tip_mass_and_tilt_of_a_profile_go_into_the_session(csv_of, make_plan, t
 def test_the_uniformity_of_the_specimen_goes_into_the_session(
     csv_of, make_plan, tmp_path, percent, uniformity
 ):
-    plan = replace(make_plan(rate_hz=1e3), specimen=Specimen(BEAM, uniformity_percent=percent))
+    plan = make_plan(rate_hz=1e3)
+    plan = replace(plan, specimen=replace(plan.specimen, uniformity_percent=percent))
     done = import_record(csv_of(angle=ANGLE, torque=TORQUE), tmp_path / "a.mcap", plan)
     assert load_record(done.path).uniformity == uniformity
 
@@ -359,7 +393,7 @@ def test_a_specimen_that_cannot_be_read_is_refused(tmp_path):
 def test_a_specimen_may_begin_with_a_byte_order_mark(profile, tmp_path, encoding):
     path = tmp_path / "beam.toml"
     path.write_text(profile.read_text("utf-8"), encoding)
-    assert read_specimen(path) == Specimen(BEAM, 0.0)
+    assert read_specimen(path) == read_specimen(profile)
 
 
 @pytest.mark.parametrize("year", [2300, 1960])

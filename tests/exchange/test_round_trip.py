@@ -8,29 +8,34 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange._channels import QUANTITIES, parse_choice
-from analysis.exchange._export import export_frf, export_record
-from analysis.exchange._import_record import ImportPlan, import_record
-from analysis.exchange._source import read_source
-from analysis.exchange._specimen import Specimen
+from analysis.exchange import (
+    QUANTITIES,
+    ImportPlan,
+    export_frf,
+    export_record,
+    import_record,
+    parse_choice,
+    read_source,
+    read_specimen,
+)
 from analysis.models import WelchSettings
-from analysis.paper._estimate import estimate
-from analysis.paper._route import analyse
+from analysis.paper import analyse, estimate
 from analysis.record import load_record
-from rigd.beam import Beam
 from rigd.session import read_session
 
-BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 FIELDS = tuple(QUANTITIES)
 SI = {"angle": "rad", "torque": "N.m", "force": "N"}
 SETTINGS = WelchSettings(types=("I",), weightings=("const",), segment_length=6000, nfft=20_000)
 
 
-def plan_for(beam, time="time_s:s", segments_s=()):
+@pytest.fixture(scope="module")
+def specimen(profile):
+    return read_specimen(profile)
+
+
+def plan_for(specimen, time="time_s:s", segments_s=()):
     channels = {field: parse_choice(f"{field}:{SI[q]}", q) for field, q in QUANTITIES.items()}
-    return ImportPlan(
-        channels, Specimen(beam), parse_choice(time, "time"), segments_s=dict(segments_s)
-    )
+    return ImportPlan(channels, specimen, parse_choice(time, "time"), segments_s=dict(segments_s))
 
 
 @st.composite
@@ -58,7 +63,9 @@ def regular(length):
 @example(samples=regular(40), rate_hz=333.3)  # of which six digits of the period tell too little
 @given(samples=sessions(), rate_hz=st.sampled_from([1000.0, 1024.0, 333.3, 5e4]))
 @pytest.mark.parametrize("suffix", [".csv", further(".mat"), further(".uff")])
-def test_what_was_exported_is_imported_as_it_was(make_session, tmp_path, suffix, samples, rate_hz):
+def test_what_was_exported_is_imported_as_it_was(
+    make_session, specimen, tmp_path, suffix, samples, rate_hz
+):
     if suffix == ".uff":
         pytest.importorskip("pyuff", reason="UFF58 needs pyuff")
     for path in tmp_path.iterdir():
@@ -67,7 +74,7 @@ def test_what_was_exported_is_imported_as_it_was(make_session, tmp_path, suffix,
     exported = tmp_path / f"a{suffix}"
     export_record(session, exported, binary=suffix == ".uff")
     time = "abscissa:s" if suffix == ".uff" else "time_s:s"
-    import_record(exported, tmp_path / "again.mcap", plan_for(BEAM, time))
+    import_record(exported, tmp_path / "again.mcap", plan_for(specimen, time))
     before, after = read_session(session), read_session(tmp_path / "again.mcap")
     for field in ("t_ns", "tick", *FIELDS):
         np.testing.assert_array_equal(after.samples[field], before.samples[field], err_msg=field)
@@ -76,12 +83,12 @@ def test_what_was_exported_is_imported_as_it_was(make_session, tmp_path, suffix,
         assert after.metadata[key] == before.metadata[key]
 
 
-def test_an_imported_record_is_analysed_as_the_session_itself(simulated, tmp_path):
+def test_an_imported_record_is_analysed_as_the_session_itself(simulated, specimen, tmp_path):
     record = load_record(simulated)
     export_record(simulated, tmp_path / "a.csv")
     segments_s = {"rest": (0, 0.5), "sweep": (0.5, 20.5), "ring_down": (20.5, 21.5)}
     import_record(
-        tmp_path / "a.csv", tmp_path / "a.mcap", plan_for(record.beam, segments_s=segments_s)
+        tmp_path / "a.csv", tmp_path / "a.mcap", plan_for(specimen, segments_s=segments_s)
     )
     again = load_record(tmp_path / "a.mcap")
     for one, other in zip(estimate(record, SETTINGS), estimate(again, SETTINGS), strict=True):
@@ -91,7 +98,7 @@ def test_an_imported_record_is_analysed_as_the_session_itself(simulated, tmp_pat
     assert one.models[0].fit.parameters == other.models[0].fit.parameters
 
 
-def test_in_other_units_it_is_the_same_to_rounding(simulated, tmp_path):
+def test_in_other_units_it_is_the_same_to_rounding(simulated, specimen, tmp_path):
     record = load_record(simulated)
     samples = read_session(simulated).samples
     source = tmp_path / "a.csv"
@@ -106,7 +113,7 @@ def test_in_other_units_it_is_the_same_to_rounding(simulated, tmp_path):
             "angle_rad": parse_choice("q:deg", "angle"),
             "coupling_torque_nm": parse_choice("T:N.mm", "torque"),
         },
-        Specimen(record.beam),
+        specimen,
         parse_choice("t:ms", "time"),
         segments_s={"rest": (0, 0.5), "sweep": (0.5, 20.5)},
         reverse_torque=True,

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange._source import ExchangeError, read_source
-from rigd.session import MAX_SAMPLES
+from analysis.exchange import ExchangeError, read_source
+from rigd.session.limits import MAX_SAMPLES
 
 NUMBERS = arrays(np.float64, st.integers(2, 40), elements=st.floats(width=64))
 

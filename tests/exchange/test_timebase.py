@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analysis.exchange import ExchangeError
 from analysis.exchange._channels import from_time_stamps, uniform
-from analysis.exchange._source import ExchangeError
 
 PATH = Path("record.csv")
 

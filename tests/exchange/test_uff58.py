@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange._source import ExchangeError
+from analysis.exchange import ExchangeError
 from analysis.exchange._table import Column, Table
 from analysis.exchange._uff_format import write_uff58
 

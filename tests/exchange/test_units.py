@@ -4,15 +4,14 @@ import math
 
 import pytest
 
-from analysis.exchange._channels import (
-    UNITS,
-    canonical_unit,
-    factor,
-    parse_choice,
-    unit_in_brackets,
-    unit_in_suffix,
-)
-from analysis.exchange._source import ExchangeError
+from analysis.exchange import ExchangeError, parse_choice
+
+UNITS = {
+    "angle": ("rad", "mrad", "urad", "deg", "arcmin", "arcsec", "rev"),
+    "torque": ("N.m", "mN.m", "uN.m", "N.cm", "N.mm", "kN.m", "lbf.in", "ozf.in"),
+    "force": ("N", "mN", "kN", "lbf"),
+    "time": ("s", "ms", "us", "ns"),
+}
 
 
 @pytest.mark.parametrize(
@@ -41,7 +40,7 @@ from analysis.exchange._source import ExchangeError
     ],
 )
 def test_a_unit_has_its_size(quantity, unit, size):
-    assert factor(quantity, unit) == pytest.approx(size, rel=1e-14)
+    assert parse_choice(f"x:{unit}", quantity).factor == pytest.approx(size, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -60,21 +59,21 @@ def test_a_unit_has_its_size(quantity, unit, size):
 )
 def test_what_is_no_unit_of_the_quantity_is_refused_with_those_that_are(quantity, unit):
     with pytest.raises(ExchangeError, match="choose from") as refusal:
-        factor(quantity, unit)
-    for name in UNITS[quantity]:
-        assert name in str(refusal.value)
+        parse_choice(f"x:{unit}", quantity)
+    assert f"choose from {', '.join(UNITS[quantity])}. " in str(refusal.value)
     # The way on for a signal in volts.
     assert "CHANNEL:0.02" in str(refusal.value)
 
 
 def test_capitals_tell_milli_from_mega():
-    assert canonical_unit("mNm") == "mN.m"
-    assert canonical_unit("MNm") is None
+    assert parse_choice("x:mNm", "torque").unit == "mN.m"
+    with pytest.raises(ExchangeError, match="'MNm' is not a unit of torque"):
+        parse_choice("x:MNm", "torque")
 
 
 def test_no_two_units_share_a_spelling():
-    names = [name for units in UNITS.values() for name in units]
-    assert [canonical_unit(name) for name in names] == names
+    for quantity, names in UNITS.items():
+        assert [parse_choice(f"x:{name}", quantity).unit for name in names] == list(names)
 
 
 def test_a_signal_s_unit_is_told_as_it_was_stated():
@@ -92,14 +91,3 @@ def test_a_choice_is_taken_apart_at_its_last_colon():
 def test_a_choice_without_channel_or_unit_is_refused(text):
     with pytest.raises(ExchangeError, match="deg"):
         parse_choice(text, "angle")
-
-
-def test_units_are_found_in_names():
-    assert unit_in_brackets("Angle [deg]") == "deg"
-    assert unit_in_brackets("Tz (N·mm) ") == "N.mm"
-    assert unit_in_brackets("Tz (raw)") is None
-    assert unit_in_brackets("Tz") is None
-    assert unit_in_suffix("coupling_torque_nm") == "N.m"
-    assert unit_in_suffix("angle_deg") == "deg"
-    assert unit_in_suffix("angle") is None
-    assert unit_in_suffix("motor_angle") is None

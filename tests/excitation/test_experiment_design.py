@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.beam import Beam, Damping, tip_motion
+from rigd.beam import Beam, Damping
+from rigd.beam.tip import tip_motion
 from rigd.excitation import (
     BeamEstimate,
     ExcitationError,

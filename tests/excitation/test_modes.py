@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rigd import excitation
-from rigd.beam import PARAMETERS, SMALL_SLOPE_RAD, Beam, transfer_and_gradient
+from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
+from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import ExcitationError
 from rigd.excitation._named import KINDS, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time

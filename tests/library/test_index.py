@@ -11,21 +11,23 @@ from pathlib import Path
 import pytest
 from library_folders import mode
 
-from rigd.library import INDEX_NAME, list_sessions
-from rigd.library import _sessions as sessions
+from rigd.library import list_sessions
+
+INDEX_NAME = "library.sqlite"
 
 
 @pytest.fixture
 def read_files(monkeypatch):
-    """Names of the files that were read, not taken from the index."""
+    """Names of the session files that were opened, not taken from the index."""
     read = []
+    open_path = Path.open
 
-    def reading(path, *others):
-        read.append(path.name)
-        return read_row(path, *others)
+    def opening(path, *arguments, **options):
+        if path.suffix == ".mcap" and path.name not in read:
+            read.append(path.name)
+        return open_path(path, *arguments, **options)
 
-    read_row = sessions.read_row
-    monkeypatch.setattr(sessions, "read_row", reading)
+    monkeypatch.setattr(Path, "open", opening)
     return read
 
 

@@ -7,7 +7,8 @@ from datetime import datetime
 import pytest
 from library_folders import START_UTC_NS, mode
 
-from rigd.library import LibraryError, list_sessions
+from rigd.errors import UserError
+from rigd.library import list_sessions
 from rigd.session import SessionWriter, Validity
 
 
@@ -179,12 +180,12 @@ def test_dates_are_local_and_the_last_day_is_included(record_briefly, tmp_path, 
 
 @pytest.mark.parametrize("given", ["yesterday", "2026-13-01", "9" * 400])
 def test_what_is_no_date_is_refused(tmp_path, given):
-    with pytest.raises(LibraryError, match=r"since = .* 2026-11-20"):
+    with pytest.raises(UserError, match=r"since = .* 2026-11-20"):
         list_sessions(tmp_path, since=given)
 
 
 @pytest.mark.parametrize("name", ["nowhere", "file"])
 def test_what_is_no_folder_is_refused(tmp_path, name):
     (tmp_path / "file").touch()
-    with pytest.raises(LibraryError, match=f"{name}: the folder cannot be listed"):
+    with pytest.raises(UserError, match=f"{name}: the folder cannot be listed"):
         list_sessions(tmp_path / name)

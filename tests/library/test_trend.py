@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from library_folders import DAY_NS, mode, quantity
 
-from rigd.library import SessionRow, change_between, mode_trends
+from rigd.library import SessionRow
+from rigd.library.trend import change_between, mode_trends
 
 
 def row(day, *modes):

@@ -20,7 +20,7 @@ from rigd.engine._shared_state import Event, SharedState, Word, write_event
 from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
 from rigd.live._address import LiveAddress
 from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
-from rigd.session._format import pack_sample_into, pack_timing_into
+from rigd.session.layout import pack_sample_into, pack_timing_into
 from rigd.view._session_info import Subject
 
 RATE_HZ = 1000.0

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper._estimate import EstimateError, SettingsError
-from analysis.paper._route import analyse
+from analysis.paper import EstimateError, SettingsError, analyse
 from analysis.record import load_record
 from rigd.beam import transfer
 from rigd.spectral import Segmentation

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.models import FrequencyResponseModel, weights
-from analysis.paper._fit import thinned
+from analysis.paper import thinned
 
 
 @given(n=st.integers(3, 900), count=st.integers(2, 900), seed=st.integers(0, 2**32 - 1))

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from rigd.session import SessionWriter, encode_samples
+from rigd.session import SessionWriter
+from rigd.session.layout import encode_samples
 
 DAY_NS = 86_400 * 10**9
 START_UTC_NS = 1_700_000_000_000_000_000

@@ -19,7 +19,8 @@ from touch_records import (
     simulate,
 )
 
-from rigd.session import SAMPLE_SIZE, SessionWriter, Status, pack_sample_into
+from rigd.session import SessionWriter
+from rigd.session.layout import SAMPLE_SIZE, Status, pack_sample_into
 
 REST = 600
 OBSTACLE = Obstacle(x_m=0.62, angle_rad=0.6, stiffness_n_per_m=3000)

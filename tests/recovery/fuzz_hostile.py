@@ -27,6 +27,8 @@ import zstandard
 
 from rigd.runtime import use_one_thread
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))  # as pytest has it
+
 MAGIC = b"\x89MCAP0\r\n"
 MOST_MEGABYTES = 500
 MOST_SECONDS = 30
@@ -94,11 +96,11 @@ SESSION = {
 
 def session_file(*parts, session=SESSION, end=True):
     """Make a file of parts, with the schemas and channels of a session in front (1 and 2)."""
-    from rigd.session._schema import EVENT_SCHEMA, SAMPLE_SCHEMA, schema_data
+    from session_schemas import schemas
 
     declared = (
-        schema(1, SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA))
-        + schema(2, EVENT_SCHEMA, schema_data(EVENT_SCHEMA))
+        schema(1, "rigd.Sample", schemas()["rigd.Sample"])
+        + schema(2, "foxglove.Log", schemas()["foxglove.Log"])
         + channel(1, "/rig/sample", 1)
         + channel(2, "/rig/event", 2)
     )
@@ -109,7 +111,7 @@ def session_file(*parts, session=SESSION, end=True):
 
 def sample_records(first, count, *, permuted=False):
     """Make message records of samples, as bytes; `permuted` puts the tick before the time."""
-    from rigd.session import SAMPLE_WIRE_DTYPE, encode_samples
+    from rigd.session.layout import SAMPLE_WIRE_DTYPE, encode_samples
 
     tick = first + np.arange(count)
     angle_rad = 0.02 * np.sin(0.05 * tick)
@@ -142,9 +144,10 @@ def samples(count, *, permuted=False, piece=20_000):
 
 def event(message_text):
     """Make a message of the log."""
-    from rigd.session._schema import event_class
+    from session_schemas import message_class
 
-    return message(2, event_class()(level=2, message=message_text, name="x").SerializeToString())
+    log = message_class("foxglove.Log")
+    return message(2, log(level=2, message=message_text, name="x").SerializeToString())
 
 
 # The files that were lost once, each by what it is made of. `scale` 1 is what they were.

@@ -29,7 +29,7 @@ from rigd.session import (
     read_timings,
     recover,
 )
-from rigd.session._format import (
+from rigd.session.layout import (
     SAMPLE_DTYPE,
     SAMPLE_SIZE,
     pack_control_into,

@@ -10,7 +10,6 @@ import pytest
 from cases import further
 
 from rigd.session import describe, read_session, read_timings, recover
-from rigd.session._recovery import _increasing
 
 
 @pytest.fixture(scope="session")
@@ -140,10 +139,18 @@ def test_a_doubled_chunk_of_a_whole_session_is_left_out_of_every_channel(origina
     assert len(read_timings(recovery.path)) == len(original.timings)
 
 
-def test_one_tick_far_too_high_takes_nothing_with_it():
-    ticks = np.arange(100, dtype=np.uint32)
-    ticks[40] = 4_000_000_000
-    assert _increasing(ticks).sum() == 99
-    assert not _increasing(ticks)[40]
-    assert _increasing(np.array([], np.uint32)).tolist() == []
-    assert _increasing(np.array([7, 7, 3], np.uint32)).tolist() == [True, False, False]
+@pytest.mark.parametrize(
+    ("ticks", "kept"),
+    [
+        ([*range(40), 4_000_000_000, *range(41, 100)], [*range(40), *range(41, 100)]),
+        ([7, 7, 3], [7]),
+    ],
+    ids=["one far too high", "one twice"],
+)
+def test_a_tick_that_is_wrong_takes_nothing_with_it(hostile, tmp_path, ticks, kept):
+    path = tmp_path / "a.mcap"
+    rows = b"".join(hostile.sample_records(tick, 1) for tick in ticks)
+    path.write_bytes(hostile.session_file(hostile.chunk(rows)))
+    recovery = recover(path)
+    assert f"has {len(ticks) - len(kept)} samples that repeat or precede" in recovery.damage
+    assert read_session(recovery.path).samples["tick"].tolist() == kept

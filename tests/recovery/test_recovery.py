@@ -1,5 +1,6 @@
 """Torn and damaged files: all that is intact, marked, and nothing that is not proven."""
 
+import fcntl
 import random
 import struct
 
@@ -7,12 +8,11 @@ import numpy as np
 import pytest
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
+from session_schemas import schemas
 
 from analysis.record import load_record
 from rigd.session import SessionError, SessionExistsError, describe, read_session, recover
-from rigd.session._format import decode_samples
-from rigd.session._schema import SAMPLE_SCHEMA, schema_data
-from rigd.session._writer import mark_as_written
+from rigd.session.layout import encode_samples
 
 
 def test_damage_of_every_kind_gives_what_was_before_it_or_a_refusal(fuzz_recovery, original):
@@ -137,7 +137,7 @@ def test_a_name_that_is_taken_meanwhile_is_refused(torn, monkeypatch):
 
 def test_a_file_that_is_being_recorded_is_left_alone(torn):
     with torn.open("r+b") as stream:
-        mark_as_written(stream.fileno())
+        fcntl.flock(stream, fcntl.LOCK_EX)  # as a process has that records
         with pytest.raises(SessionError, match="is still being recorded"):
             recover(torn)
         with pytest.raises(SessionError, match=r"is still being recorded\. Wait for the end"):
@@ -207,7 +207,7 @@ def write_plainly(path, samples, *, use_chunking):
     writer.start()
     keys = ("beam_length_m", "beam_density_kg_per_m", "beam_bending_stiffness_n_m2")
     writer.add_metadata("session", {"rate_hz": "1000"} | dict.fromkeys(keys, "0.5"))
-    schema = writer.register_schema(SAMPLE_SCHEMA, "protobuf", schema_data(SAMPLE_SCHEMA))
+    schema = writer.register_schema("rigd.Sample", "protobuf", schemas()["rigd.Sample"])
     channel = writer.register_channel("/rig/sample", "protobuf", schema)
     other = writer.register_channel("/lab/temperature", "json", 0)
     for tick, message in enumerate(samples):
@@ -249,12 +249,7 @@ def test_a_torn_file_of_another_writer_is_recovered_with_a_warning(
 
 
 def packed(row):
-    from rigd.session._format import SAMPLE_SIZE, pack_sample_into
-
-    block = bytearray(SAMPLE_SIZE)
-    pack_sample_into(block, 0, *row.item())
-    assert decode_samples(block)["tick"][0] == row["tick"]
-    return bytes(block)
+    return encode_samples({name: row[name] for name in row.dtype.names})
 
 
 def test_the_progress_runs_from_start_to_end(torn):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rigd.session import SessionError, SessionWriter, read_session, recover
-from rigd.session._format import SAMPLE_SIZE, decode_samples, pack_sample_into
+from rigd.session.layout import SAMPLE_SIZE, decode_samples, pack_sample_into
 
 METADATA = {"rate_hz": "1000.0", "beam_length_m": "1"}
 
@@ -174,7 +174,7 @@ CHILD = """
     from pathlib import Path
     sys.path.insert(0, sys.argv[2])
     from test_recovery_disk import begun, packed
-    from rigd.session._format import SAMPLE_SIZE
+    from rigd.session.layout import SAMPLE_SIZE
 
     rate_hz = float(sys.argv[3])
     block = packed(0, 3000, rate_hz)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import zstandard
 from cases import further
+from session_schemas import schemas
 
 from analysis.record import RecordError, load_record
 from rigd.session import SessionError
-from rigd.session._schema import SAMPLE_SCHEMA, schema_data
 
 MAGIC = b"\x89MCAP0\r\n"
 MEGABYTES = 1000
@@ -23,8 +23,8 @@ def peak():
     status = dict(line.split(":", 1) for line in open("/proc/self/status"))
     print(int(status["VmHWM"].split()[0]) // 1024)
 atexit.register(peak)
-from rigd.session import _mcap_limits
-_mcap_limits.MAX_STEPS //= {share}
+from rigd.session import limits
+limits.MAX_STEPS //= {share}
 from analysis.cli.app import main
 main()
 """
@@ -80,9 +80,9 @@ def chunk(records, claimed=None):
 SCHEMA = record(
     3,
     struct.pack("<H", 1)
-    + text(SAMPLE_SCHEMA.encode())
+    + text(b"rigd.Sample")
     + text(b"protobuf")
-    + text(schema_data(SAMPLE_SCHEMA)),
+    + text(schemas()["rigd.Sample"]),
 )
 SESSION = metadata(
     b"session",

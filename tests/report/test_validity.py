@@ -11,7 +11,7 @@ import pytest
 from analysis.report._document import document, document_text
 from analysis.report._text import as_text, result_text, summary_table, tables_text
 from analysis.results import RecordResult
-from rigd.beam import SMALL_SLOPE_RAD, linear_model_error
+from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
 from rigd.session import Validity
 
 NUMBER_OF_DAMPING = re.compile(r"damping|[ζγαλ]|zeta|gamma", re.IGNORECASE)

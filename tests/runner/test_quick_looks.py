@@ -17,7 +17,7 @@ from rigd.runner import _quick_looks as quick_looks
 from rigd.runner._quick_looks import QuickLook, QuickLooks
 from rigd.runner._session import SessionResult
 from rigd.runtime import processor_use
-from rigd.session import look_path
+from rigd.session.quick_look import look_path
 
 PROGRAM = """
 import json, pathlib, sys, time

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.engine._ring import Ring, shared_memory_fd
 from rigd.runner._status import SignalWatch
-from rigd.session._format import SAMPLE_SIZE, pack_sample_into
+from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
 
 
 @pytest.fixture

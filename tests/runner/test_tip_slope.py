@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from rigd.beam import SMALL_SLOPE_RAD, linear_model_error
+from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
 from rigd.excitation import chirp, from_csv, multisine, step
 from rigd.identification import speeds_session
 from rigd.runner import (

@@ -8,7 +8,7 @@ import pytest
 
 from rigd.engine import TouchReady, TouchTold
 from rigd.runner._touch_search import TouchEstimates
-from rigd.session import touch_line, touches_of
+from rigd.session.touches import touch_line, touches_of
 
 
 class Group(dict):

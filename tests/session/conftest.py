@@ -12,9 +12,10 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
+from session_schemas import schemas
 
 from rigd.session import SessionWriter
-from rigd.session._format import (
+from rigd.session.layout import (
     CONTROL_SIZE,
     CONTROL_TYPES,
     SAMPLE_DTYPE,
@@ -25,7 +26,6 @@ from rigd.session._format import (
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.session._schema import SAMPLE_SCHEMA, schema_data
 
 START_UTC_NS = 1_700_000_000_123_456_789
 METADATA = {
@@ -91,7 +91,7 @@ MINIMUM = {
 }
 
 
-def write_foreign(path, messages, *, schema=None, name=SAMPLE_SCHEMA, metadata=MINIMUM,
+def write_foreign(path, messages, *, schema=None, name="rigd.Sample", metadata=MINIMUM,
                   topic="/rig/sample", extra=None, encoding="protobuf", **options):  # fmt: skip
     """Write messages with the plain mcap package; `extra` names a second channel."""
     with path.open("wb") as stream:
@@ -99,7 +99,7 @@ def write_foreign(path, messages, *, schema=None, name=SAMPLE_SCHEMA, metadata=M
         writer.start()
         for key, values in ({"session": metadata} if metadata else {}).items():
             writer.add_metadata(key, values)
-        data = schema_data(SAMPLE_SCHEMA) if schema is None else schema
+        data = schemas()["rigd.Sample"] if schema is None else schema
         schema_id = writer.register_schema(name, encoding, data)
         channel = writer.register_channel(topic, encoding, schema_id)
         if extra:

@@ -1,40 +1,23 @@
-"""Messages of any encoding that are decoded together read as protobuf decodes them one by one."""
+"""Messages of any encoding, which are decoded together, read as protobuf decodes each."""
 
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from session_schemas import message_class, schemas
 
-from rigd.session import SessionError, read_session
-from rigd.session import _message_decoder as message_decoder
-from rigd.session._format import SAMPLE_FIELDS
-from rigd.session._schema import SAMPLE_SCHEMA, message_class, schema_data
+from rigd.session import SessionError, limits, read_session
+from rigd.session.layout import SAMPLE_FIELDS
 
 TYPES = {"INT64": 3, "UINT32": 13, "SINT32": 17, "FLOAT": 2, "SFIXED64": 16, "FIXED32": 7}
 
 
 def schema_with(changes):
-    files = FileDescriptorSet.FromString(schema_data(SAMPLE_SCHEMA))
+    files = FileDescriptorSet.FromString(schemas()["rigd.Sample"])
     for name, kind in changes.items():
         files.file[0].message_type[0].field[SAMPLE_FIELDS.index(name)].type = TYPES[kind]
     return files.SerializeToString()
-
-
-def read_both_ways(path, monkeypatch):
-    """Read a file as usual, and message by message; return both, and how many were single."""
-    single = []
-    whole = message_decoder.MessageDecoder._decode_single
-
-    def counting(self, channel, messages, places, out):
-        single.append(len(messages))
-        whole(self, channel, messages, places, out)
-
-    monkeypatch.setattr(message_decoder.MessageDecoder, "_decode_single", counting)
-    together = read_session(path).samples
-    count = sum(single)
-    monkeypatch.setattr(message_decoder, "_FEW", 10**9)
-    return together, read_session(path).samples, count
 
 
 @settings(
@@ -63,7 +46,7 @@ def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, 
     samples["fx_n"] = np.round(rng.normal(size=400)) * (rng.random(400) < 0.5)
     samples["status"] = rng.integers(0, 400, 400) * (rng.random(400) < 0.3)
     schema = schema_with(changes)
-    cls = message_class(SAMPLE_SCHEMA, schema)
+    cls = message_class("rigd.Sample", schema)
     quarters = [SAMPLE_FIELDS[i::4] for i in order]
     messages = []
     for i, row in enumerate(samples):
@@ -72,26 +55,27 @@ def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, 
             for names in quarters
         ]
         messages.append(b"".join(parts) + parts[i % 2] + tail)  # some fields twice
-        assert cls.FromString(messages[-1]).tick == i
-    path = kit.write_foreign(tmp_path / "f.mcap", messages, schema=schema)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        together, single, _ = read_both_ways(path, monkeypatch)
-    np.testing.assert_array_equal(together, single)
-    np.testing.assert_array_equal(together["tick"], np.arange(400))
+    decoded = [cls.FromString(message) for message in messages]
+    # All of them, and as few as are decoded one by one.
+    for name, count in (("all.mcap", 400), ("few.mcap", 9)):
+        path = kit.write_foreign(tmp_path / name, messages[:count], schema=schema)
+        found = read_session(path).samples
+        assert found.tolist() == [
+            tuple(getattr(each, name) for name in SAMPLE_FIELDS) for each in decoded[:count]
+        ]
+        np.testing.assert_array_equal(found["tick"], np.arange(count))
 
 
 def test_samples_of_another_order_are_decoded_together(kit, tmp_path, monkeypatch):
     samples = kit.make_samples(5000)
     messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(samples)]
     path = kit.write_foreign(tmp_path / "f.mcap", messages)
-    together, single, count = read_both_ways(path, monkeypatch)
-    np.testing.assert_array_equal(together, samples)
-    np.testing.assert_array_equal(single, samples)
-    assert count == 0
+    monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 0)
+    np.testing.assert_array_equal(read_session(path).samples, samples)
 
 
 def test_too_many_messages_that_differ_are_refused(kit, tmp_path, monkeypatch):
-    monkeypatch.setattr(message_decoder, "MAX_SINGLE_MESSAGES", 100)
+    monkeypatch.setattr(limits, "MAX_SINGLE_MESSAGES", 100)
     whole = kit.fixed_messages(kit.make_samples(300))
     messages = [m + b"\xa2\x01" + bytes([i % 100]) + bytes(i % 100) for i, m in enumerate(whole)]
     path = kit.write_foreign(tmp_path / "f.mcap", messages)

@@ -8,15 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.session import (
-    SAMPLE_SIZE,
+from rigd.session import SessionError
+from rigd.session.layout import SAMPLE_SIZE, decode_samples, pack_sample_into
+from rigd.session.online_fit import (
     EstimateRequest,
-    SessionError,
     StreamStart,
-    decode_samples,
     estimate_lines,
     mode_line,
-    pack_sample_into,
     read_frames,
     read_start,
     write_request,

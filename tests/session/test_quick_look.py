@@ -10,15 +10,8 @@ from hypothesis import strategies as st
 from library_folders import mode, quantity
 from online_fits import online_fit
 
-from rigd.session import (
-    BeamUniformity,
-    Validity,
-    fit_of,
-    last_look,
-    look_path,
-    modes_of,
-    read_look,
-)
+from rigd.session import BeamUniformity, Validity
+from rigd.session.quick_look import fit_of, last_look, look_path, modes_of, read_look
 from rigd.view._fits import fit_table
 
 RESPONSE = {

@@ -12,7 +12,7 @@ import pytest
 import zstandard
 from mcap.writer import Writer
 
-from rigd.session import SessionError, describe, read_controls, read_session
+from rigd.session import SessionError, describe, limits, read_controls, read_session
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -222,7 +222,7 @@ def test_many_chunks_that_add_up_to_too_much_are_refused(kit, tmp_path, monkeypa
         tmp_path / "a.mcap", kit.fixed_messages(kit.make_samples(100)), chunk_size=3000
     )
     assert len(read_session(path).samples) == 100  # 15 000 bytes and a schema
-    monkeypatch.setattr("rigd.session._mcap_limits.MAX_TOTAL_BYTES", 10_000)
+    monkeypatch.setattr(limits, "MAX_TOTAL_BYTES", 10_000)
     refused(path, "claims .* which is more than")
 
 

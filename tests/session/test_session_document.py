@@ -8,31 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigd.session import Status, read_session
-from rigd.session import _message_decoder as message_decoder
-from rigd.session._format import (
+from rigd.session import limits, read_session
+from rigd.session.layout import (
     CONTROL_TYPES,
     SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
     TOUCH_KINDS,
     TOUCH_SIZE,
     TOUCH_TYPES,
+    Status,
     field_tag,
 )
-from rigd.session._mcap_limits import (
-    MAX_CHUNK_BYTES,
-    MAX_DECLARED_BYTES,
-    MAX_ENTRIES,
-    MAX_FILE_BYTES,
-    MAX_MESSAGE_BYTES,
-    MAX_STEPS,
-    MAX_TEXT_BYTES,
-    MAX_TOTAL_BYTES,
-)
-from rigd.session._message_decoder import MAX_CHANNELS, MAX_SINGLE_MESSAGES
-from rigd.session._reader import MAX_SURVEYED
-from rigd.session._record_limits import MAX_SAMPLES
-from rigd.session._schema import MAX_SCHEMA_BYTES
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "session_format.md").read_text("utf-8")
 
@@ -71,20 +57,20 @@ def test_the_status_bits_are_those_of_the_code():
 
 
 def test_the_limits_are_those_of_the_code():
-    assert f"more than {MAX_CHUNK_BYTES >> 20} MiB" in DOCUMENT
-    assert f"more than {MAX_TOTAL_BYTES >> 30} GiB" in DOCUMENT
-    assert MAX_FILE_BYTES == MAX_TOTAL_BYTES
-    assert f"more than {MAX_DECLARED_BYTES >> 20} MiB of schemas" in DOCUMENT
-    assert f"more than {MAX_TEXT_BYTES >> 20} MiB of them" in DOCUMENT
-    assert f"more than {MAX_ENTRIES // 1000} 000 keys" in DOCUMENT
-    assert f"schema of more than {MAX_SCHEMA_BYTES >> 10} KiB" in DOCUMENT
-    assert f"more than {MAX_CHANNELS} channels" in DOCUMENT
-    assert f"message of more than {MAX_MESSAGE_BYTES >> 20} MiB" in DOCUMENT
-    assert f"of more than {message_decoder.MAX_MESSAGE_BYTES >> 10} KiB" in DOCUMENT
-    assert f"more than {MAX_STEPS // 10**6} million runs" in DOCUMENT
-    assert f"more than {MAX_SINGLE_MESSAGES // 1000} 000 samples" in DOCUMENT
-    assert f"up to {MAX_SURVEYED / 1e6:g} million samples" in DOCUMENT
-    assert f"up to {MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
+    assert f"more than {limits.MAX_CHUNK_BYTES >> 20} MiB" in DOCUMENT
+    assert f"more than {limits.MAX_TOTAL_BYTES >> 30} GiB" in DOCUMENT
+    assert limits.MAX_FILE_BYTES == limits.MAX_TOTAL_BYTES
+    assert f"more than {limits.MAX_DECLARED_BYTES >> 20} MiB of schemas" in DOCUMENT
+    assert f"more than {limits.MAX_TEXT_BYTES >> 20} MiB of them" in DOCUMENT
+    assert f"more than {limits.MAX_ENTRIES // 1000} 000 keys" in DOCUMENT
+    assert f"schema of more than {limits.MAX_SCHEMA_BYTES >> 10} KiB" in DOCUMENT
+    assert f"more than {limits.MAX_CHANNELS} channels" in DOCUMENT
+    assert f"message of more than {limits.MAX_MESSAGE_BYTES >> 20} MiB" in DOCUMENT
+    assert f"of more than {limits.MAX_DECODED_BYTES >> 10} KiB" in DOCUMENT
+    assert f"more than {limits.MAX_STEPS // 10**6} million runs" in DOCUMENT
+    assert f"more than {limits.MAX_SINGLE_MESSAGES // 1000} 000 samples" in DOCUMENT
+    assert f"up to {limits.MAX_SURVEYED / 1e6:g} million samples" in DOCUMENT
+    assert f"up to {limits.MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 
 
 def test_the_example_writes_a_session(tmp_path):

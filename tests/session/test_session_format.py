@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from session_schemas import message_class
 
-from rigd.session._format import (
+from rigd.session.layout import (
     CONTROL_SIZE,
     CONTROL_TYPES,
     SAMPLE_DTYPE,
@@ -32,14 +33,6 @@ from rigd.session._format import (
     pack_timing_into,
     pack_touch,
 )
-from rigd.session._schema import (
-    CONTROL_SCHEMA,
-    SAMPLE_SCHEMA,
-    TIMING_SCHEMA,
-    TOUCH_SCHEMA,
-    message_class,
-    schema_data,
-)
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
@@ -55,7 +48,7 @@ def same(left, right):
 
 
 def protobuf_fields(schema_name, data, names):
-    message = message_class(schema_name, schema_data(schema_name)).FromString(data)
+    message = message_class(schema_name).FromString(data)
     return [getattr(message, name) for name in names]
 
 
@@ -82,7 +75,7 @@ def test_a_packed_touch_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack_touch(*values)
     expected = (*values[:-1], TOUCH_KINDS.index(values[-1]))
     assert len(data) == TOUCH_SIZE
-    assert all(map(same, protobuf_fields(TOUCH_SCHEMA, data, TOUCH_TYPES), expected))
+    assert all(map(same, protobuf_fields("rigd.Touch", data, TOUCH_TYPES), expected))
     assert all(map(same, decode_touches(data)[0].item(), expected))
 
 
@@ -93,21 +86,21 @@ def test_a_touch_of_an_unheard_kind_is_unknown():
 @given(SAMPLES)
 def test_a_packed_sample_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_sample_into, SAMPLE_SIZE, values)
-    assert all(map(same, protobuf_fields(SAMPLE_SCHEMA, data, SAMPLE_FIELDS), values))
+    assert all(map(same, protobuf_fields("rigd.Sample", data, SAMPLE_FIELDS), values))
     assert all(map(same, decode_samples(data)[0].item(), values))
 
 
 @given(CONTROLS)
 def test_a_packed_control_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_control_into, CONTROL_SIZE, values)
-    assert all(map(same, protobuf_fields(CONTROL_SCHEMA, data, CONTROL_TYPES), values))
+    assert all(map(same, protobuf_fields("rigd.Control", data, CONTROL_TYPES), values))
     assert all(map(same, decode_controls(data)[0].item(), values))
 
 
 @given(TIMINGS)
 def test_a_packed_timing_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_timing_into, TIMING_SIZE, values)
-    assert all(map(same, protobuf_fields(TIMING_SCHEMA, data, TIMING_TYPES), values))
+    assert all(map(same, protobuf_fields("rigd.Timing", data, TIMING_TYPES), values))
     assert all(map(same, decode_timings(data)[0].item(), values))
 
 
@@ -153,7 +146,7 @@ def test_a_block_that_is_no_whole_number_of_samples_is_refused():
 def test_the_control_process_imports_neither_container_nor_protobuf():
     heavy = ("mcap", "google.protobuf", "zstandard", "lz4", "scipy")
     code = (
-        "import sys, rigd.session, rigd.session._format\n"
+        "import sys, rigd.session, rigd.session.layout\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
     result = subprocess.run(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd.session import SessionError, SessionWriter, describe
-from rigd.session._format import Status
+from rigd.session.layout import Status
 
 
 @pytest.fixture

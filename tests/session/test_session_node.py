@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigd.session._format import SAMPLE_FIELDS, decode_controls
+from rigd.session.layout import SAMPLE_FIELDS, decode_controls
 
 NODE_FILES = Path(__file__).parent / "node"
 

@@ -1,5 +1,7 @@
 """Reader of sound files: this writer's, and any other MCAP and protobuf library's."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import zstandard
@@ -8,15 +10,15 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
+from session_schemas import message_class, schemas
 
-from rigd.session import Event, SessionError, read_controls, read_session
-from rigd.session._format import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
-from rigd.session._schema import SAMPLE_SCHEMA, message_class, schema_data
+from rigd.session import SessionError, read_controls, read_session
+from rigd.session.layout import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
 
 
 def encoded(samples, cls=None):
     """Messages as google.protobuf writes them: zeros left out."""
-    cls = cls or message_class(SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA))
+    cls = cls or message_class("rigd.Sample")
     return [
         cls(**dict(zip(SAMPLE_FIELDS, row, strict=True))).SerializeToString()
         for row in samples.tolist()
@@ -25,7 +27,7 @@ def encoded(samples, cls=None):
 
 def changed_schema(change):
     """Return the sample's schema with `change` applied to its message descriptor."""
-    files = FileDescriptorSet.FromString(schema_data(SAMPLE_SCHEMA))
+    files = FileDescriptorSet.FromString(schemas()["rigd.Sample"])
     change(files.file[0].message_type[0])
     return files.SerializeToString()
 
@@ -42,9 +44,9 @@ def test_a_recorded_session_is_read_back(kit, recorded):
     assert session.segments == kit.SEGMENTS
     assert session.outcome == kit.OUTCOME
     assert session.attachments == kit.ATTACHMENTS
-    assert session.events == [
-        Event(-5_000_000, "info", "rigd.engine", "before the first tick"),
-        Event(1_000_000_000, "warning", "rigd", "late — 3 ticks"),
+    assert [dataclasses.astuple(event) for event in session.events] == [
+        (-5_000_000, "info", "rigd.engine", "before the first tick"),
+        (1_000_000_000, "warning", "rigd", "late — 3 ticks"),
     ]
     assert session.number("beam_length_m") == 0.98
     assert session.number("angle_delay_s", 0.0) == 0.0
@@ -129,13 +131,14 @@ def test_a_schema_is_interpreted_once_however_the_messages_vary(kit, tmp_path, m
     """Zeros left out make lengths differ, so that hardly two messages are taken together."""
     samples = kit.make_samples(300)
     samples["fx_n"][::2] = 0.0
-    path = kit.write_foreign(tmp_path / "f.mcap", encoded(samples))
+    # A schema of its own, which nothing has read before.
+    schema = changed_schema(lambda message: message.field.add(name="once", number=99, type=9))
+    path = kit.write_foreign(tmp_path / "f.mcap", encoded(samples), schema=schema)
     built = []
     get_class = message_factory.GetMessageClass
     monkeypatch.setattr(
         message_factory, "GetMessageClass", lambda d: built.append(d) or get_class(d)
     )
-    message_class.cache_clear()
     np.testing.assert_array_equal(read_session(path).samples, samples)
     assert len(built) == 1
 
@@ -222,7 +225,7 @@ def test_a_number_too_large_for_its_field_is_refused(kit, tmp_path):
         message.field[SAMPLE_FIELDS.index("tick")].type = FieldDescriptorProto.TYPE_UINT64
 
     schema = changed_schema(change)
-    message = message_class(SAMPLE_SCHEMA, schema)(tick=2**32).SerializeToString()
+    message = message_class("rigd.Sample", schema)(tick=2**32).SerializeToString()
     path = kit.write_foreign(tmp_path / "f.mcap", [message], schema=schema)
     with pytest.raises(SessionError, match="holds a number that its field cannot take"):
         read_session(path)
@@ -298,7 +301,7 @@ def test_a_bad_segment_is_named(tmp_path, text):
         writer = Writer(stream)
         writer.start()
         writer.add_metadata("segments", {"sweep": text})
-        schema = writer.register_schema(SAMPLE_SCHEMA, "protobuf", schema_data(SAMPLE_SCHEMA))
+        schema = writer.register_schema("rigd.Sample", "protobuf", schemas()["rigd.Sample"])
         writer.register_channel("/rig/sample", "protobuf", schema)
         writer.finish()
     with pytest.raises(SessionError, match="segment 'sweep'"):

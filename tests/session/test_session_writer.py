@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from session_schemas import message_class
 
 from rigd.session import (
     SessionError,
@@ -22,8 +23,7 @@ from rigd.session import (
     read_timings,
     recover,
 )
-from rigd.session._format import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
-from rigd.session._schema import message_class
+from rigd.session.layout import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
 
 
 def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
@@ -139,9 +139,9 @@ def test_a_session_without_samples_is_complete(kit, tmp_path):
 CHILD = """
     import sys
     from pathlib import Path
-    sys.path.insert(0, sys.argv[2])
+    sys.path[:0] = sys.argv[2], sys.argv[2] + "/../plugins"
     from conftest import begin, make_samples, packed
-    from rigd.session._format import SAMPLE_SIZE
+    from rigd.session.layout import SAMPLE_SIZE
 
     block = packed(make_samples(5000))
     writer = begin(Path(sys.argv[1]))

@@ -5,14 +5,8 @@ import math
 
 import pytest
 
-from rigd.session import (
-    packed_touches,
-    read_session,
-    read_touches,
-    recover,
-    touch_line,
-    touches_of,
-)
+from rigd.session import read_session, read_touches, recover
+from rigd.session.touches import packed_touches, touch_line, touches_of
 
 
 def known(value, half):

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.session import MetadataError, added_metadata, metadata_keys
+from rigd.session.user_metadata import MetadataError, added_metadata, metadata_keys
 
 
 def test_a_unit_in_the_name_makes_a_number():

@@ -22,7 +22,8 @@ import pytest
 from cases import further
 from paper_table import table_3
 
-from rigd.beam import Beam, Damping, TransferGrid, couple, modes, propagator, realise
+from rigd.beam import Beam, Damping, TransferGrid, modes
+from rigd.beam.realisation import couple, propagator, realise
 from rigd.devices.parameters import (
     Actuation,
     Encoder,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.beam import Beam, Damping, RealisationError
+from rigd.beam import Beam, Damping
+from rigd.beam.realisation import RealisationError
 from rigd.devices.parameters import (
     Actuation,
     Encoder,

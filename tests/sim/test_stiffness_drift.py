@@ -8,7 +8,8 @@ from cases import further
 from scipy.integrate import solve_ivp
 from shipped_profile import load_shipped
 
-from rigd.beam import Beam, Damping, RealisationError, clamped_free_eigenvalues, realise
+from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.beam.realisation import RealisationError, realise
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._stiffness_drift import MOST_DRIFT
 

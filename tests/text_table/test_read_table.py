@@ -5,7 +5,8 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from rigd.text_table import MissingColumnError, TableError, decode_text, read_table, stated_unit_of
+from rigd.text_table import MissingColumnError, TableError, decode_text, read_table
+from rigd.text_table.titles import stated_unit_of
 
 
 def table(text, *names, encoding="utf-8", most_rows=1000):

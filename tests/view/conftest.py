@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping
-from rigd.session._format import SAMPLE_DTYPE
+from rigd.session.layout import SAMPLE_DTYPE
 from rigd.view._plots import TIMELINE
 from rigd.view._session_info import Subject
 

@@ -8,7 +8,7 @@ import pytest
 from online_fits import online_fit
 
 from rigd.session import read_session
-from rigd.session._format import TIMING_DTYPE
+from rigd.session.layout import TIMING_DTYPE
 from rigd.view._fits import TABLE, fit_record, fit_source, fit_table
 from rigd.view._layout import FIT_TAB, TABS, blueprint
 from rigd.view._recorded import draw_session, subject_of_session

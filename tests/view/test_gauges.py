@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigd.session import Status
+from rigd.session.layout import Status
 from rigd.view import Gauge, Gauges
 
 

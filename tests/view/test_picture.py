@@ -10,11 +10,11 @@ import pytest
 from cases import further
 
 from analysis.models import PAPER_BAND_HZ, WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
-from rigd.session import Status, read_session
-from rigd.session._format import TIMING_DTYPE
+from rigd.session import read_session
+from rigd.session.layout import TIMING_DTYPE, Status
 from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
 from rigd.view._recorded import draw_session
 from rigd.view._scene import Scene

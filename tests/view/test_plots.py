@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from rigd.session._format import TIMING_DTYPE
+from rigd.session.layout import TIMING_DTYPE
 from rigd.view._plots import HEALTH, READINGS, SIGNALS, send_columns
 from rigd.view._session_info import Health, health_record
 

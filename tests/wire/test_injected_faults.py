@@ -10,7 +10,8 @@ from processes import eventually
 from rigd.devices._wired_rig import reset_drive
 from rigd.devices.contracts import DeviceError
 from rigd.runner._rig import RigError
-from rigd.session import Status, read_session
+from rigd.session import read_session
+from rigd.session.layout import Status
 from rigd.sim.wire._simulator import inject
 
 # Fast from the beginning, so that every fault is met while the motor moves.

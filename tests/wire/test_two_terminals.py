@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from processes import child_running, eventually
 
-from rigd.session import Status, read_session, read_timings
+from rigd.session import read_session, read_timings
+from rigd.session.layout import Status
 
 # Little torque: while the machine stands still it is held, and swings the motor out.
 CHIRP = ("--amplitude", "0.005", "--stop-hz", "5", "--duration", "1.5")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from rigd.beam import RealisationError
+from rigd.beam.realisation import RealisationError
 from rigd.devices import Obstacle, ObstacleError
 from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.parameters import RigParameters

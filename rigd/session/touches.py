@@ -5,23 +5,23 @@ from collections.abc import Mapping, Sequence
 from math import isfinite, nan
 from typing import Any, Final
 
-from rigd.session._format import pack_touch
+from rigd.session.layout import pack_touch
 from rigd.units import with_half_width
 
-_TOLD: Final = {
+_ESTIMATED: Final = {
     "x_m": "m from the axis",
     "time_s": "s",
     "force_n": "N",
     "stiffness_n_per_m": "N/m",
 }
-"""What is known of a touch with an uncertainty, and its unit in words."""
+"""Estimated quantities of a touch, and their units in words."""
 _MOST: Final = 1000
 """Touches that are read."""
 _MOST_CHARACTERS: Final = 100
 
 
 def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """Return the touches that the outcome of a session lists; whatever is no touch is left out.
+    """Return the touches that the outcome of a session lists; anything else there is left out.
 
     Parameters
     ----------
@@ -37,22 +37,22 @@ def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
     return [_touch(each) for each in listed[:_MOST] if isinstance(each, dict)]
 
 
-def _touch(told: Mapping[str, Any]) -> dict[str, Any]:
-    number, kind = told.get("number"), told.get("kind")
+def _touch(stated: Mapping[str, Any]) -> dict[str, Any]:
+    number, kind = stated.get("number"), stated.get("kind")
     touch: dict[str, Any] = {
         "number": number if isinstance(number, int) and 0 < number < 10**9 else 0,
-        **{name: _estimated(told.get(name)) for name in _TOLD},
+        **{name: _estimated(stated.get(name)) for name in _ESTIMATED},
     }
-    first = {"final": False} if told.get("final") is False else {}
+    first = {"final": False} if stated.get("final") is False else {}
     return touch | {"kind": kind[:_MOST_CHARACTERS] if isinstance(kind, str) else ""} | first
 
 
-def _estimated(told: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
+def _estimated(stated: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
     """Return a number with its uncertainty; None if it is none."""
-    if not isinstance(told, dict):
+    if not isinstance(stated, dict):
         return None
-    ends = told.get("interval_95")
-    numbers = [told.get("value"), told.get("std"), *(ends if isinstance(ends, list) else ())]
+    ends = stated.get("interval_95")
+    numbers = [stated.get("value"), stated.get("std"), *(ends if isinstance(ends, list) else ())]
     if len(numbers) != 4 or not all(
         isinstance(each, int | float) and abs(each) < 1e15 and isfinite(each) for each in numbers
     ):
@@ -62,7 +62,7 @@ def _estimated(told: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON v
 
 
 def touch_line(touch: Mapping[str, Any]) -> str:
-    """Say what a touch was.
+    """Return one line about a touch: its estimates and its kind.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def touch_line(touch: Mapping[str, Any]) -> str:
     """
     parts = [
         f"{with_half_width(found['value'], found['interval_95'])} {unit}"
-        for name, unit in _TOLD.items()
+        for name, unit in _ESTIMATED.items()
         if (found := touch.get(name)) is not None
     ]
     kind = touch.get("kind", "")

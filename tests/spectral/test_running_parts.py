@@ -1,4 +1,7 @@
-"""Blocks with missing ticks cut into segments, against the whole record cut at once."""
+"""Parts of a running estimate: low bins against the whole transform, segments against the record.
+
+The lowest bins of a padded transform, and blocks with missing ticks cut into segments as they come.
+"""
 
 from itertools import pairwise
 
@@ -7,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.spectral._running import Segments
+from rigd.spectral._running import LowBins, Segments, bins_up_to
 
 LENGTH, HOP, LONGEST_GAP = 40, 30, 5
 
@@ -75,3 +78,40 @@ def test_a_value_is_held_where_the_record_begins_with_a_short_gap_only():
         _, found = cut(ticks, np.full((1, ticks.size), 3.0), [])
         assert [first for first, _ in found] == ([0] if value else [])
         assert all((segment == value).all() for _, segment in found)
+
+
+@given(data=st.data())
+def test_equals_the_whole_transform(data):
+    length = data.draw(st.integers(1, 300))
+    nfft = data.draw(st.integers(length, 1000))
+    bins = data.draw(st.integers(1, nfft // 2 + 1))
+    transform = LowBins(length, nfft, bins)
+    rng = np.random.default_rng(length)
+    # The shorter one after the longer: nothing of that may be left.
+    for samples in (length, data.draw(st.integers(1, length))):
+        x = rng.normal(size=samples)
+        whole = np.fft.rfft(x, nfft)
+        np.testing.assert_allclose(
+            transform(x), whole[:bins], rtol=0, atol=1e-13 * np.abs(whole).max()
+        )
+
+
+def test_equals_the_papers_transform():
+    x = np.random.default_rng(5).normal(size=17_266) * np.hamming(17_266)
+    whole = np.fft.rfft(x, 160_000)[:9601]
+    np.testing.assert_allclose(LowBins(17_266, 160_000, 9601)(x), whole, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("last_hz", "nfft", "rate_hz", "bins"),
+    [
+        (60.0, 160_000, 1000.0, 9601),
+        (0.1 + 0.2, 100, 10.0, 4),
+        (0.3, 100, 10.0, 4),
+        (0.2999, 100, 10.0, 3),
+        (1e6, 100, 10.0, 51),
+        (0.0, 100, 10.0, 1),
+    ],
+)
+def test_bins_up_to_a_frequency(last_hz, nfft, rate_hz, bins):
+    assert bins_up_to(last_hz, nfft, rate_hz) == bins

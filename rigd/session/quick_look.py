@@ -40,12 +40,12 @@ _BAND: Final = ("magnitude_low_95", "magnitude_high_95")
 
 
 def look_path(path: Path) -> Path:
-    """Return where the quick look at a session is, which is written beside its file.
+    """Return the path of a session's quick look, in the same folder as its file.
 
     Examples
     --------
     >>> from pathlib import Path
-    >>> from rigd.session import look_path
+    >>> from rigd.session.quick_look import look_path
     >>> print(look_path(Path("sessions/20261120-101500-chirp.mcap")))
     sessions/20261120-101500-chirp.look.json
     """

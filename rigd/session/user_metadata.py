@@ -62,7 +62,7 @@ def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
 
     Examples
     --------
-    >>> from rigd.session import metadata_keys
+    >>> from rigd.session.user_metadata import metadata_keys
     >>> metadata_keys({"temperature_c": "21.40", "batch": "B 7"})
     {'meta_temperature_c': '21.4', 'meta_batch': 'B 7'}
     """

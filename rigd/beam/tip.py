@@ -48,7 +48,7 @@ def linear_model_error(slope_rad: float) -> float:
 
     Examples
     --------
-    >>> from rigd.beam import linear_model_error
+    >>> from rigd.beam.tip import linear_model_error
     >>> print(f"{100 * linear_model_error(0.6):.0f} %")
     12 %
     """
@@ -92,7 +92,8 @@ def tip_motion(
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping, tip_motion
+    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.beam.tip import tip_motion
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> angle_rad = 0.02 * np.sin(2 * np.pi * np.arange(5000) / 1000)
     >>> motion = tip_motion(beam, Damping(zeta=7e-5), angle_rad, rate_hz=1000)
@@ -147,7 +148,7 @@ def tip_motion(
 
 
 def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
-    """Motion of the tip over the angle.
+    """Return the transfer functions from the angle to the tip's displacement and slope.
 
     Parameters
     ----------

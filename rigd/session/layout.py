@@ -1,4 +1,4 @@
-"""Byte layout of a session file's messages, and the errors of session files.
+"""Byte layout of a session file's messages.
 
 Every message of ``/rig/sample``, ``/rig/control``, ``/rig/timing`` and ``/rig/touch`` is protobuf
 of *fixed layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the
@@ -18,23 +18,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-
-from rigd.errors import FailureError
-
-
-class SessionError(FailureError):
-    """A session file cannot be read or written; the message names the file and the remedy."""
-
-
-class SessionAccessError(SessionError):
-    """The system does not let the file be read now; it may be sound, and readable another time."""
-
-
-class SessionExistsError(SessionError):
-    """The file to be written exists already, and nothing is ever overwritten."""
-
-
-# Messages
 
 Buffer = bytes | bytearray | memoryview
 
@@ -125,54 +108,6 @@ class Status(IntFlag):
     """The loop detected in this tick that the beam has met something."""
 
 
-def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[str, tuple[int, int]]:
-    """Cut segments off at a tick; those that begin there or later are left out.
-
-    Parameters
-    ----------
-    segments : mapping of str to (int, int)
-        Name → first tick and end (exclusive).
-    end : int
-        First tick that is left out.
-    """
-    return {
-        name: (first, min(last, end)) for name, (first, last) in segments.items() if first < end
-    }
-
-
-def sweep_frequency_hz(
-    segments: Mapping[str, tuple[int, int]], ends_hz: tuple[float, float], tick: int
-) -> float | None:
-    """Return the frequency of a linear sweep at a tick; None before and after it.
-
-    Parameters
-    ----------
-    segments : mapping of str to (int, int)
-        ``sweep`` → first tick and end (exclusive); of a sweep there and back, ``there`` and
-        ``back``.
-    ends_hz : tuple of float
-        Frequencies at the start and at the end of the (first) sweep.
-    tick : int
-        Tick of the record.
-
-    Examples
-    --------
-    >>> from rigd.session import sweep_frequency_hz
-    >>> both = {"sweep": (0, 200), "there": (0, 100), "back": (100, 200)}
-    >>> [sweep_frequency_hz(both, (0.0, 50.0), tick) for tick in (50, 150, 200)]
-    [25.0, 25.0, None]
-    """
-    start_hz, stop_hz = ends_hz
-    there = segments.get("there", segments["sweep"])
-    for (first, end), begin_hz, end_hz in (
-        (there, start_hz, stop_hz),
-        (segments.get("back", (0, 0)), stop_hz, start_hz),
-    ):
-        if first <= tick < end:
-            return begin_hz + (end_hz - begin_hz) * (tick - first) / (end - first)
-    return None
-
-
 def field_tag(number: int, protobuf_type: str) -> int:
     """Return the tag byte of field `number` (1–15) of a fixed-layout message.
 
@@ -185,7 +120,7 @@ def field_tag(number: int, protobuf_type: str) -> int:
 
     Examples
     --------
-    >>> from rigd.session import field_tag
+    >>> from rigd.session.layout import field_tag
     >>> hex(field_tag(2, "fixed32"))
     '0x15'
     """
@@ -208,25 +143,25 @@ SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
 SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
 """A decoded sample."""
 SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
-"""A sample as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A sample as it is in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
 
 CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
 """A decoded message of the controller's terms."""
 CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
-"""A control message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A control message as it is in the file: each field after its tag byte ``tag_NAME``."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 
 TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
 """A decoded message of the readings' ages."""
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
-"""A timing message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A timing message as it is in the file: each field after its tag byte ``tag_NAME``."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
 
 TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
 """A decoded touch."""
 TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
-"""A touch as it stands in the file: each field after its tag byte ``tag_NAME``."""
+"""A touch as it is in the file: each field after its tag byte ``tag_NAME``."""
 TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
 
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
@@ -263,7 +198,7 @@ def pack_sample_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -281,7 +216,7 @@ def pack_sample_into(
 
     Examples
     --------
-    >>> from rigd.session import SAMPLE_SIZE, decode_samples, pack_sample_into
+    >>> from rigd.session.layout import SAMPLE_SIZE, decode_samples, pack_sample_into
     >>> block = bytearray(SAMPLE_SIZE)
     >>> pack_sample_into(block, 0, 5_000_000, 5, 0.01, 0.009, *[0.0] * 8, 0, 12_000, 90_000)
     >>> sample = decode_samples(block)[0]
@@ -324,7 +259,7 @@ def pack_control_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -359,7 +294,7 @@ def pack_timing_into(
     buffer
         Memory to write to.
     offset
-        Place of the message in it, in bytes.
+        Offset of the message in it, in bytes.
     t_ns
         Scheduled time of the tick since the session's start.
     tick
@@ -416,7 +351,7 @@ def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
 
     Examples
     --------
-    >>> from rigd.session import decode_samples, encode_samples
+    >>> from rigd.session.layout import decode_samples, encode_samples
     >>> decode_samples(encode_samples({"tick": [0, 1], "angle_rad": [0.1, 0.2]}))["angle_rad"]
     array([0.1, 0.2])
     """
@@ -435,7 +370,7 @@ def _encode(
 
 
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
-    """Tell which messages have every tag of the fixed layout in its place.
+    """Return which messages have every tag of the fixed layout at its offset.
 
     Parameters
     ----------
@@ -464,7 +399,15 @@ def _tags(
 
 
 def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:
-    """Copy fields of messages (n,) of a wire dtype into the array `out` (n,) of a decoded dtype."""
+    """Copy fields of messages as they are in the file into an array of decoded messages.
+
+    Parameters
+    ----------
+    wire : array (n,) of a wire dtype
+    names
+        Fields to copy.
+    out : array (n,) of a decoded dtype
+    """
     for name in names:
         out[name] = wire[name]
 

@@ -87,7 +87,7 @@ class Realisation:
     def transfer(self, s: ArrayLike) -> Complex:
         """G(s) as realised, in N·m/rad, of the shape of `s` (rad/s)."""
         points = np.asarray(s, dtype=np.complex128)
-        columns = basis(points.ravel(), self.poles_rad_s)
+        columns = _basis(points.ravel(), self.poles_rad_s)
         direct = (
             self.direct_inertia_kg_m2,
             self.direct_viscosity_nm_s_per_rad,
@@ -99,7 +99,7 @@ class Realisation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateOutput:
-    """Another response to the root's angle, told by the states of a realisation.
+    """Another response to the root's angle, as an output of a realisation's states.
 
     It is ``c x + D θ'' + V θ' + K θ``, as the torque of a `Realisation`.
     """
@@ -121,7 +121,7 @@ def state_output(
     inertial: bool,
     small: float = 0.0,
 ) -> StateOutput:
-    """Tell a response of the beam, such as its base shear, by the states of its realisation.
+    """Fit a response of the beam, such as its base shear, as an output of its realisation.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def state_output(
     s = (1j * omega[apart]).astype(np.complex128)
     weight = weight[apart]
     exact = response(s)
-    columns = basis(s, poles)
+    columns = _basis(s, poles)
     used = np.arange(columns.shape[1])
     if not inertial:
         used = np.delete(used, -3)
@@ -171,7 +171,7 @@ def state_output(
     return StateOutput(coefficients[:-3], inertia, viscosity, stiffness)
 
 
-def basis(s: Complex, poles: Complex) -> Complex:
+def _basis(s: Complex, poles: Complex) -> Complex:
     """Columns whose combination with ``c, D, V, K`` is G: shape (len(s), n + 3)."""
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
     s2 = (s * s)[:, None]
@@ -197,7 +197,7 @@ def realise(
     stiffness_offsets: tuple[float, ...] = (),
     modes_of: Beam | None = None,
 ) -> Realisation:
-    """Real-time realisation of the beam.
+    """Return a state space of the beam that runs in real time.
 
     Parameters
     ----------
@@ -224,7 +224,8 @@ def realise(
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping, realise, transfer
+    >>> from rigd.beam import Beam, Damping, transfer
+    >>> from rigd.beam.realisation import realise
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> damping = Damping(zeta=7e-5, alpha=0.9)
     >>> realisation = realise(beam, damping)
@@ -244,7 +245,7 @@ def realise(
     s = 1j * omega[apart]
     exact = _exact(loaded, s)
     scale = weight[apart] / exact
-    coefficients = _fit(basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
+    coefficients = _fit(_basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
 
     error = _relative_error(loaded, poles, zeros, coefficients)
     if not error <= max_relative_error:
@@ -386,7 +387,7 @@ def _relative_error(
     omega = 2 * np.pi * frequency[(frequency >= low) & (frequency <= high)]
     s = 1j * omega[_apart(omega, poles, zeros)]
     exact = _exact(loaded, s)
-    return float(np.max(np.abs(basis(s, poles) @ coefficients / exact - 1)))
+    return float(np.max(np.abs(_basis(s, poles) @ coefficients / exact - 1)))
 
 
 def _apart(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
@@ -597,7 +598,7 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
 
     Examples
     --------
-    >>> from rigd.beam import couple, propagator
+    >>> from rigd.beam.realisation import couple, propagator
     >>> motor = couple(None, motor_inertia_kg_m2=2e-3)
     >>> phi, gamma = propagator(motor, 0.1)
     >>> print(phi, gamma.round(6))
@@ -608,12 +609,12 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     extended = np.zeros((n + 1, n + 1))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n] = model.b * duration_s
-    exponential = expm(extended)
+    exponential = _expm(extended)
     return exponential[:n, :n], exponential[:n, n]
 
 
 def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
-    """State that inputs of 1, held over a duration, leave behind, shape (n, inputs).
+    """Return the state after inputs of 1 held over a duration, shape (n, inputs).
 
     Parameters
     ----------
@@ -626,10 +627,10 @@ def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
     extended = np.zeros((n + m, n + m))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n:] = inputs * duration_s
-    return expm(extended)[:n, n:]
+    return _expm(extended)[:n, n:]
 
 
-def expm(matrix: Real) -> Real:
+def _expm(matrix: Real) -> Real:
     """Matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order

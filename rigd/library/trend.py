@@ -91,7 +91,7 @@ def change_between(before: Quantity, after: Quantity) -> Change:
 
     Examples
     --------
-    >>> from rigd.library import change_between
+    >>> from rigd.library.trend import change_between
     >>> before = {"value": 2.60, "interval_95": [2.59, 2.61]}
     >>> change_between(before, {"value": 2.63, "interval_95": [2.62, 2.64]}).significant
     True

@@ -26,8 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.printable import listed
-from rigd.session._format import Buffer, SessionError, decode_samples
+from rigd.session._errors import SessionError
 from rigd.session._validity import Validity
+from rigd.session.layout import Buffer, decode_samples
 from rigd.units import decimals, with_half_width
 
 _VERSION: Final = 1
@@ -66,7 +67,7 @@ class EstimateRequest:
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
-    """Begin a stream.
+    """Write the start of a stream: metadata and segments of the session.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def write_start(stream: BinaryIO, start: StreamStart) -> None:
 
 
 def write_samples(stream: BinaryIO, block: Buffer) -> None:
-    """Send consecutive samples.
+    """Write consecutive samples to the stream.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def write_samples(stream: BinaryIO, block: Buffer) -> None:
 
 
 def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
-    """Ask for an estimate.
+    """Write a request for an estimate to the stream.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ def _write(stream: BinaryIO, kind: bytes, content: Buffer) -> None:
 
 
 def read_start(stream: BinaryIO) -> StreamStart:
-    """Read what a stream begins with.
+    """Read the start of a stream.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def read_start(stream: BinaryIO) -> StreamStart:
 
 
 def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateRequest]:
-    """Read what follows, until the stream ends.
+    """Read samples and requests until the stream ends.
 
     Yields
     ------
@@ -191,7 +192,7 @@ def mode_line(mode: Mapping[str, Any]) -> str:
 
     Examples
     --------
-    >>> from rigd.session import mode_line
+    >>> from rigd.session.online_fit import mode_line
     >>> hz = {"value": 2.5699, "interval_95": [2.5687, 2.5711]}
     >>> print(mode_line({"mode": 1, "frequency_hz": hz,
     ...                  "damping_ratio": {"value": 0.00909, "interval_95": None}}))
@@ -249,7 +250,7 @@ def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
 
     Examples
     --------
-    >>> from rigd.session import unseen_modes
+    >>> from rigd.session.online_fit import unseen_modes
     >>> unseen_modes([{"mode": n, "shown": n == 1} for n in (1, 2, 3)])
     'modes 2 and 3'
     """
