@@ -8,10 +8,9 @@ from dataclasses import replace
 import pytest
 from cases import further
 
+from rigd.checks import Verdict, overall
 from rigd.checks._devices import inspect_devices
-from rigd.checks._rows import Verdict, overall
-from rigd.devices._simulator import find_simulator
-from rigd.devices._wired_rig import reset_drive
+from rigd.devices import find_simulator, reset_drive
 from rigd.devices.contracts import DeviceError
 
 RUN = """
@@ -38,7 +37,7 @@ def profile(request, can_profile, serial_profile):
 
 
 def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
-    from rigd.sim.wire._simulator import inject
+    from rigd.sim.wire import inject
 
     rows = inspect_devices(profile)
     assert overall(rows) == "ok", rows

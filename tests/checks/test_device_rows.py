@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.checks import Verdict, overall
 from rigd.checks._devices import inspect_devices
-from rigd.checks._rows import Verdict, overall
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.checks import Verdict
 from rigd.checks._machine import machine_rows
-from rigd.checks._rows import Verdict
 from rigd.profile import load_profile
 
 CPU = "sys/devices/system/cpu"

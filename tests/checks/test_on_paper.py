@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
-from rigd.checks import check_on_paper
+from rigd.checks import Row, Verdict, check_on_paper, overall
 from rigd.checks._gate import paper_rows
 from rigd.checks._on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
-from rigd.checks._rows import Row, Verdict, overall
-from rigd.devices.canbus._budget import bus_load
+from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
 from rigd.profile import load_profile
 

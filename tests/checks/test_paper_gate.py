@@ -8,10 +8,9 @@ import pytest
 from cases import further
 from eds_files import eds_path
 
-from rigd.checks import UnknownRowError, check_on_paper
+from rigd.checks import UnknownRowError, Verdict, check_on_paper, overall
 from rigd.checks._check import default_session_rows
 from rigd.checks._gate import PAPER_CHECKS, paper_rows
-from rigd.checks._rows import Verdict, overall
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, DeviceError, open_devices, unknown_values
 from rigd.excitation import KINDS, hold

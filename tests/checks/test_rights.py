@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.checks import Verdict
 from rigd.checks._machine import rights_rows
-from rigd.checks._rows import Verdict
 from rigd.profile import load_profile
 
 

@@ -10,9 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from rigd.beam import Damping
-from rigd.control import close_loop
+from rigd.control import close_loop, loop_margins
 from rigd.control._closed_loop import MAX_DELAY_PERIODS
-from rigd.control._margins import loop_margins, open_loop_gain
+from rigd.control._margins import open_loop_gain
 
 DELAY_OF = {
     "torque command": "actuation_delay_s",

@@ -12,8 +12,8 @@ from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from rigd.devices import EdsError, read_eds
 from rigd.devices import _eds as eds
-from rigd.devices._eds import EdsError, read_eds
 
 TABLE = """
     1000 u32 ro 0x00020192

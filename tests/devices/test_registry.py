@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._registry import UnknownDeviceError, check_selection
+from rigd.devices import UnknownDeviceError, check_selection
 from rigd.devices.parameters import Selection
 
 

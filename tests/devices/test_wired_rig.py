@@ -6,9 +6,16 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.devices import (
+    SimulatorAddress,
+    WhatMoves,
+    announce,
+    described,
+    open_devices,
+    reality,
+    simulated_differently,
+)
 from rigd.devices import _wired_rig as wired_rig
-from rigd.devices._registry import WhatMoves, open_devices, reality, simulated_differently
-from rigd.devices._simulator import SimulatorAddress, announce, described
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
 

@@ -8,18 +8,16 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
-from rigd.identification import _records
-from rigd.identification._estimate import EstimateError
-from rigd.identification._experiments import (
-    Pass,
-    lay_out_passes,
+from rigd.identification import (
+    EstimateError,
+    _records,
     multisine_session,
-    read_layout,
+    read_recording,
     speeds_session,
     trial_session,
 )
-from rigd.identification._records import read_recording
-from rigd.runner._planning import plan_session
+from rigd.identification._experiments import Pass, lay_out_passes, read_layout
+from rigd.runner import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 

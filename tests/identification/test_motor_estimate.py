@@ -8,13 +8,8 @@ import pytest
 import scipy  # whose parts come on first use
 from cases import further
 
-from rigd.identification._estimate import (
-    EstimateError,
-    Timing,
-    Window,
-    _coverage,
-    estimate_motor,
-)
+from rigd.identification import EstimateError, estimate_motor
+from rigd.identification._estimate import Timing, Window, _coverage
 
 RATE_HZ = 1000.0
 STEPS = 5

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.identification._estimate import MotorEstimate, Quantity
-from rigd.identification._proposal import _rounded, propose
+from rigd.identification import MotorEstimate, propose
+from rigd.identification._estimate import Quantity
+from rigd.identification._proposal import _rounded
 from rigd.profile import load_profile
 
 ESTIMATE = MotorEstimate(

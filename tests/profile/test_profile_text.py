@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from rigd.profile import ProfileError, load_profile
+from rigd.profile import ProfileError, check_new, load_profile, write_new
 from rigd.profile._load import profile_of
-from rigd.profile._write import Setting, check_new, with_head, with_settings, write_new
+from rigd.profile._write import Setting, with_head, with_settings
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.devices._registry import open_devices
+from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
 
 HOST, NODE = 127, 1

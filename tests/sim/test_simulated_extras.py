@@ -7,7 +7,8 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.beam import LoadedBeam, PointForceGrid
-from rigd.sim._plant import OtherClock, SimulatedPlant
+from rigd.sim import SimulatedPlant
+from rigd.sim._plant import OtherClock
 
 TICKS = 12_000
 RATE_HZ = 1000.0

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from shipped_profile import load_shipped
 
 from rigd.beam import Beam, Damping, RealisationError, clamped_free_eigenvalues, realise
-from rigd.sim._plant import SimulatedPlant
+from rigd.sim import SimulatedPlant
 from rigd.sim._stiffness_drift import MOST_DRIFT
 
 RATE_HZ = 1000.0

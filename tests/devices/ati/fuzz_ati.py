@@ -21,9 +21,9 @@ from fakes_ati import (
     record_of,
 )
 
+from rigd.devices.ati import AtiCanSensor
 from rigd.devices.ati import _serial_protocol as modbus
 from rigd.devices.ati._calibration import parse_block
-from rigd.devices.ati._can_sensor import AtiCanSensor
 from rigd.devices.ati._serial_protocol import RECORD_SIZE, SYNC_RECORDS, RecordStream
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile

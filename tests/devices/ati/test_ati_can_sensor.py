@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
+from rigd.devices import SimulatorAddress
+from rigd.devices.ati import AtiCanSensor
 from rigd.devices.ati import _netcanoem as netcanoem
-from rigd.devices.ati._can_sensor import AtiCanSensor
 from rigd.devices.canbus import CanLink
 from rigd.devices.contracts import DeviceError
 

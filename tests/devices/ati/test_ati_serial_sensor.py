@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.ati._serial_sensor import AtiSerialSensor
+from rigd.devices import SimulatorAddress
+from rigd.devices.ati import AtiSerialSensor
 from rigd.devices.ati._serial_setup import SerialLine
 from rigd.devices.contracts import DeviceError
 

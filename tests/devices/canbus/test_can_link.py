@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
+from rigd.devices import SimulatorAddress
 from rigd.devices.canbus import CanLink
 from rigd.devices.canbus._exchange import BusLock
 from rigd.devices.contracts import DeviceError

@@ -10,10 +10,9 @@ from dataclasses import replace
 import can
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.canbus import open_port, pack_frame, unpack_frame
-from rigd.devices.canbus._exchange import CanExchange
-from rigd.devices.canbus._port import PythonCanPort, SocketPort
+from rigd.devices import SimulatorAddress
+from rigd.devices.canbus import CanExchange, SocketPort, open_port, pack_frame, unpack_frame
+from rigd.devices.canbus._port import PythonCanPort
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 

@@ -8,8 +8,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from rigd.devices.canbus import pack_frame, unpack_frame
-from rigd.devices.canbus._port import SocketPort
+from rigd.devices.canbus import SocketPort, pack_frame, unpack_frame
 from rigd.devices.canbus._setup_bus import from_message, to_message
 
 NODE = 5

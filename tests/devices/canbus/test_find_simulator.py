@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress, announce, find_simulator
+from rigd.devices import SimulatorAddress, announce, find_simulator
 from rigd.devices._simulator import runtime_folder as current_folder
 
 

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.canbus._budget import Traffic, bus_load, frame_bits, sum_up, worst_frame_bits
+from rigd.devices.canbus import bus_load
+from rigd.devices.canbus._budget import Traffic, frame_bits, sum_up, worst_frame_bits
 from rigd.profile import load_profile
 
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
+from rigd.devices import SimulatorAddress
 from rigd.devices.canbus import CanLink
-from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.parameters import Acquisition, CanBus, ServoDrive
 from rigd.profile import load_profile
 

@@ -11,9 +11,8 @@ import canopen
 import pytest
 
 import rigd.devices.cia402 as package
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.canbus import CanExchange, open_port
-from rigd.devices.canbus._port import SocketPort
+from rigd.devices import SimulatorAddress
+from rigd.devices.canbus import CanExchange, SocketPort, open_port
 from rigd.devices.cia402._setup import set_up
 from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.contracts import DeviceError

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.checks import Verdict
 from rigd.checks._devices import drive_rows
-from rigd.checks._rows import Verdict
-from rigd.devices.cia402._requirements import Watchdog
+from rigd.devices.cia402 import Watchdog
 from rigd.devices.contracts import DeviceError
 
 READ_ONLY, ABSENT, GENERAL = 0x06010002, 0x06020000, 0x08000000

@@ -5,15 +5,8 @@ import sys
 
 import pytest
 
-from rigd.devices.cia402._requirements import (
-    ACCEPTABLE,
-    CORE,
-    OPTIONAL,
-    REQUIREMENTS,
-    Access,
-    Fit,
-    requirement,
-)
+from rigd.devices.cia402 import ACCEPTABLE
+from rigd.devices.cia402._requirements import CORE, OPTIONAL, REQUIREMENTS, Access, Fit, requirement
 
 
 def test_each_object_stands_there_once():

@@ -8,7 +8,7 @@ from math import tau
 
 import pytest
 
-from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.cia402._requirements import (
     interpolation_time,
     sync_period_us,

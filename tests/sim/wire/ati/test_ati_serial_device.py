@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
 UNLOADED = [612, -1043, 385, 871, -724, 198]

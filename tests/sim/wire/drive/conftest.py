@@ -8,7 +8,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.devices.parameters import ServoDrive
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
 
 NODE = 5

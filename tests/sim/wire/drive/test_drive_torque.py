@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.sim._devices import SimulatedDrive, SimulatedRig
+from rigd.sim import SimulatedRig
+from rigd.sim._devices import SimulatedDrive
 
 RATED_NM = 0.5
 

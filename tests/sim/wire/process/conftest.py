@@ -5,7 +5,7 @@ import struct
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog
 

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.sim.wire._faults import KINDS, FaultError, parse_fault
+from rigd.sim.wire import parse_fault
+from rigd.sim.wire._faults import KINDS, FaultError
 
 whole = st.integers
 sender = st.sampled_from(["drive", "sensor", "host"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress, ask_simulator
+from rigd.devices import SimulatorAddress, ask_simulator
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
 from rigd.sim.wire._faults import EventLog

@@ -14,8 +14,7 @@ import pytest
 import serial
 from cases import further
 
-from rigd.devices import DeviceError
-from rigd.devices._simulator import ask_simulator, find_simulator
+from rigd.devices import DeviceError, ask_simulator, find_simulator
 
 RUN = (
     "import typer\n"

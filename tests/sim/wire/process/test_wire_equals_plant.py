@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.devices._registry import open_devices
-from rigd.devices._simulator import ask_simulator, find_simulator
-from rigd.devices.canbus._budget import bus_load
+from rigd.devices import ask_simulator, find_simulator, open_devices
+from rigd.devices.canbus import bus_load
 from rigd.profile import load_profile
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rigd.devices import Knock, Obstacle
-from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError, parse_fault
+from rigd.sim.wire import parse_fault
+from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError
 
 PERIOD_NS = 1_000_000
 RPDO, POLL = 0x201, 0x680
