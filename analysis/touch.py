@@ -29,9 +29,6 @@ from analysis.validity import record_validity
 from rigd.beam import Damping
 from rigd.session import Session, SessionError, Status, Validity, read_session, readable_texts
 from rigd.touch import (
-    CONTACT_S,
-    FINAL_S,
-    HISTORY_S,
     DetectorSettings,
     FreeBeam,
     Noise,
@@ -40,10 +37,15 @@ from rigd.touch import (
     TouchEstimator,
     TouchModel,
     TouchRecord,
+    watched_beam,
+)
+from rigd.touch.samples import (
+    CONTACT_S,
+    FINAL_S,
+    HISTORY_S,
     around_touch,
     base_shear_n,
     touch_record,
-    watched_beam,
 )
 from rigd.view import nominal_damping
 

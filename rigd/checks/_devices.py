@@ -14,19 +14,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from rigd.checks._rows import Row, Verdict, grade, name_of, value_of
-from rigd.devices import (
-    DeviceError,
-    Devices,
-    RigParameters,
-    WhatMoves,
-    find_simulator,
-    open_devices,
-    reality,
-)
-from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
+from rigd.devices import WhatMoves, open_devices, reality
+from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
+from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.parameters import RigParameters
+from rigd.devices.running_simulator import find_simulator
 from rigd.engine import RealClock
 from rigd.profile import Profile
-from rigd.safety import MEASURED
+from rigd.safety.probing_move import MEASURED
 
 _SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
 """What a drive need not state of its position, and the objects."""

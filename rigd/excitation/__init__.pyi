@@ -7,13 +7,6 @@ from ._experiment_design import expected_precisions as expected_precisions
 from ._experiment_design import next_piece as next_piece
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
-from ._moves import Braking as Braking
-from ._moves import braked as braked
-from ._moves import braking_path as braking_path
-from ._moves import modal_state as modal_state
-from ._moves import quintic as quintic
-from ._moves import slew as slew
-from ._moves import still_path as still_path
 from ._named import FROM_THE_RIG as FROM_THE_RIG
 from ._named import KINDS as KINDS
 from ._named import Value as Value
@@ -34,9 +27,6 @@ from ._signals import hold as hold
 from ._signals import multisine as multisine
 from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
-from ._targets import Precision as Precision
-from ._targets import Target as Target
-from ._targets import parse_target as parse_target
 from ._touch_passes import Approach as Approach
 from ._touch_passes import Pass as Pass
 from ._touch_passes import after_touch as after_touch

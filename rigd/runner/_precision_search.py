@@ -23,10 +23,10 @@ from rigd.excitation import (
     BeamEstimate,
     Piece,
     PrecisionSearch,
-    Target,
     expected_precisions,
     next_piece,
 )
+from rigd.excitation.targets import Target
 from rigd.profile import Profile
 from rigd.runner._planning import LoopPreview
 from rigd.session import Validity

@@ -32,7 +32,7 @@ from rigd.beam import (
     realise_force,
     state_output,
 )
-from rigd.devices import Encounter, Knock, Obstacle
+from rigd.devices.obstacles import Encounter, Knock, Obstacle
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

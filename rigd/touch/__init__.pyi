@@ -12,14 +12,6 @@ from ._innovations import observed_beam as observed_beam
 from ._model import TouchModel as TouchModel
 from ._results import Estimated as Estimated
 from ._results import TouchEstimate as TouchEstimate
-from ._samples import CONTACT_S as CONTACT_S
-from ._samples import FINAL_S as FINAL_S
-from ._samples import FIRST_S as FIRST_S
-from ._samples import HISTORY_S as HISTORY_S
-from ._samples import LOOK_S as LOOK_S
-from ._samples import around_touch as around_touch
-from ._samples import base_shear_n as base_shear_n
-from ._samples import touch_record as touch_record
 from ._sensor_filter import SensorFilter as SensorFilter
 from ._signatures import WatchedBeam as WatchedBeam
 from ._signatures import signatures as signatures

@@ -10,8 +10,9 @@ from cases import further
 
 from rigd.checks import Verdict, overall
 from rigd.checks._devices import inspect_devices
-from rigd.devices import find_simulator, reset_drive
+from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import find_simulator
 
 RUN = """
 import sys

@@ -12,7 +12,8 @@ from rigd.checks import UnknownRowError, Verdict, check_on_paper, overall
 from rigd.checks._check import default_session_rows
 from rigd.checks._gate import PAPER_CHECKS, paper_rows
 from rigd.control import ControlDesignError
-from rigd.devices import MAY_BE_UNKNOWN, DeviceError, open_devices, unknown_values
+from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
+from rigd.devices.contracts import DeviceError
 from rigd.excitation import KINDS, hold
 from rigd.profile import ProfileError, UnknownValueError, load_profile
 from rigd.runner import Rig, RigError, Series, excitation_for

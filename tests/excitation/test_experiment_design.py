@@ -13,11 +13,11 @@ from rigd.excitation import (
     design_excitation,
     information,
     next_piece,
-    parse_target,
 )
 from rigd.excitation._beam_estimate import OF_UNIFORM
 from rigd.excitation._fisher_information import covariance_of
 from rigd.excitation._piece_search import SHARE_OF_LIMITS, largest_factor
+from rigd.excitation.targets import parse_target
 
 RATE_HZ = 1000.0
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

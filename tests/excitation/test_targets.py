@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping, modes
-from rigd.excitation import BeamEstimate, ExcitationError, Target, parse_target
+from rigd.excitation import BeamEstimate, ExcitationError
 from rigd.excitation._beam_estimate import OF_UNIFORM
-from rigd.excitation._targets import Quantities
+from rigd.excitation.targets import Quantities, Target, parse_target
 
 ESTIMATE = BeamEstimate(
     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),

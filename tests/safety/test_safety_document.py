@@ -8,7 +8,7 @@ import pytest
 from rigd.checks._on_paper import travel_rows, worst_travel
 from rigd.profile import load_profile
 from rigd.profile._schema import keys
-from rigd.safety import INTERLOCKS
+from rigd.safety.limits import INTERLOCKS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "safety.md").read_text("utf-8")
 

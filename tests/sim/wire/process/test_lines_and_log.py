@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices import SimulatorAddress, ask_simulator
 from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import SimulatorAddress, ask_simulator
 from rigd.profile import load_profile
 from rigd.sim.wire._faults import EventLog
 from rigd.sim.wire._links import PtyLine, without_transport

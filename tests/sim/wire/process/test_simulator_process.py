@@ -14,7 +14,8 @@ import pytest
 import serial
 from cases import further
 
-from rigd.devices import DeviceError, ask_simulator, find_simulator
+from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import ask_simulator, find_simulator
 
 RUN = (
     "import typer\n"

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.devices import ask_simulator, find_simulator, open_devices
+from rigd.devices import open_devices
 from rigd.devices.canbus import bus_load
+from rigd.devices.running_simulator import ask_simulator, find_simulator
 from rigd.profile import load_profile
 from rigd.sim import SimulatedRig
 

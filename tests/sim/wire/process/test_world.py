@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from rigd.devices import Knock, Obstacle
+from rigd.devices.obstacles import Knock, Obstacle
 from rigd.sim.wire import parse_fault
 from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError
 
