@@ -17,7 +17,7 @@ from rigd.devices.running_simulator import find_simulator
 RUN = """
 import sys
 from rigd.profile import load_profile
-from rigd.sim.wire._simulator import SimulatorOptions, run_simulator
+from rigd.sim.wire import SimulatorOptions, run_simulator
 sys.exit(run_simulator(load_profile(sys.argv[1]).rig, SimulatorOptions(lock_step=True, quiet=True)))
 """
 

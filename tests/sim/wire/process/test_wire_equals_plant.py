@@ -31,7 +31,7 @@ AND_A_DRIFT = (
 RUN = (
     "import sys\n"
     "from rigd.profile import load_profile\n"
-    "from rigd.sim.wire._simulator import SimulatorOptions, run_simulator\n"
+    "from rigd.sim.wire import SimulatorOptions, run_simulator\n"
     "options = SimulatorOptions(lock_step=True, quiet=True)\n"
     "sys.exit(run_simulator(load_profile(sys.argv[1]).rig, options))\n"
 )
