@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks import Verdict, overall
-from rigd.checks._devices import inspect_devices
+from rigd.checks.devices import inspect_devices
+from rigd.checks.rows import Verdict, overall
 from rigd.devices.cia402 import Outfit
 from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError
@@ -90,7 +90,7 @@ def test_devices_that_cannot_be_opened(can_profile, monkeypatch):
     def refuse(rig):
         raise DeviceError("a simulated rig is running, and the hardware is here too")
 
-    monkeypatch.setattr("rigd.checks._devices.open_devices", refuse)
+    monkeypatch.setattr("rigd.checks.devices.open_devices", refuse)
     assert inspect_devices(can_profile)[-1].verdict is Verdict.FAIL
 
 

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigd.beam import Beam, RealisationError, undamped_frequencies_rad_s
-from rigd.checks._rows import Row, Verdict, grade
+from rigd.checks.rows import Row, Verdict, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.devices import MAY_BE_UNKNOWN, unknown_values
 from rigd.devices.parameters import RigParameters
