@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from analysis.identify import Plant, mode_poles
 from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping, LoadedBeam, modes, tip_motion
-from rigd.excitation import BeamEstimate, chirp, expected_precisions
+from rigd.excitation import BeamEstimate, chirp
+from rigd.excitation.experiment_design import expected_precisions
 from rigd.excitation.targets import parse_target
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview

@@ -1,4 +1,3 @@
-from ._registry import UnknownDeviceError as UnknownDeviceError
 from ._registry import WhatMoves as WhatMoves
 from ._registry import check_selection as check_selection
 from ._registry import objections as objections

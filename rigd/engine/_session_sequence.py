@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigd.control import VibrationDamper
+from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
 from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._ipc import Parent

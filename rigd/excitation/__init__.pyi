@@ -1,10 +1,5 @@
 from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
-from ._experiment_design import Design as Design
-from ._experiment_design import DesignRig as DesignRig
-from ._experiment_design import design_excitation as design_excitation
-from ._experiment_design import expected_precisions as expected_precisions
-from ._experiment_design import next_piece as next_piece
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
 from ._named import FROM_THE_RIG as FROM_THE_RIG
@@ -15,7 +10,6 @@ from ._narrow_sweeps import modes as modes
 from ._piece_search import SHORTEST_S as SHORTEST_S
 from ._piece_search import Forecast as Forecast
 from ._piece_search import Piece as Piece
-from ._shortest_move import Move as Move
 from ._shortest_move import MovePlant as MovePlant
 from ._shortest_move import move as move
 from ._shortest_move import shortest_braking as shortest_braking

@@ -1,6 +1,6 @@
 """Search for the next piece of excitation: sweeps, what they tell, and the limits they keep.
 
-See `rigd.excitation._experiment_design`, which it serves.
+See `rigd.excitation.experiment_design`, which it serves.
 """
 
 from collections.abc import Collection

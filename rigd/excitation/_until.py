@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, Beam, undamped_frequencies_rad_s
 from rigd.excitation._beam_estimate import BeamEstimate
-from rigd.excitation._experiment_design import DesignRig, geometry_floors
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -23,6 +22,7 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
+from rigd.excitation.experiment_design import DesignRig, geometry_floors
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import QUANTITIES, Target, parse_target
 from rigd.units import with_share

@@ -7,7 +7,6 @@ from ._free_motion import FreeBeam as FreeBeam
 from ._free_motion import TouchRecord as TouchRecord
 from ._innovations import InnovationFilter as InnovationFilter
 from ._innovations import Noise as Noise
-from ._innovations import ObservedBeam as ObservedBeam
 from ._innovations import observed_beam as observed_beam
 from ._model import TouchModel as TouchModel
 from ._results import Estimated as Estimated

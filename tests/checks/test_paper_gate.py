@@ -15,7 +15,7 @@ from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
 from rigd.devices.contracts import DeviceError
 from rigd.errors import UserError
 from rigd.excitation import KINDS, hold
-from rigd.profile import ProfileError, UnknownValueError, load_profile
+from rigd.profile import ProfileError, load_profile
 from rigd.runner import Rig, RigError, Series, excitation_for
 from rigd.testing import write_profile
 
@@ -197,9 +197,9 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
     assert (failed.what, failed.name) == (key, "unknown_values")
     assert str(path) in failed.detail
     assert MAY_BE_UNKNOWN[key] in failed.detail
-    with pytest.raises(UnknownValueError, match=key):
+    with pytest.raises(UserError, match=key):
         Series(profile, hold(rate_hz=1000.0), tmp_path / "out")
-    with pytest.raises(UnknownValueError, match=key):
+    with pytest.raises(UserError, match=key):
         excitation_for(profile, "move", {"angle_rad": 0.1})
     with pytest.raises(DeviceError, match=key):
         open_devices(profile.rig)
@@ -256,7 +256,7 @@ def test_every_excitation_is_refused(unknown, tmp_path):
         needed = {name: value for name, value in given.items() if name in known}
         if kind in ("file", "modes"):
             continue  # read a file first
-        with pytest.raises(UnknownValueError, match="inertia_kg_m2"):
+        with pytest.raises(UserError, match="inertia_kg_m2"):
             Series(profile, excitation_for(profile, kind, needed), tmp_path)
 
 

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.control import close_loop, design_damper
+from rigd.control import close_loop
+from rigd.control.damper import design_damper
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine._messages import Ending

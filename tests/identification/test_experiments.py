@@ -8,15 +8,16 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
-from rigd.identification import (
-    EstimateError,
-    _records,
+from rigd.identification import _records, read_recording
+from rigd.identification.estimate import EstimateError
+from rigd.identification.experiments import (
+    Pass,
+    lay_out_passes,
     multisine_session,
-    read_recording,
+    read_layout,
     speeds_session,
     trial_session,
 )
-from rigd.identification._experiments import Pass, lay_out_passes, read_layout
 from rigd.runner import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)

@@ -13,16 +13,16 @@ from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine import Cycle, make_observers, make_watch
-from rigd.identification import (
-    cautious,
-    estimate_motor,
+from rigd.identification import cautious, tuned
+from rigd.identification.estimate import Timing, Window, estimate_motor
+from rigd.identification.experiments import (
+    TOP_HZ,
+    lay_out_passes,
     multisine_session,
+    read_layout,
     speeds_session,
     trial_session,
-    tuned,
 )
-from rigd.identification._estimate import Timing, Window
-from rigd.identification._experiments import TOP_HZ, lay_out_passes, read_layout
 from rigd.profile import load_profile
 
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}

@@ -8,8 +8,7 @@ import pytest
 import scipy  # whose parts come on first use
 from cases import further
 
-from rigd.identification import EstimateError, estimate_motor
-from rigd.identification._estimate import Timing, Window, _coverage
+from rigd.identification.estimate import EstimateError, Timing, Window, _coverage, estimate_motor
 
 RATE_HZ = 1000.0
 STEPS = 5

@@ -262,7 +262,8 @@ def design_excitation(
     --------
     >>> import numpy as np
     >>> from rigd.beam import Beam, Damping
-    >>> from rigd.excitation import BeamEstimate, design_excitation
+    >>> from rigd.excitation import BeamEstimate
+    >>> from rigd.excitation.experiment_design import design_excitation
     >>> from rigd.excitation.targets import parse_target
     >>> from rigd.profile import load_profile
     >>> from rigd.runner import LoopPreview
