@@ -30,9 +30,6 @@ from rigd.beam import Damping
 from rigd.session import Session, SessionError, Validity, read_session, readable_texts
 from rigd.session.layout import Status
 from rigd.touch import (
-    CONTACT_S,
-    FINAL_S,
-    HISTORY_S,
     DetectorSettings,
     FreeBeam,
     Noise,
@@ -41,10 +38,15 @@ from rigd.touch import (
     TouchEstimator,
     TouchModel,
     TouchRecord,
+    watched_beam,
+)
+from rigd.touch.samples import (
+    CONTACT_S,
+    FINAL_S,
+    HISTORY_S,
     around_touch,
     base_shear_n,
     touch_record,
-    watched_beam,
 )
 from rigd.view import nominal_damping
 

@@ -25,21 +25,12 @@ from numpy.typing import NDArray
 from analysis.identify import Measurement, Plant, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam.tip import tip_motion
-from rigd.excitation import (
-    BeamEstimate,
-    Piece,
-    Precision,
-    Target,
-    chirp,
-    information,
-    modes,
-    next_piece,
-    parse_target,
-)
+from rigd.excitation import BeamEstimate, Piece, chirp, information, modes
 from rigd.excitation._beam_estimate import OF_UNIFORM
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of
 from rigd.excitation._piece_search import PieceSearch
-from rigd.excitation._targets import Quantities
+from rigd.excitation.experiment_design import next_piece
+from rigd.excitation.targets import Precision, Quantities, Target, parse_target
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview
 

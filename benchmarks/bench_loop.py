@@ -17,7 +17,7 @@ from pathlib import Path
 from rigd.bench import HELD, HIGHEST_HZ, Figures, Measurement, core_of, cores_beside, figures
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.checks import settings_granted
+from rigd.checks.machine import settings_granted
 from rigd.profile import load_profile
 from rigd.runtime import use_one_thread
 

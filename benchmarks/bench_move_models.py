@@ -23,7 +23,7 @@ import numpy as np
 from bench_moves import left_nm
 
 from rigd.errors import UserError
-from rigd.excitation import quintic
+from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
 from rigd.runner import excitation_for
 from rigd.session import read_session

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import LoadedBeam, clamped_free_eigenvalues, poles
-from rigd.excitation import quintic
+from rigd.excitation.moves import quintic
 from rigd.profile import Profile, load_profile
 from rigd.runner import excitation_for, plan_session
 from rigd.session import read_session

@@ -19,20 +19,14 @@ import numpy as np
 
 from rigd.engine import probed_rig
 from rigd.profile import load_profile
-from rigd.safety import (
-    ProbeEnd,
-    ProbeEstimate,
-    ProbingMove,
-    contradiction,
-    estimate_probe,
-    plan_probe,
-)
+from rigd.safety.probe_estimate import ProbeEstimate, contradiction, estimate_probe
+from rigd.safety.probing_move import ProbeEnd, ProbingMove, plan_probe
 from rigd.sim import SimulatedPlant
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rigd.devices import RigParameters
+    from rigd.devices.parameters import RigParameters
     from rigd.profile import Profile
 
 LONGEST_TICKS = 30_000

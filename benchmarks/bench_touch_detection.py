@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.control import PidController, design_pid
-from rigd.excitation import chirp, slew, still_path
+from rigd.excitation import chirp
+from rigd.excitation.moves import slew, still_path
 from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview

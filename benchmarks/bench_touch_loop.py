@@ -21,7 +21,7 @@ import numpy as np
 from rigd.bench import Figures, Measurement, figures, measurement
 from rigd.bench import _loops as loops
 from rigd.bench._measure import UsageMeter
-from rigd.checks import settings_granted
+from rigd.checks.machine import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
 from rigd.runner import LoopPreview, Order, SessionProgress

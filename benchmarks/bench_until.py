@@ -29,7 +29,9 @@ from numpy.typing import NDArray
 from analysis.identify import Plant, mode_poles
 from rigd.beam import Beam, Damping, LoadedBeam, modes
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
-from rigd.excitation import BeamEstimate, chirp, expected_precisions, parse_target
+from rigd.excitation import BeamEstimate, chirp
+from rigd.excitation.experiment_design import expected_precisions
+from rigd.excitation.targets import parse_target
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview
 

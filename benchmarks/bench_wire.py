@@ -24,10 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.devices import SimulatorAddress, Wrench, WrenchSensor, find_simulator
 from rigd.devices.ati import AtiCanSensor, AtiSerialSensor
-from rigd.devices.canbus import CanExchange, SocketPort
+from rigd.devices.canbus import CanExchange
+from rigd.devices.canbus.port import SocketPort
 from rigd.devices.cia402 import Cia402Drive
+from rigd.devices.contracts import Wrench, WrenchSensor
+from rigd.devices.running_simulator import SimulatorAddress, find_simulator
 from rigd.engine import collect_no_garbage, obtain
 from rigd.profile import load_profile
 

@@ -9,7 +9,7 @@ profile can name.
 import math
 from collections.abc import Callable
 
-from rigd.devices import Devices, LineHealth, Wrench
+from rigd.devices.contracts import Devices, LineHealth, Wrench
 
 INERTIA_KG_M2, FRICTION_NM_S = 3.5e-3, 7e-3
 

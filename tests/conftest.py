@@ -239,7 +239,7 @@ def run_here(app, *arguments) -> Done:
 @pytest.fixture
 def start_simulator(runtime_folder, tmp_path):
     """Start `rigd simulate` for a profile and wait until it can be found."""
-    from rigd.devices._simulator import find_simulator
+    from rigd.devices.running_simulator import find_simulator
     from rigd.profile import load_profile
 
     started = []

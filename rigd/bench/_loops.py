@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from rigd.bench._measure import Measurement, UsageMeter, measurement
-from rigd.devices import Selection, unknown_values
+from rigd.devices import unknown_values
+from rigd.devices.parameters import Selection
 from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold

@@ -1,9 +1,9 @@
 """``rigd check``: everything that can be known of a rig before a torque acts, in rows.
 
-Offers the whole check (`check_rig`), its part that every session asks for (`check_on_paper`), the
-check of an EDS file alone (`eds_rows`), and the rows with their verdict (`Row`, `Verdict`,
-`print_table`). In this order: what profile and EDS show (`_on_paper`, listed in `_gate`), this
-computer (`_machine`), the devices (`_devices`). No torque is ever commanded.
+Offers the whole check (`check_rig`) and its part that every session asks for (`check_on_paper`). In
+this order: what profile and EDS file show (module `on_paper`, its functions listed in `_gate`),
+this computer (`machine`), the devices (`devices`). Each is a list of `rows.Row`, with their
+verdict. No torque is ever commanded.
 """
 
 import lazy_loader as lazy

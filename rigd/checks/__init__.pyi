@@ -1,16 +1,6 @@
 from ._check import check_beside as check_beside
 from ._check import check_rig as check_rig
 from ._gate import ACCEPTABLE as ACCEPTABLE
-from ._gate import CheckFailedError as CheckFailedError
 from ._gate import Clearance as Clearance
 from ._gate import FailedCheck as FailedCheck
-from ._gate import UnknownRowError as UnknownRowError
 from ._gate import check_on_paper as check_on_paper
-from ._machine import settings_granted as settings_granted
-from ._on_paper import eds_rows as eds_rows
-from ._rows import OF_A_RIG as OF_A_RIG
-from ._rows import OF_AN_EDS as OF_AN_EDS
-from ._rows import Row as Row
-from ._rows import Verdict as Verdict
-from ._rows import overall as overall
-from ._rows import print_table as print_table

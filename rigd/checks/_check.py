@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rigd.checks._devices import calibration_rows, inspect_devices
 from rigd.checks._gate import paper_rows
-from rigd.checks._machine import machine_rows, rights_rows
-from rigd.checks._on_paper import wiring_rows
-from rigd.checks._rows import Row, Verdict, grade
+from rigd.checks.devices import calibration_rows, inspect_devices
+from rigd.checks.machine import machine_rows, rights_rows
+from rigd.checks.on_paper import wiring_rows
+from rigd.checks.rows import Row, Verdict, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from rigd.checks import _on_paper as paper
-from rigd.checks._rows import Row, Verdict
+from rigd.checks import on_paper as paper
+from rigd.checks.rows import Row, Verdict
 from rigd.devices import unknown_values
 from rigd.errors import FailureError, UserError
 from rigd.profile import Profile

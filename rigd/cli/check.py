@@ -14,7 +14,7 @@ from rigd.runtime import raise_on
 
 if TYPE_CHECKING:
     from rigd.bench import Results
-    from rigd.checks import Row
+    from rigd.checks.rows import Row
     from rigd.profile import Profile
 
 
@@ -51,7 +51,7 @@ def check(
 
 
 def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
-    from rigd.checks import eds_rows
+    from rigd.checks.on_paper import eds_rows
 
     if profile is None:
         return list(eds_rows(eds, None))
@@ -66,14 +66,15 @@ def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
 
 
 def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
-    from rigd.checks import overall
+    from rigd.checks.rows import overall
 
     verdict = overall(rows)
     if as_json:
         document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
-        from rigd.checks import ACCEPTABLE, OF_A_RIG, OF_AN_EDS, Verdict, print_table
+        from rigd.checks import ACCEPTABLE
+        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, Verdict, print_table
 
         print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
         failed = {row.name for row in rows if row.verdict is Verdict.FAIL}

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rigd.excitation import Excitation
-    from rigd.identification import MotorEstimate, Proposal
+    from rigd.identification import Proposal
+    from rigd.identification.estimate import MotorEstimate
     from rigd.profile import Profile
 
     Session = Callable[..., Excitation]
@@ -134,13 +135,8 @@ def _run_sessions(
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
     stop, group = start_processes(live=False)
-    from rigd.identification import (
-        cautious,
-        multisine_session,
-        speeds_session,
-        trial_session,
-        tuned,
-    )
+    from rigd.identification import cautious, tuned
+    from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
 
@@ -188,7 +184,8 @@ def _run_sessions(
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
-    from rigd.identification import estimate_motor, propose, read_recording
+    from rigd.identification import propose, read_recording
+    from rigd.identification.estimate import estimate_motor
 
     profile = profile_named(profile_name)
     recording = read_recording(files, profile.rig.actuation.delay_s)

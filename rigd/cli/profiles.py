@@ -135,7 +135,7 @@ def new(
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
-    from rigd.devices import read_eds
+    from rigd.devices.eds import read_eds
     from rigd.profile import Draft, check_new, write_new
 
     base = profile_named(start_from)

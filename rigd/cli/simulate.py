@@ -57,7 +57,7 @@ def simulate(
     )
     rig = profile_named(profile).rig
     if obstacle:
-        from rigd.devices import with_obstacles
+        from rigd.devices.obstacles import with_obstacles
 
         rig = with_obstacles(rig, obstacle)
     if seed is not None and rig.simulation is not None:

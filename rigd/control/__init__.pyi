@@ -4,17 +4,11 @@ from ._closed_loop import LoopResponse as LoopResponse
 from ._closed_loop import check_stability as check_stability
 from ._closed_loop import close_loop as close_loop
 from ._closed_loop import stable_loop as stable_loop
-from ._damper import DamperSettings as DamperSettings
-from ._damper import VibrationDamper as VibrationDamper
-from ._damper import damped_poles as damped_poles
-from ._damper import design_damper as design_damper
 from ._friction import Disturbances as Disturbances
-from ._friction import DisturbedResponse as DisturbedResponse
 from ._friction import simulate_disturbed as simulate_disturbed
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._pid import ControlDesignError as ControlDesignError
 from ._pid import ControlSettings as ControlSettings
 from ._pid import PidController as PidController
-from ._pid import PidGains as PidGains
 from ._pid import design_pid as design_pid

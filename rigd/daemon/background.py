@@ -105,7 +105,8 @@ class CheckJob:
 
     def perform(self) -> dict[str, Any]:
         """Return the rows and the verdict as the reply has them."""
-        from rigd.checks import check_beside, overall
+        from rigd.checks import check_beside
+        from rigd.checks.rows import overall
 
         rows = check_beside(self.profile, self.calibration)
         return {

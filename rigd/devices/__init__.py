@@ -1,9 +1,10 @@
 """Devices that the loop talks to: contracts, their parameters, and the registry of drivers.
 
-Offers the contracts (`Devices`, `WrenchSensor`, `DeviceError`), a rig's parameters
-(`RigParameters`), the opening of what a profile names (`open_devices`), a running simulation of it
-(`find_simulator`) and EDS files (`read_eds`). The drivers are in `canbus`, `cia402` and `ati`, the
-simulated devices in `rigd.sim`. Nothing here knows of sessions, limits or the controller.
+Offers the opening of the devices that a profile names (`open_devices`) and what will move
+(`reality`). Public modules: `contracts` (`Devices`, `WrenchSensor`, `DeviceError`), `parameters`
+(`RigParameters`), `running_simulator` (the address of ``rigd simulate``), `obstacles` and `eds`
+(EDS files). The drivers are in `canbus`, `cia402` and `ati`, the simulated devices in `rigd.sim`.
+Nothing here knows of sessions, limits or the controller.
 """
 
 import lazy_loader as lazy

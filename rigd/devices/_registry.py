@@ -7,10 +7,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import cast
 
-from rigd.devices._simulator import differences, find_simulator
 from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters, Selection
+from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
 
 # Drive and sensor share a plant or a bus, so drivers are opened by the pair.

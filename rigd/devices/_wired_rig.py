@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from rigd.devices._registry import WhatMoves, objections, open_devices
-from rigd.devices._simulator import SimulatorAddress, ask_simulator, find_simulator
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
+from rigd.devices.running_simulator import SimulatorAddress, ask_simulator, find_simulator
 
 _LOCK_STEP_PATIENCE_US = 0.5e6
 """In lock-step the simulated rig waits for the replies, so a tick can wait for them too."""

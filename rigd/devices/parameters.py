@@ -135,7 +135,7 @@ class Simulation:
     )
     """The same of the bending stiffness."""
     obstacles: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """What the beam meets, each as `rigd.devices.parse_obstacle` reads it."""
+    """What the beam meets, each as `rigd.devices.obstacles.parse_obstacle` reads it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,7 @@ class ServoDrive:
     """Manufacturer-specific objects written at the start, each ``"index:sub type value"``; see
     `rigd.devices.cia402`."""
     accept_without: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """What this drive may lack, by names of `rigd.devices.cia402.ACCEPTABLE`."""
+    """What this drive may lack, by names of `rigd.devices.cia402.requirements.ACCEPTABLE`."""
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
     """After how long the drive's own watchdog takes the torque off when SYNC and RPDO stay
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
@@ -287,7 +287,7 @@ class AtiSerial:
 
         Examples
         --------
-        >>> from rigd.devices import AtiSerial
+        >>> from rigd.devices.parameters import AtiSerial
         >>> sensor = AtiSerial("/dev/ttyUSB0", 1_250_000, 3000.0, "triangle", 1, "", 32767)
         >>> [round(9 * weight) for weight in sensor.weights(rate_hz=1000)]
         [1, 2, 3, 2, 1]

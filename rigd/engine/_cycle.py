@@ -19,19 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.control import PidController
-from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
+from rigd.devices.contracts import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import UnsafeFolderError, runtime_folder
-from rigd.safety import (
-    BY_NAME,
-    BeamPrediction,
-    EncoderWatch,
-    LimitWatch,
-    ScaleWatch,
-    SensorWatch,
-    Violation,
-)
+from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, ScaleWatch, SensorWatch
+from rigd.safety.limits import BY_NAME, Violation
 from rigd.session.layout import WRENCH_FIELDS, Status
 
 REMEDY = (

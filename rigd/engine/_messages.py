@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
-    from rigd.control import DamperSettings
+    from rigd.control.damper import DamperSettings
     from rigd.devices import WhatMoves
     from rigd.engine._reference import ReferenceSpec
     from rigd.engine._topics import ChannelSpecs

@@ -17,7 +17,8 @@ from rigd.engine._timing import Clock, TickScheduler
 from rigd.engine._topics import Channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
-from rigd.safety import ProbingMove, estimate_probe, plan_probe
+from rigd.safety.probe_estimate import estimate_probe
+from rigd.safety.probing_move import ProbingMove, plan_probe
 
 if TYPE_CHECKING:
     from rigd.control import PidController
@@ -52,7 +53,7 @@ class ProbeSequence(SessionSequence):
         Returns
         -------
         dict
-            ``end``: why it ended, and the fields of a `rigd.safety.ProbeEstimate`.
+            ``end``: why it ended, and the fields of a `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """Data of a profile for its probing move; imports nothing heavy, for the supervisor uses it too."""
 
 from rigd.profile import Profile
-from rigd.safety import ProbedRig
+from rigd.safety.probing_move import ProbedRig
 
 
 def probed_rig(profile: Profile) -> ProbedRig:

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from math import isfinite
 
-from rigd.devices import Devices, LineHealth
+from rigd.devices.contracts import Devices, LineHealth
 from rigd.engine._cycle import Cycle
 from rigd.engine._ipc import Pulse
 from rigd.engine._ring import Ring

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigd.control import VibrationDamper
-from rigd.devices import DeviceError
+from rigd.control.damper import VibrationDamper
+from rigd.devices.contracts import DeviceError
 from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._ipc import Parent
 from rigd.engine._messages import Ending
@@ -29,10 +29,11 @@ from rigd.engine._timing import (
     TickScheduler,
 )
 from rigd.engine._topics import Channels
-from rigd.excitation import quintic, still_path
+from rigd.excitation.moves import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
-from rigd.safety import BY_NAME, LOOK_EVERY, OVERLOADED
+from rigd.safety import LOOK_EVERY
+from rigd.safety.limits import BY_NAME, OVERLOADED
 
 if TYPE_CHECKING:
     from rigd.engine._touch_watch import TouchWatch

@@ -10,7 +10,7 @@ from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
 from rigd.engine._shared_state import EVENT_SIZE, SharedState, Stop, Word
-from rigd.safety import BUFFERED_S
+from rigd.safety.limits import BUFFERED_S
 from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 # Topics

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
-from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
+from rigd.devices import open_devices
+from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
 from rigd.engine._cycle import (
     Cycle,

@@ -20,15 +20,13 @@ from rigd.engine._shared_state import Word
 from rigd.engine._topics import attach_channels
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.layout import Status, decode_samples
-from rigd.touch import (
+from rigd.touch import GrowingEstimate, TouchEstimator, TouchRecord
+from rigd.touch.samples import (
     CONTACT_S,
     FINAL_S,
     FIRST_S,
     HISTORY_S,
     LOOK_S,
-    GrowingEstimate,
-    TouchEstimator,
-    TouchRecord,
     around_touch,
     touch_record,
 )

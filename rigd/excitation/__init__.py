@@ -3,8 +3,8 @@
 A reference is relative to the angle at which the session starts. Every excitation has the same
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). Offers a
 function per kind (`chirp` … `from_csv`, `modes`, `move`) and `make_excitation` for one by its name;
-beside them what moves are made of (`shortest_move`, `slew`, `still_path`, `braking_path`). Whether
-a rig can follow a reference is not known here: `rigd.runner` predicts it.
+the module `moves` has the paths that moves consist of, `targets` the precisions to search for.
+Whether a rig can follow a reference is not known here: `rigd.runner` predicts it.
 """
 
 import lazy_loader as lazy

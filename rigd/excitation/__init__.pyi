@@ -1,19 +1,7 @@
 from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
-from ._experiment_design import Design as Design
-from ._experiment_design import DesignRig as DesignRig
-from ._experiment_design import design_excitation as design_excitation
-from ._experiment_design import expected_precisions as expected_precisions
-from ._experiment_design import next_piece as next_piece
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
-from ._moves import Braking as Braking
-from ._moves import braked as braked
-from ._moves import braking_path as braking_path
-from ._moves import modal_state as modal_state
-from ._moves import quintic as quintic
-from ._moves import slew as slew
-from ._moves import still_path as still_path
 from ._named import FROM_THE_RIG as FROM_THE_RIG
 from ._named import KINDS as KINDS
 from ._named import Value as Value
@@ -22,7 +10,6 @@ from ._narrow_sweeps import modes as modes
 from ._piece_search import SHORTEST_S as SHORTEST_S
 from ._piece_search import Forecast as Forecast
 from ._piece_search import Piece as Piece
-from ._shortest_move import Move as Move
 from ._shortest_move import MovePlant as MovePlant
 from ._shortest_move import move as move
 from ._shortest_move import shortest_braking as shortest_braking
@@ -34,9 +21,6 @@ from ._signals import hold as hold
 from ._signals import multisine as multisine
 from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
-from ._targets import Precision as Precision
-from ._targets import Target as Target
-from ._targets import parse_target as parse_target
 from ._touch_passes import Approach as Approach
 from ._touch_passes import Pass as Pass
 from ._touch_passes import after_touch as after_touch

@@ -1,6 +1,6 @@
 """Search for the next piece of excitation: sweeps, what they tell, and the limits they keep.
 
-See `rigd.excitation._experiment_design`, which it serves.
+See `rigd.excitation.experiment_design`, which it serves.
 """
 
 from collections.abc import Collection
@@ -20,10 +20,10 @@ from rigd.excitation._fisher_information import (
     responses,
     whitened_kernels,
 )
-from rigd.excitation._moves import quintic
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import SHARE_OF_LIMITS, ExcitationError
-from rigd.excitation._targets import Precision, Quantities
+from rigd.excitation.moves import quintic
+from rigd.excitation.targets import Precision, Quantities
 
 Real = NDArray[np.float64]
 

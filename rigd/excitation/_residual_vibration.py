@@ -7,7 +7,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._moves import ROBUST_BELOW_HZ
+from rigd.excitation.moves import ROBUST_BELOW_HZ
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

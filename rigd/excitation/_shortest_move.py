@@ -15,16 +15,6 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._moves import (
-    ROBUST_BELOW_HZ,
-    Braking,
-    braked,
-    braking_path,
-    from_acceleration,
-    modal_state,
-    quintic,
-    zero_rows,
-)
 from rigd.excitation._residual_vibration import predict_end
 from rigd.excitation._signals import (
     SHARE_OF_LIMITS,
@@ -34,6 +24,16 @@ from rigd.excitation._signals import (
     finite,
     lay_out_segments,
     within_a_turn,
+)
+from rigd.excitation.moves import (
+    ROBUST_BELOW_HZ,
+    Braking,
+    braked,
+    braking_path,
+    from_acceleration,
+    modal_state,
+    quintic,
+    zero_rows,
 )
 from rigd.identified_beam import MOVE, IdentifiedBeam, Use
 

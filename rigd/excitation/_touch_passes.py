@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._moves import Braking, slew, still_path
 from rigd.excitation._shortest_move import MoveRig, shortest_braking
 from rigd.excitation._signals import (
     Excitation,
@@ -26,6 +25,7 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
+from rigd.excitation.moves import Braking, slew, still_path
 from rigd.identified_beam import TOUCH
 
 Real = NDArray[np.float64]

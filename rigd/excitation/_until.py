@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
-from rigd.excitation._experiment_design import DesignRig, geometry_floors
-from rigd.excitation._moves import quintic
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -25,7 +23,9 @@ from rigd.excitation._signals import (
     positive,
     within_a_turn,
 )
-from rigd.excitation._targets import QUANTITIES, Target, parse_target
+from rigd.excitation.experiment_design import DesignRig, geometry_floors
+from rigd.excitation.moves import quintic
+from rigd.excitation.targets import QUANTITIES, Target, parse_target
 from rigd.units import with_share
 
 Real = NDArray[np.float64]
@@ -120,7 +120,7 @@ def until(
         Ticks a second.
     targets
         Standard deviations to be reached: one or several of ``QUANTITY STD``, such as
-        ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.parse_target`.
+        ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.targets.parse_target`.
     at_most_s
         Longest record.
     tip_slope_rad

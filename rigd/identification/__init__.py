@@ -1,9 +1,9 @@
 """Identification of the motor from recorded sessions: experiments, estimate, proposal.
 
-Offers the sessions that identify a motor (`trial_session`, `multisine_session`, `speeds_session`),
-the estimate of inertia, friction, torque scale and delay (`estimate_motor`) and what it proposes
-for the profile (`propose`). It runs no session: ``rigd identify`` does. The beam is identified by
-the analyser, from other sessions.
+Offers the reading of recorded sessions (`read_recording`) and the proposal for the profile
+(`propose`). Public modules: `experiments` (the sessions that identify a motor) and `estimate`
+(inertia, friction, torque scale and delay). It runs no session: ``rigd identify`` does. The beam is
+identified by the analyser, from other sessions.
 """
 
 import lazy_loader as lazy

@@ -1,9 +1,3 @@
-from ._estimate import EstimateError as EstimateError
-from ._estimate import MotorEstimate as MotorEstimate
-from ._estimate import estimate_motor as estimate_motor
-from ._experiments import multisine_session as multisine_session
-from ._experiments import speeds_session as speeds_session
-from ._experiments import trial_session as trial_session
 from ._proposal import Proposal as Proposal
 from ._proposal import cautious as cautious
 from ._proposal import propose as propose

@@ -5,7 +5,7 @@ from math import floor, inf, log10
 from typing import Any
 
 from rigd.control import ControlDesignError, check_stability, close_loop
-from rigd.identification._estimate import MotorEstimate, Quantity
+from rigd.identification.estimate import MotorEstimate, Quantity
 from rigd.profile import Profile
 from rigd.units import unit_of
 

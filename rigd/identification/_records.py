@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.identification._estimate import EstimateError, Timing, Window
-from rigd.identification._experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
+from rigd.identification.estimate import EstimateError, Timing, Window
+from rigd.identification.experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
 from rigd.session import Session, read_session, sample_digests
 from rigd.session.layout import Status
 

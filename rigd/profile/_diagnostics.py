@@ -14,20 +14,21 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
-from rigd.devices import (
-    MAY_BE_UNKNOWN,
+from rigd.devices import MAY_BE_UNKNOWN
+from rigd.devices.ati import RECORD_BITS
+from rigd.devices.cia402 import parse_assignment
+from rigd.devices.cia402.requirements import ACCEPTABLE
+from rigd.devices.obstacles import (
     NOT_BESIDE_FORCES,
     NOT_BESIDE_OBSTACLES,
-    AtiSerial,
     ObstacleError,
     check_obstacles,
     parse_obstacle,
 )
-from rigd.devices.ati import RECORD_BITS
-from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
+from rigd.devices.parameters import AtiSerial
 from rigd.printable import printable
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
-from rigd.safety import BUFFERED_S
+from rigd.safety.limits import BUFFERED_S
 from rigd.session.user_metadata import NOTES, MetadataError, check_name
 from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 

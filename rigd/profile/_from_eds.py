@@ -10,17 +10,11 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from rigd.devices import MAY_BE_UNKNOWN, Eds
-from rigd.devices.cia402 import (
-    MAX_SPEED_RPM,
-    RATED_TORQUE,
-    TORQUE_FEEDBACK,
-    TORQUE_LIMIT,
-    WATCHDOG,
-    Finding,
-    Grade,
-    judge,
-)
+from rigd.devices import MAY_BE_UNKNOWN
+from rigd.devices.cia402 import Finding, Grade, judge
+from rigd.devices.cia402.objects import MAX_SPEED_RPM, RATED_TORQUE
+from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
+from rigd.devices.eds import Eds
 from rigd.errors import FailureError
 from rigd.profile._load import ProfileError, profile_of
 from rigd.profile._schema import UNKNOWN, Profile, keys

@@ -17,7 +17,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd import documents
-from rigd.devices import MAY_BE_UNKNOWN, RigParameters
+from rigd.devices import MAY_BE_UNKNOWN
+from rigd.devices.parameters import RigParameters
 from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics

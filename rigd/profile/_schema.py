@@ -10,7 +10,9 @@ from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.beam import Beam, Damping
 from rigd.control import ControlSettings, LoopModel
-from rigd.devices import (
+from rigd.devices import describe_unknown_values
+from rigd.devices.parameters import (
+    OPTIONAL,
     Acquisition,
     Actuation,
     AtiCan,
@@ -22,11 +24,10 @@ from rigd.devices import (
     Selection,
     ServoDrive,
     Simulation,
-    describe_unknown_values,
+    WrenchSensor,
 )
-from rigd.devices.parameters import OPTIONAL, WrenchSensor
 from rigd.errors import UserError
-from rigd.safety import Limits
+from rigd.safety.limits import Limits
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,13 +15,8 @@ from rigd.beam import Beam, LoadedBeam
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import Clearance, check_on_paper
-from rigd.control import (
-    ClosedLoop,
-    ControlDesignError,
-    LoopResponse,
-    design_damper,
-    stable_loop,
-)
+from rigd.control import ClosedLoop, ControlDesignError, LoopResponse, stable_loop
+from rigd.control.damper import design_damper
 from rigd.engine import Ending
 from rigd.errors import UserError
 from rigd.excitation import (

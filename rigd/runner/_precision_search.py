@@ -16,17 +16,9 @@ from numpy.typing import NDArray
 
 from rigd.engine import FitTold, PieceTold, PieceWriter, SearchEnded
 from rigd.errors import RigdError
-from rigd.excitation import (
-    BAND_HZ,
-    PAUSE_S,
-    SHORTEST_S,
-    BeamEstimate,
-    Piece,
-    PrecisionSearch,
-    Target,
-    expected_precisions,
-    next_piece,
-)
+from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, Piece, PrecisionSearch
+from rigd.excitation.experiment_design import expected_precisions, next_piece
+from rigd.excitation.targets import Target
 from rigd.profile import Profile
 from rigd.runner._planning import LoopPreview
 from rigd.session import Validity

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from rigd.devices import WhatMoves, described, find_simulator, what_moves
+from rigd.devices import WhatMoves, what_moves
+from rigd.devices.running_simulator import described, find_simulator
 from rigd.engine import probed_rig
 from rigd.errors import FailureError
 from rigd.profile import Profile
@@ -20,7 +21,8 @@ from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import load_rig
 from rigd.runner._rig import Rig
 from rigd.runtime import RigLock, StopRequest, runtime_folder
-from rigd.safety import MEASURED, ProbeEnd, ProbeEstimate, contradiction, doubts, plan_probe
+from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
+from rigd.safety.probing_move import MEASURED, ProbeEnd, plan_probe
 
 _VERIFIED: Final = (
     "rate_hz", "beam.", "damping.", "motor.", "encoder.", "actuation.", "sensor.projection",

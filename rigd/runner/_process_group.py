@@ -168,7 +168,7 @@ class ProcessGroup:
             If there is not enough shared memory.
         """
         from rigd.engine import HURRIED_BUFFERED_S, create_channels
-        from rigd.safety import BUFFERED_S
+        from rigd.safety.limits import BUFFERED_S
 
         # Whoever watches samples, as a live view does and a fit, is slower than the virtual clock.
         hurried = fast and (self.live or self._also or watched)

@@ -25,17 +25,17 @@ from rigd.devices import (
     objections,
     reality,
     simulated_differently,
-    unreachable_simulators,
     what_moves,
-    with_obstacles,
 )
+from rigd.devices.obstacles import with_obstacles
+from rigd.devices.running_simulator import unreachable_simulators
 from rigd.engine import Connected, Ending, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.runner._planning import RefusedError
 from rigd.runner._touch_search import TouchSearch
-from rigd.safety import Limits
+from rigd.safety.limits import Limits
 from rigd.session import PART_SUFFIX
 from rigd.session.user_metadata import META_PREFIX, NOTES
 from rigd.units import unit_of

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, WhatMoves, describe_unknown_values
+from rigd.devices import WhatMoves, describe_unknown_values
+from rigd.devices.contracts import DeviceError
 from rigd.engine import (
     CONTROL,
     LIVE,
@@ -286,8 +287,8 @@ class Rig:
         Returns
         -------
         dict
-            ``end``: name of a `rigd.safety.ProbeEnd`, and the fields of a
-            `rigd.safety.ProbeEstimate`.
+            ``end``: name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
+            `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------

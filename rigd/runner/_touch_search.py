@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rigd.devices import RigParameters
+from rigd.devices.parameters import RigParameters
 from rigd.engine import (
     TOUCH,
     ChildError,

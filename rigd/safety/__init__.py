@@ -1,8 +1,10 @@
 """Limits and interlocks: what ends a session, what warns, and what the operator is told.
 
-Offers the table of interlocks (`INTERLOCKS`), the levels of a profile (`Limits`), and the check of
-every tick (`LimitWatch`), which the loop calls. The software stops a session that leaves its
-limits; it is not a safety function. That is the wired STO of the drive (docs/safety.md).
+Offers the checks of every tick (`LimitWatch`, `EncoderWatch`, `SensorWatch`), which the loop calls.
+Public modules: `limits` (the table of interlocks, the levels of a profile), `probing_move` and
+`probe_estimate` (the small move that verifies scales and signs before a session). The software
+stops a session that leaves its limits; it is not a safety function. That is the wired STO of the
+drive (docs/safety.md).
 """
 
 import lazy_loader as lazy

@@ -21,8 +21,8 @@ from collections import deque
 from math import copysign, inf, sqrt
 
 from rigd.safety._beam_prediction import BeamPrediction
-from rigd.safety._limits import BY_NAME, Violation
 from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
+from rigd.safety.limits import BY_NAME, Violation
 
 ENCODER_FAILURE_S = 0.004
 """Time after which net torque on an encoder that stands still is a fault, if it is large."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import exp, inf, isfinite, sqrt
 
-from rigd.safety._limits import BY_NAME, OVERLOADED, Limits, Violation
+from rigd.safety.limits import BY_NAME, OVERLOADED, Limits, Violation
 
 LOOK_EVERY = 64
 """Ticks between two checks of what changes slowly."""

@@ -14,7 +14,7 @@ from math import copysign, inf, sqrt
 
 import numpy as np
 
-from rigd.safety._limits import BY_NAME, Violation
+from rigd.safety.limits import BY_NAME, Violation
 
 WINDOW_TICKS = 8
 """Ticks from one mean speed to the next."""

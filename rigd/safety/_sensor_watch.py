@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import ceil, log, sqrt
 from operator import eq
 
-from rigd.safety._limits import BY_NAME, Violation
+from rigd.safety.limits import BY_NAME, Violation
 
 _FROZEN_S = 0.02
 _FROZEN_READINGS = 3

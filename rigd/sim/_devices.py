@@ -18,14 +18,9 @@ from typing import IO, TypeVar, cast
 import numpy as np
 
 from rigd.beam import check_order
-from rigd.devices import (
-    Encounter,
-    ObstacleError,
-    describe_obstacle,
-    fresh_seed,
-    with_obstacles,
-)
+from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
+from rigd.devices.obstacles import Encounter, ObstacleError, describe_obstacle, with_obstacles
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters

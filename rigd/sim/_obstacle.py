@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid, realise_force
 from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
-from rigd.devices import Encounter, Knock, Obstacle
+from rigd.devices.obstacles import Encounter, Knock, Obstacle
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

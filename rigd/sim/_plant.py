@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam.realisation import Realisation
-from rigd.devices import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
+from rigd.devices.obstacles import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import Contact, March

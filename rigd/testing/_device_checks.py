@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from math import isfinite
 
-from rigd.devices import Devices, Wrench
+from rigd.devices.contracts import Devices, Wrench
 
 _PERIOD_NS = 1_000_000
 _TORQUE_NM = 0.3

@@ -6,8 +6,8 @@ loop computes tick by tick, and the sequential test on them (`watched_beam`, `To
 `TouchEstimator` estimates one touch after another with one model of the beam (`TouchModel`, read
 from an analysis or taken from the profile) and tells point, instant, force and stiffness with
 intervals, and the kind of obstacle (`TouchEstimate`). What it needs is a `TouchRecord`: angle,
-torque and base shear from 0.3 s or more before the touch (`touch_record`). A process beside the
-control loop and the analyser use it alike. It knows of no rig and no file but the analyser's
+torque and base shear from 0.3 s or more before the touch (`samples.touch_record`). A process beside
+the control loop and the analyser use it alike. It knows of no rig and no file but the analyser's
 document.
 """
 

@@ -28,9 +28,9 @@ from rigd.touch._physical import (
     descend,
 )
 from rigd.touch._posterior import Posterior, sampled
-from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
 from rigd.touch._tables import GRID_S, Tables
 from rigd.touch._uncertain import deviations
+from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 Real = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from rigd.touch._free_motion import FreeBeam
 from rigd.touch._kernels import contact_kernels, cross_kernels, places
 from rigd.touch._model import TouchModel
 from rigd.touch._physical import Starts
-from rigd.touch._samples import FINAL_S, FIRST_S, HISTORY_S
+from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 NOTICED_S: Final = (0.013, 0.04, 0.12)
 """A touch is noticed at most so long after it: the longer ones are tried if the shorter fail."""

@@ -151,9 +151,9 @@ class StandIns:
 def stand_ins(monkeypatch):
     """Devices of which the checks believe that they are the profile's."""
     made = StandIns()
-    monkeypatch.setattr("rigd.checks._devices.open_devices", made.open)
+    monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
     monkeypatch.setattr("rigd.devices._wired_rig.open_devices", made.open)
-    monkeypatch.setattr("rigd.checks._devices.TICKS", 100)
+    monkeypatch.setattr("rigd.checks.devices.TICKS", 100)
     return made
 
 

@@ -13,7 +13,7 @@ from rigd.profile import load_profile
 @pytest.fixture
 def rigd(rigd_here, monkeypatch):
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)  # of the test runner
-    monkeypatch.setattr("rigd.checks._devices.open_devices", not_to_be_called)
+    monkeypatch.setattr("rigd.checks.devices.open_devices", not_to_be_called)
     return rigd_here
 
 

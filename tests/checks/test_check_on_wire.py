@@ -8,16 +8,16 @@ from dataclasses import replace
 import pytest
 from cases import further
 
-from rigd.checks._devices import inspect_devices
-from rigd.checks._rows import Verdict, overall
-from rigd.devices._simulator import find_simulator
-from rigd.devices._wired_rig import reset_drive
+from rigd.checks.devices import inspect_devices
+from rigd.checks.rows import Verdict, overall
+from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import find_simulator
 
 RUN = """
 import sys
 from rigd.profile import load_profile
-from rigd.sim.wire._simulator import SimulatorOptions, run_simulator
+from rigd.sim.wire import SimulatorOptions, run_simulator
 sys.exit(run_simulator(load_profile(sys.argv[1]).rig, SimulatorOptions(lock_step=True, quiet=True)))
 """
 
@@ -38,7 +38,7 @@ def profile(request, can_profile, serial_profile):
 
 
 def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
-    from rigd.sim.wire._simulator import inject
+    from rigd.sim.wire import inject
 
     rows = inspect_devices(profile)
     assert overall(rows) == "ok", rows

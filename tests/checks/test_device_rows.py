@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks._devices import inspect_devices
-from rigd.checks._rows import Verdict, overall
+from rigd.checks.devices import inspect_devices
+from rigd.checks.rows import Verdict, overall
+from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
 
@@ -88,7 +90,7 @@ def test_devices_that_cannot_be_opened(can_profile, monkeypatch):
     def refuse(rig):
         raise DeviceError("a simulated rig is running, and the hardware is here too")
 
-    monkeypatch.setattr("rigd.checks._devices.open_devices", refuse)
+    monkeypatch.setattr("rigd.checks.devices.open_devices", refuse)
     assert inspect_devices(can_profile)[-1].verdict is Verdict.FAIL
 
 
@@ -109,6 +111,27 @@ def test_what_a_sensor_does_not_tell(can_profile, stand_ins):
     for what in ("range", "calibration date", "firmware"):
         assert rows["sensor", what].found == "not stated by the sensor"
         assert rows["sensor", what].verdict is Verdict.OK
+
+
+@pytest.mark.parametrize(
+    ("watchdog", "verdict"),
+    [
+        (Watchdog.HEARTBEAT, Verdict.OK),
+        (Watchdog.RPDO_DEADLINE, Verdict.OK),
+        (Watchdog.OWN, Verdict.WARNING),
+        (Watchdog.NONE, Verdict.WARNING),
+    ],
+)
+def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
+    can_profile, stand_ins, watchdog, verdict
+):
+    after_s = float("inf") if watchdog is Watchdog.NONE else 0.05
+    stand_ins.drive.outfit = lambda: Outfit({}, watchdog, after_s, (), ())
+    row = by_name(inspect_devices(can_profile))["drive", "watchdog"]
+    assert row.verdict is verdict
+    if watchdog is Watchdog.NONE:
+        assert row.found == "none: accepted"
+        assert "STO" in row.detail
 
 
 def test_a_sensor_that_complains_is_a_warning(can_profile, stand_ins):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from rigd.beam import Damping
-from rigd.checks._on_paper import margin_rows, stability_rows
-from rigd.checks._rows import Verdict, overall
+from rigd.checks.on_paper import margin_rows, stability_rows
+from rigd.checks.rows import Verdict, overall
 from rigd.profile import load_profile
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks._machine import machine_rows
-from rigd.checks._rows import Verdict
+from rigd.checks.machine import machine_rows
+from rigd.checks.rows import Verdict
 from rigd.profile import load_profile
 
 CPU = "sys/devices/system/cpu"
@@ -24,7 +24,7 @@ REALTIME_KERNEL = "#1 SMP PREEMPT_RT Debian 6.1"
 @pytest.fixture
 def rows(tmp_path, monkeypatch):
     """The rows of a good computer, but for some files."""
-    monkeypatch.setattr("rigd.checks._machine._synchronised", lambda: True)
+    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: True)
 
     def of(changed=None, *, kernel=REALTIME_KERNEL, **settings):
         for path, text in (GOOD | (changed or {})).items():
@@ -103,7 +103,7 @@ def test_a_loop_that_is_kept_off_the_isolated_core_is_told_so(rows):
 
 
 def test_a_wall_clock_that_nobody_keeps_is_told(rows, monkeypatch):
-    monkeypatch.setattr("rigd.checks._machine._synchronised", lambda: False)
+    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: False)
     assert rows()["wall clock"].verdict is Verdict.WARNING
 
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
-from rigd.checks import check_on_paper
-from rigd.checks._gate import paper_rows
-from rigd.checks._on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
-from rigd.checks._rows import Row, Verdict, overall
-from rigd.devices.canbus._budget import bus_load
+from rigd.checks import check_beside, check_on_paper
+from rigd.checks.on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
+from rigd.checks.rows import Row, Verdict, overall
+from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
 from rigd.profile import load_profile
 
@@ -65,7 +64,7 @@ def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profi
     assert (row.found, row.verdict) == ("not known", Verdict.WARNING)
     for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
         assert words in row.detail
-    assert row in paper_rows(can_profile)
+    assert row in check_beside(can_profile, None)
     assert not check_on_paper(can_profile).refusals
     (row,) = plumb_rows(load_profile("sim"))
     assert row.verdict is Verdict.SKIPPED

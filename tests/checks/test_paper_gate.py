@@ -8,14 +8,14 @@ import pytest
 from cases import further
 from eds_files import eds_path
 
-from rigd.checks import UnknownRowError, check_on_paper
-from rigd.checks._check import default_session_rows
-from rigd.checks._gate import PAPER_CHECKS, paper_rows
-from rigd.checks._rows import Verdict, overall
+from rigd.checks import check_beside, check_on_paper
+from rigd.checks.rows import Verdict, overall
 from rigd.control import ControlDesignError
-from rigd.devices import MAY_BE_UNKNOWN, DeviceError, open_devices, unknown_values
+from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
+from rigd.devices.contracts import DeviceError
+from rigd.errors import UserError
 from rigd.excitation import KINDS, hold
-from rigd.profile import ProfileError, UnknownValueError, load_profile
+from rigd.profile import ProfileError, load_profile
 from rigd.runner import Rig, RigError, Series, excitation_for
 from rigd.testing import write_profile
 
@@ -81,14 +81,16 @@ def test_check_and_run_agree_on_a_profile_with_one_lie(lie, tmp_path, key, facto
         profile = load_profile(path)
     except ProfileError:
         return  # neither command begins
-    failed = [row for row in paper_rows(profile) if row.verdict is Verdict.FAIL]
+    rows = check_beside(profile, None)
+    failed = [row for row in rows if row.verdict is Verdict.FAIL]
+    assert {row.name for row in failed} == {each.name for each in check_on_paper(profile).failed}
     refused = refusal(profile, tmp_path / "out", "hold", duration_s=0.5)
     assert bool(failed) == bool(refused)
     for row in failed:
         assert f"({row.name})" in refused or row.found in refused
     # A chirp may leave limits that a hold keeps: check says that, too.
     chirp = refusal(profile, tmp_path / "out", "chirp")
-    advice = [row.verdict for row in default_session_rows(profile)]
+    advice = [row.verdict for row in rows if row.what == "chirp without options"]
     assert bool(chirp) == bool(failed or advice == [Verdict.WARNING])
 
 
@@ -99,13 +101,13 @@ def test_the_shipped_profiles_pass(can_profile, serial_profile):
 
 def test_every_row_that_fails_has_a_name_of_its_check(lie):
     profile = load_profile(lie("limits.stop_angle_rad", 0.51))
-    for check in PAPER_CHECKS:
-        names = {row.name for row in check.rows(profile)}
-        assert names <= set(check.names) | {""}
-        assert check.names or names == {""}
-    assert {each.name for each in check_on_paper(profile).failed} == {
+    travel = {
         "travel_loop_fails", "travel_no_angle", "travel_encoder_fails", "travel_missed_ticks",
     }  # fmt: skip
+    assert {each.name for each in check_on_paper(profile).failed} == travel
+    assert {
+        row.name for row in check_beside(profile, None) if row.verdict is Verdict.FAIL
+    } == travel
 
 
 def test_only_what_is_accepted_passes(lie, tmp_path):
@@ -124,10 +126,10 @@ def test_only_what_is_accepted_passes(lie, tmp_path):
 
 
 def test_a_name_that_is_none_is_refused_with_those_there_are(can_profile):
-    with pytest.raises(UnknownRowError, match="travel_loop_fails, travel_no_angle") as refused:
+    with pytest.raises(UserError, match="travel_loop_fails, travel_no_angle") as refused:
         check_on_paper(can_profile, ["worst travel"])
     assert refused.value.wrong_use
-    with pytest.raises(UnknownRowError, match="nothing can be computed without it"):
+    with pytest.raises(UserError, match="nothing can be computed without it"):
         check_on_paper(can_profile, ["unknown_values"])
 
 
@@ -191,13 +193,13 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
     profile = load_profile(path)
     assert unknown_values(profile.rig) == (key,)
     assert profile.sources[key] == "unknown"
-    (failed,) = [row for row in paper_rows(profile) if row.verdict is Verdict.FAIL]
+    (failed,) = [row for row in check_beside(profile, None) if row.verdict is Verdict.FAIL]
     assert (failed.what, failed.name) == (key, "unknown_values")
     assert str(path) in failed.detail
     assert MAY_BE_UNKNOWN[key] in failed.detail
-    with pytest.raises(UnknownValueError, match=key):
+    with pytest.raises(UserError, match=key):
         Series(profile, hold(rate_hz=1000.0), tmp_path / "out")
-    with pytest.raises(UnknownValueError, match=key):
+    with pytest.raises(UserError, match=key):
         excitation_for(profile, "move", {"angle_rad": 0.1})
     with pytest.raises(DeviceError, match=key):
         open_devices(profile.rig)
@@ -209,7 +211,7 @@ def test_an_unknown_value_is_named_wherever_it_is_needed(unknown, tmp_path, key)
 def test_all_unknown_at_once_and_on_a_simulated_rig(unknown, tmp_path):
     assert unknown_values(load_profile(unknown(*MAY_BE_UNKNOWN)).rig) == tuple(MAY_BE_UNKNOWN)
     profile = load_profile(unknown("motor.inertia_kg_m2", base=load_profile("sim")))
-    assert overall(paper_rows(profile)) == "failed"
+    assert overall(check_beside(profile, None)) == "failed"
     with pytest.raises(DeviceError, match="inertia_kg_m2 is unknown; enter its value"):
         open_devices(profile.rig)
 
@@ -254,7 +256,7 @@ def test_every_excitation_is_refused(unknown, tmp_path):
         needed = {name: value for name, value in given.items() if name in known}
         if kind in ("file", "modes"):
             continue  # read a file first
-        with pytest.raises(UnknownValueError, match="inertia_kg_m2"):
+        with pytest.raises(UserError, match="inertia_kg_m2"):
             Series(profile, excitation_for(profile, kind, needed), tmp_path)
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks._machine import rights_rows
-from rigd.checks._rows import Verdict
+from rigd.checks.machine import rights_rows
+from rigd.checks.rows import Verdict
 from rigd.profile import load_profile
 
 
@@ -50,7 +50,7 @@ def test_an_ordinary_scheduler_may_be_wanted(asked):
 
 
 def test_a_trial_that_fails_is_told(asked, monkeypatch):
-    monkeypatch.setattr("rigd.checks._machine.OWN_PYTHON", ("/no/such/python",))
+    monkeypatch.setattr("rigd.checks.machine.OWN_PYTHON", ("/no/such/python",))
     (row,) = rights_rows(asked)
     assert row.verdict is Verdict.WARNING
     assert "could not be tried" in row.found
@@ -63,7 +63,7 @@ def test_the_lines_that_grant_what_is_lacking_are_spelt_out(asked, monkeypatch):
         "scheduling": "refused: not permitted",
         "supervision": "nice -10 (SCHED_RR refused: not permitted)",
     }
-    monkeypatch.setattr("rigd.checks._machine.settings_granted", lambda settings: granted)
+    monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
     rows = {row.what: row for row in rights_rows(asked)}
     user = pwd.getpwuid(os.geteuid()).pw_name
     assert f"{user} - memlock unlimited" in rows["memory"].detail
@@ -76,7 +76,7 @@ def test_the_lines_that_grant_what_is_lacking_are_spelt_out(asked, monkeypatch):
 
 def test_memory_that_is_locked_in_part_only_is_a_warning(asked, monkeypatch):
     granted = {"memory": "locked, but for what is allocated later (limit of 8 MB)"}
-    monkeypatch.setattr("rigd.checks._machine.settings_granted", lambda settings: granted)
+    monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
     (row,) = rights_rows(asked)
     assert row.verdict is Verdict.WARNING
     assert "memlock unlimited" in row.detail

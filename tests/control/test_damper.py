@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rigd.beam import poles
-from rigd.control import VibrationDamper, close_loop, damped_poles, design_damper
+from rigd.control import close_loop
+from rigd.control.damper import VibrationDamper, damped_poles, design_damper
 from rigd.profile import load_profile
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rigd.control import Disturbances, close_loop, simulate_disturbed
-from rigd.excitation import quintic
+from rigd.excitation.moves import quintic
 
 NONE = Disturbances(coulomb_nm=0.0, encoder_step_rad=0.0, torque_noise_nm=0.0)
 PATH = np.concatenate([[0.0], 0.3 * quintic(0.2, 1000.0), np.full(400, 0.3)])

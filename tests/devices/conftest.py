@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from cases import further
 
-from rigd.devices._registry import open_devices
+from rigd.devices import open_devices
 from rigd.profile import load_profile
 
 HARDWARE = "RIGD_HARDWARE"

@@ -12,8 +12,8 @@ from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rigd.devices import _eds as eds
-from rigd.devices._eds import EdsError, read_eds
+from rigd.devices import eds
+from rigd.devices.eds import EdsError, read_eds
 
 TABLE = """
     1000 u32 ro 0x00020192
@@ -317,7 +317,7 @@ def test_nothing_is_printed_and_no_library_is_waited_for(tmp_path):
     path = tmp_path / "bare.eds"
     path.write_text("[6040]\nDataType=0x99\nDefaultValue=x\n")
     code = (
-        "import sys; from pathlib import Path; from rigd.devices._eds import read_eds; "
+        "import sys; from pathlib import Path; from rigd.devices.eds import read_eds; "
         f"assert read_eds(Path({str(path)!r})).get(0x6040); "
         "assert not {'canopen', 'can', 'numpy', 'pydantic'} & set(sys.modules)"
     )

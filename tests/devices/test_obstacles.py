@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.devices import (
+from rigd.devices.obstacles import (
     Knock,
     Obstacle,
     ObstacleError,

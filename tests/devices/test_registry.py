@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._registry import UnknownDeviceError, check_selection
+from rigd.devices import check_selection
 from rigd.devices.parameters import Selection
+from rigd.errors import UserError
 
 
 def test_unknown_drivers_are_refused_with_what_there_is():
-    with pytest.raises(UnknownDeviceError, match=r'a\.toml: .*"steam".*choose drive = "sim"'):
+    with pytest.raises(UserError, match=r'a\.toml: .*"steam".*choose drive = "sim"'):
         check_selection(Selection(drive="steam", sensor="sim"), Path("a.toml"))
 
 

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices import _wired_rig as wired_rig
-from rigd.devices._registry import WhatMoves, open_devices, reality, simulated_differently
-from rigd.devices._simulator import SimulatorAddress, announce, described
+from rigd.devices import WhatMoves, open_devices, reality, simulated_differently
 from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import SimulatorAddress, announce, described
 from rigd.profile import load_profile
 
 
@@ -68,13 +67,14 @@ def test_colliding_identifiers_are_refused_before_anything_is_sent(rig, runtime_
         open_devices(colliding)
 
 
-def test_hardware_beside_a_simulated_rig_is_refused(rig, stand_in, tmp_path, monkeypatch):
+def test_hardware_beside_a_simulated_rig_is_refused(rig, stand_in):
     stand_in(rig.name, can_socket="/nowhere")
-    monkeypatch.setattr(wired_rig, "_INTERFACES", tmp_path)
-    assert open_devices(rig).simulated
-    (tmp_path / "can0").mkdir()
-    with pytest.raises(DeviceError, match=r"is running .* and the CAN interface can0 of the real"):
-        open_devices(rig)
+    absent, present = (
+        replace(rig, can=replace(rig.can, channel=channel)) for channel in ("nocan9", "lo")
+    )
+    assert open_devices(absent).simulated
+    with pytest.raises(DeviceError, match=r"is running .* and the CAN interface lo of the real"):
+        open_devices(present)
 
 
 def test_a_serial_port_beside_a_simulated_one_is_refused(stand_in, tmp_path):

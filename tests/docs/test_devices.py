@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from eds_files import WITHOUT_TORQUE, eds_path
 
-from rigd.devices.cia402._requirements import ACCEPTABLE
+from rigd.devices.cia402.requirements import ACCEPTABLE
 from rigd.profile import load_profile
 
 PAGE = (Path(__file__).parents[2] / "docs" / "devices.md").read_text("utf-8")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.control import DamperSettings
+from rigd.control.damper import DamperSettings
 from rigd.engine._messages import Ending, Finished, Ready
 from rigd.excitation import chirp, step
 from rigd.runner import plan_session

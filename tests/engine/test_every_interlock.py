@@ -15,7 +15,7 @@ from rigd.engine._shared_state import Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
-from rigd.safety import INTERLOCKS, Action
+from rigd.safety.limits import INTERLOCKS, Action
 from rigd.session.layout import Status
 from rigd.sim import Stuck
 

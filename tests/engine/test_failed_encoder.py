@@ -9,12 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.control import close_loop, design_damper
+from rigd.control import close_loop
+from rigd.control.damper import design_damper
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine._messages import Ending
-from rigd.excitation import chirp, hold, multisine, quintic, step
+from rigd.excitation import chirp, hold, multisine, step
 from rigd.excitation._signals import Excitation
+from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
 from rigd.sim import Stuck
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from rigd.engine._messages import TouchOrder
 from rigd.engine._touch_watch import TouchWatch
-from rigd.excitation import Approach, Pass, after_touch, braking_path, quintic
+from rigd.excitation import Approach, Pass, after_touch
+from rigd.excitation.moves import braking_path, quintic
 from rigd.session.layout import Status
 
 RATE_HZ = 1000.0

@@ -3,24 +3,21 @@
 import json
 from dataclasses import replace
 
+import beam_estimates
 import numpy as np
 import pytest
+from beam_estimates import UNIFORM, covariance_of
 
 from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping, modes, transfer
+from rigd.beam import Beam, modes, transfer
 from rigd.excitation import BeamEstimate, ExcitationError, information
-from rigd.excitation._beam_estimate import OF_UNIFORM
-from rigd.excitation._fisher_information import RecordSoFar, covariance_of, projected
 
 RATE_HZ = 1000.0
-LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+LINK = beam_estimates.ESTIMATE.beam
 NOISE_NM = 5e-3
-ESTIMATE = BeamEstimate(
-    beam=LINK,
-    damping=Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
-    names=OF_UNIFORM,
-    noise_frequency_hz=np.array([1.0]),
+ESTIMATE = replace(
+    beam_estimates.ESTIMATE,
     noise_nm2_per_hz=np.array([2.0 * NOISE_NM**2 / RATE_HZ]),
     delay_s=3e-4,
     tool_inertia_kg_m2=1e-5,
@@ -72,7 +69,7 @@ def scan():
 
 def test_it_is_the_gram_matrix_of_finite_differences():
     angle = scan()
-    steps = dict.fromkeys(OF_UNIFORM, 1e-5) | {"delay_s": 1e-7, "tool_inertia_kg_m2": 1e-9}
+    steps = dict.fromkeys(UNIFORM, 1e-5) | {"delay_s": 1e-7, "tool_inertia_kg_m2": 1e-9}
     rows = np.array(
         [
             (moved(angle, stepped(ESTIMATE, n, h)) - moved(angle, stepped(ESTIMATE, n, -h)))
@@ -116,9 +113,9 @@ def test_it_predicts_what_a_fit_states():
     known = np.ones(torque.size, dtype=bool)
     measurement = Measurement("record", angle, torque + noise, RATE_HZ, LINK, known, known, 0.0)
     fit = fit_record(measurement, [STRUCTURES["VI"]]).fits[0]
-    predicted = covariance_of(information(angle, ESTIMATE, RATE_HZ), ESTIMATE)
+    predicted = covariance_of(information(angle, ESTIMATE, RATE_HZ))
     for name, spread in zip(fit.determined, np.sqrt(np.diag(fit.covariance)), strict=True):
-        place = OF_UNIFORM.index(name)
+        place = UNIFORM.index(name)
         assert spread == pytest.approx(np.sqrt(predicted[place, place]), rel=0.25), name
 
 
@@ -128,25 +125,6 @@ def test_twice_the_noise_tells_a_quarter():
     np.testing.assert_allclose(
         4.0 * information(angle, loud, RATE_HZ), information(angle, ESTIMATE, RATE_HZ), rtol=1e-9
     )
-
-
-def test_a_record_that_goes_on_adds_up():
-    """A piece after a record tells as much as both in one, whatever tick it begins at."""
-    angle = scan()
-    for ticks in (5000, 5003):
-        record = RecordSoFar.of(angle[:ticks], ESTIMATE, RATE_HZ, 2.0)
-        held = record.after(None, 250)
-        longer = np.concatenate([angle[:ticks], np.zeros(2000)])
-        whole = information(longer, ESTIMATE, RATE_HZ)
-        size = np.sqrt(np.diag(whole))
-        np.testing.assert_allclose(
-            held / np.outer(size, size), whole / np.outer(size, size), atol=0.02
-        )
-
-
-def test_what_is_unknown_besides_takes_information_away():
-    gram = np.array([[4.0, 1.0, 2.0], [1.0, 9.0, 0.0], [2.0, 0.0, 1.0]])
-    np.testing.assert_allclose(projected(gram, 2), [[0.0, 1.0], [1.0, 9.0]], atol=1e-9)
 
 
 # The estimate from JSON

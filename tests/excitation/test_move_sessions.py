@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rigd.beam import clamped_free_eigenvalues
-from rigd.excitation import KINDS, ExcitationError, modal_state, move
+from rigd.excitation import KINDS, ExcitationError, move
+from rigd.excitation.moves import modal_state
 from rigd.identified_beam import MOVE, IdentifiedBeamError
 from rigd.profile import load_profile
 from rigd.runner import (

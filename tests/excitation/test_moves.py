@@ -7,17 +7,8 @@ import pytest
 
 from rigd.beam import participation, transfer
 from rigd.control import close_loop
-from rigd.excitation import (
-    ExcitationError,
-    braked,
-    braking_path,
-    modal_state,
-    quintic,
-    shortest_braking,
-    shortest_move,
-    slew,
-    still_path,
-)
+from rigd.excitation import ExcitationError, shortest_braking, shortest_move
+from rigd.excitation.moves import braked, braking_path, modal_state, quintic, slew, still_path
 from rigd.identified_beam import MOVE
 
 RATE_HZ = 1000.0

@@ -4,19 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from beam_estimates import ESTIMATE, UNIFORM
 
-from rigd.beam import Beam, Damping, modes
-from rigd.excitation import BeamEstimate, ExcitationError, Target, parse_target
-from rigd.excitation._beam_estimate import OF_UNIFORM
-from rigd.excitation._targets import Quantities
-
-ESTIMATE = BeamEstimate(
-    beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),
-    damping=Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
-    names=OF_UNIFORM,
-    noise_frequency_hz=np.array([1.0]),
-    noise_nm2_per_hz=np.array([5e-8]),
-)
+from rigd.beam import Damping, modes
+from rigd.excitation import ExcitationError
+from rigd.excitation.targets import Quantities, Target, parse_target
 
 
 @pytest.mark.parametrize(
@@ -80,7 +72,7 @@ def test_another_text_is_refused_with_a_remedy(quantity, text, message):
 )
 def test_a_mode_moves_as_the_model_says(name, step, grown):
     """Derivatives of damping ratio and frequency, against differences of the model's own modes."""
-    place = OF_UNIFORM.index(name)
+    place = UNIFORM.index(name)
     up, down = (
         modes(e.beam, e.damping, 3) for e in (grown(ESTIMATE, step), grown(ESTIMATE, -step))
     )
@@ -96,7 +88,7 @@ def test_every_mode_in_the_band_is_asked_for_unless_one_is_named():
     quantities = Quantities.of([*asked, parse_target("zeta", "5%")], ESTIMATE)
     names = [each.target.name for each in quantities.items]
     assert names == [*(f"damping of mode {n}" for n in (1, 2, 3)), "frequency of mode 2", "zeta"]
-    covariance = np.diag(np.full(len(OF_UNIFORM), 1e-4))
+    covariance = np.diag(np.full(len(UNIFORM), 1e-4))
     found = quantities.precisions(covariance)
     assert found[-1].std == pytest.approx(7.1e-5 * 0.01)
     assert found[-1].reached

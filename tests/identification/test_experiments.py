@@ -8,9 +8,9 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
-from rigd.identification import _records
-from rigd.identification._estimate import EstimateError
-from rigd.identification._experiments import (
+from rigd.identification import _records, read_recording
+from rigd.identification.estimate import EstimateError
+from rigd.identification.experiments import (
     Pass,
     lay_out_passes,
     multisine_session,
@@ -18,8 +18,7 @@ from rigd.identification._experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.identification._records import read_recording
-from rigd.runner._planning import plan_session
+from rigd.runner import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 

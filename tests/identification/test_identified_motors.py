@@ -10,11 +10,12 @@ import pytest
 from cases import further
 
 from rigd.control import PidController, design_pid
-from rigd.devices._registry import open_devices
+from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine._cycle import Cycle, make_observers, make_watch
-from rigd.identification._estimate import Timing, Window, estimate_motor
-from rigd.identification._experiments import (
+from rigd.engine import Cycle, make_observers, make_watch
+from rigd.identification import cautious, tuned
+from rigd.identification.estimate import Timing, Window, estimate_motor
+from rigd.identification.experiments import (
     TOP_HZ,
     lay_out_passes,
     multisine_session,
@@ -22,7 +23,6 @@ from rigd.identification._experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.identification._proposal import cautious, tuned
 from rigd.profile import load_profile
 
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}

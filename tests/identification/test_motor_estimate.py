@@ -8,13 +8,7 @@ import pytest
 import scipy  # whose parts come on first use
 from cases import further
 
-from rigd.identification._estimate import (
-    EstimateError,
-    Timing,
-    Window,
-    _coverage,
-    estimate_motor,
-)
+from rigd.identification.estimate import EstimateError, Timing, Window, _coverage, estimate_motor
 
 RATE_HZ = 1000.0
 STEPS = 5

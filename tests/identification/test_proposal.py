@@ -1,12 +1,13 @@
 """Table, TOML and notes of estimates that are made up."""
 
+import re
 import tomllib
 from dataclasses import replace
 
 import pytest
 
-from rigd.identification._estimate import MotorEstimate, Quantity
-from rigd.identification._proposal import _rounded, propose
+from rigd.identification import propose
+from rigd.identification.estimate import MotorEstimate, Quantity
 from rigd.profile import load_profile
 
 ESTIMATE = MotorEstimate(
@@ -74,8 +75,11 @@ def test_misfit_and_missing_passes_are_told(profile):
         (0.0, 1e-3, ("0.0000", "0.001")),
     ],
 )
-def test_numbers_show_two_figures_of_their_deviation(value, std, expected):
-    assert _rounded(value, std) == expected
+def test_numbers_show_two_figures_of_their_deviation(profile, value, std, expected):
+    estimate = replace(ESTIMATE, viscous_nm_s_per_rad=Quantity(value, std))
+    (line,) = [row for row in propose(estimate, profile).table() if "motor.viscous" in row]
+    cells = re.split(r"  +", line)
+    assert (cells[1].partition(" ")[0], cells[2]) == expected
 
 
 @pytest.mark.parametrize(("delay_s", "pasted"), [(9.96e-4, 1e-3), (1.004e-3, 1.004e-3)])

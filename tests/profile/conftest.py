@@ -1,6 +1,18 @@
 import pytest
 
-from rigd.profile import ProfileError, load_profile
+from rigd.profile import Profile, ProfileError, load_profile
+
+
+@pytest.fixture
+def loaded(tmp_path):
+    """Load the text of a profile."""
+
+    def load(text: str) -> Profile:
+        path = tmp_path / "a.toml"
+        path.write_text(text, encoding="utf-8")
+        return load_profile(path)
+
+    return load
 
 
 @pytest.fixture

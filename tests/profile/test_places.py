@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from rigd.profile import load_profile, profile_files, user_folder
-from rigd.profile._places import Origin
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -30,10 +29,10 @@ def put(folder):
 def test_the_working_folder_comes_before_the_users_and_that_before_the_shipped(own):
     here = put(Path("hw_profiles"))
     shipped = CHECKOUT / "hw_profiles" / "sim.toml"
-    assert [(file.path, file.origin) for file in profile_files()["sim"]] == [
-        (here, Origin.HERE),
-        (own, Origin.USER),
-        (shipped, Origin.SHIPPED),
+    assert [(file.path, file.origin.name) for file in profile_files()["sim"]] == [
+        (here, "HERE"),
+        (own, "USER"),
+        (shipped, "SHIPPED"),
     ]
     for path in (here, own, shipped):
         assert load_profile("sim").path == path
@@ -43,8 +42,8 @@ def test_the_working_folder_comes_before_the_users_and_that_before_the_shipped(o
 
 def test_in_the_checkout_itself_its_profiles_are_the_shipped_ones(own, monkeypatch):
     monkeypatch.chdir(CHECKOUT)
-    assert [file.origin for file in profile_files()["sim"]] == [Origin.USER, Origin.SHIPPED]
-    assert [file.origin for file in profile_files()["antenna_can"]] == [Origin.SHIPPED]
+    assert [file.origin.name for file in profile_files()["sim"]] == ["USER", "SHIPPED"]
+    assert [file.origin.name for file in profile_files()["antenna_can"]] == ["SHIPPED"]
 
 
 def test_the_users_folder_is_below_his_home_unless_said_otherwise(tmp_path, monkeypatch):

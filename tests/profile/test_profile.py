@@ -12,7 +12,6 @@ import pytest
 from rigd.beam import Beam, Damping
 from rigd.control import check_stability, close_loop
 from rigd.profile import ProfileError, load_profile
-from rigd.profile._load import profile_of
 
 
 @pytest.fixture
@@ -342,7 +341,9 @@ def test_simulated_devices_need_their_section(refuse, sim_toml):
         ("stiffness_drift_per_s", -1e-5),
     ],
 )
-def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(refuse, sim_toml, name, value):
+def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(
+    loaded, refuse, sim_toml, name, value
+):
     def with_extras(**extras):
         more = [f'{key} = {{ value = {extras[key]}, source = "assumed" }}' for key in extras]
         return sim_toml, "\n".join([sim_toml, *more, ""])
@@ -350,7 +351,7 @@ def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(refuse, sim_tom
     [line] = refuse(with_extras(air_drag_m=2.3e-3, **{name: value}))
     assert line.startswith(f"simulation.{name} and simulation.air_drag_m cannot be simulated")
     for one in ({name: value, "air_drag_m": 0.0}, {name: 0.0, "air_drag_m": 2.3e-3}):
-        profile_of(with_extras(**one)[1], Path("a.toml"))
+        loaded(with_extras(**one)[1])
 
 
 @pytest.mark.parametrize(
@@ -379,7 +380,7 @@ def test_disturbances_that_cannot_be_simulated_are_refused(refuse, sim_toml, mor
     assert line.startswith(said)
 
 
-def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams():
+def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams(loaded):
     path = Path(__file__).resolve().parents[2] / "hw_profiles" / "antenna_serial.toml"
     lines = [
         f'{key} = {{ value = {value}, source = "assumed" }}'
@@ -388,7 +389,7 @@ def test_a_hum_may_be_faster_than_the_ticks_where_a_sensor_streams():
     text = path.read_text(encoding="utf-8")
     assert text.count("[simulation]\n") == 1
     text = text.replace("[simulation]\n", "\n".join(["[simulation]", *lines, ""]))
-    assert profile_of(text, Path("a.toml")).rig.simulation.hum_hz == 700.0
+    assert loaded(text).rig.simulation.hum_hz == 700.0
 
 
 def test_a_projection_of_nothing_is_refused(refuse):
@@ -401,9 +402,9 @@ def test_a_shear_that_is_the_torque_is_refused(refuse):
     assert line.startswith("sensor.shear_projection = [0, 0, 0, 0, 0, 2] is a multiple of")
 
 
-def test_the_base_shear_may_be_left_out(sim_toml):
+def test_the_base_shear_may_be_left_out(loaded, sim_toml):
     lines = [line for line in sim_toml.splitlines() if not line.startswith("shear_projection")]
-    profile = profile_of("\n".join(lines), Path("a.toml"))
+    profile = loaded("\n".join(lines))
     assert profile.rig.sensor.shear_projection == (0.0,) * 6
 
 

@@ -1,12 +1,9 @@
 """Other values in the text of a profile: comments stay, and it says what it is told to say."""
 
-from pathlib import Path
-
 import pytest
 
-from rigd.profile import ProfileError, load_profile
-from rigd.profile._load import profile_of
-from rigd.profile._write import Setting, check_new, with_head, with_settings, write_new
+from rigd.profile import ProfileError, check_new, load_profile, write_new
+from rigd.profile._write import Setting, with_head, with_settings
 
 
 @pytest.fixture(scope="module")
@@ -30,25 +27,25 @@ def shipped():
         (Setting("cia402.sync_gaps", False), "sync_gaps = false"),
     ],
 )
-def test_a_value_stands_where_its_key_stood(shipped, setting, line):
+def test_a_value_stands_where_its_key_stood(loaded, shipped, setting, line):
     text = with_settings(shipped.text, [setting])
     old, new = shipped.text.splitlines(), text.splitlines()
     assert len(old) == len(new)
     ((_, after),) = [pair for pair in zip(old, new, strict=True) if pair[0] != pair[1]]
     assert after == line
-    profile = profile_of(text, Path("a.toml"))
+    profile = loaded(text)
     section, _, key = setting.key.rpartition(".")
     found = getattr(getattr(profile.rig, section), key) if section else profile.description
     assert found == setting.value
 
 
-def test_reasons_become_comments_above(shipped):
+def test_reasons_become_comments_above(loaded, shipped):
     text = with_settings(shipped.text, [Setting("cia402.node_id", 7, reason="Because. " * 20)])
     lines = text.splitlines()
     place = lines.index('node_id = { value = 7, source = "assumed" }')
     assert lines[place - 1].startswith("# Because.")
     assert max(map(len, lines[place - 3 : place])) <= 100
-    assert profile_of(text, Path("a.toml")).rig.cia402.node_id == 7
+    assert loaded(text).rig.cia402.node_id == 7
 
 
 def test_a_key_that_is_shown_nowhere_comes_first_in_its_section(shipped):
@@ -60,10 +57,10 @@ def test_a_key_that_is_shown_nowhere_comes_first_in_its_section(shipped):
         with_settings("name = 'x'\n", [Setting("cia402.node_id", 1)])
 
 
-def test_another_head(shipped):
+def test_another_head(loaded, shipped):
     text = with_head(shipped.text, ["One line.", "", "* another"])
     assert text.startswith('# One line.\n#\n# * another\n\nname = "antenna_can"')
-    assert profile_of(text, Path("a.toml")).rig == shipped.rig
+    assert loaded(text).rig == shipped.rig
 
 
 def test_only_new_files_are_written(tmp_path):

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine._messages import Connected
+from rigd.engine import Connected
 from rigd.profile import load_profile
-from rigd.profile._load import profile_of
-from rigd.runner._request import Order, file_header
+from rigd.runner import Order
+from rigd.runner._request import file_header
 
 SHIPPED = ("sim", "antenna_can", "antenna_serial")
 
@@ -27,11 +27,11 @@ def with_examples(name):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_profiles_state_none_and_show_how(name):
+def test_shipped_profiles_state_none_and_show_how(loaded, name):
     profile = load_profile(name)
     assert profile.uncertainty.stated == {}
     assert (profile.tip_mass_kg, profile.axis_tilt_deg) == (None, None)
-    profile = profile_of(with_examples(name), Path("a.toml"))
+    profile = loaded(with_examples(name))
     assert profile.uncertainty.stated == {
         "torque_scale_percent": 0.5, "length_percent": 0.05, "density_percent": 0.3,
         "tip_mass_percent": 1.0,
@@ -39,15 +39,20 @@ def test_shipped_profiles_state_none_and_show_how(name):
     assert (profile.tip_mass_kg, profile.axis_tilt_deg) == (1e-4, 0.1)
 
 
-def header_of(text, **parameters):
-    """Header of the file of a session on a rig with this profile."""
-    excitation = SimpleNamespace(kind="chirp", parameters=parameters, segments={})
-    connected = Connected(simulated=True, calibration={}, realtime={}, drive={})
-    order = Order(profile_of(text, Path("a.toml")), excitation, Path("a.mcap"))
-    return file_header(order, connected, {})
+@pytest.fixture
+def header_of(loaded):
+    """Return the header of the file of a session on a rig with this profile."""
+
+    def header_of(text, **parameters):
+        excitation = SimpleNamespace(kind="chirp", parameters=parameters, segments={})
+        connected = Connected(simulated=True, calibration={}, realtime={}, drive={})
+        order = Order(loaded(text), excitation, Path("a.mcap"))
+        return file_header(order, connected, {})
+
+    return header_of
 
 
-def test_a_session_carries_what_its_profile_states():
+def test_a_session_carries_what_its_profile_states(header_of):
     def metadata(text):
         header = header_of(text.replace("length_percent", "# length_percent"))
         return {k: v for k, v in header.metadata.items() if k.startswith("uncertainty")}
@@ -68,7 +73,7 @@ def test_a_share_of_more_than_half_is_refused(complaints_of):
 
 
 @pytest.mark.parametrize(("percent", "stated"), [(None, "0.1"), (0.3, "0.3"), (0, "0.0")])
-def test_a_session_states_the_uniformity_of_the_beam(percent, stated):
+def test_a_session_states_the_uniformity_of_the_beam(header_of, percent, stated):
     text = load_profile("sim").text
     if percent is not None:
         value = f'uniformity_percent = {{ value = {percent}, source = "assumed" }}'
@@ -76,12 +81,12 @@ def test_a_session_states_the_uniformity_of_the_beam(percent, stated):
     assert header_of(text).metadata["uniformity_percent"] == stated
 
 
-def test_a_session_may_state_a_uniformity_of_its_own():
+def test_a_session_may_state_a_uniformity_of_its_own(header_of):
     text = load_profile("sim").text
     assert header_of(text, uniformity_percent=0.0).metadata["uniformity_percent"] == "0.0"
 
 
-def test_tip_mass_and_tilt_are_in_the_file_only_if_they_are_stated():
+def test_tip_mass_and_tilt_are_in_the_file_only_if_they_are_stated(header_of):
     def stated(text):
         metadata = header_of(text).metadata
         return metadata.get("tip_mass_kg"), metadata.get("axis_tilt_deg")
@@ -90,10 +95,10 @@ def test_tip_mass_and_tilt_are_in_the_file_only_if_they_are_stated():
     assert stated(with_examples("sim")) == ("0.0001", "0.1")
 
 
-def test_the_loop_is_predicted_with_the_tip_mass():
+def test_the_loop_is_predicted_with_the_tip_mass(loaded):
     """A mass of half the beam's at the tip; the beam stays the uniform one."""
     text = with_examples("sim").replace("value = 1.0e-4", "value = 2.0e-3")
-    profile = profile_of(text, Path("a.toml"))
+    profile = loaded(text)
     assert profile.rig.beam == load_profile("sim").rig.beam
     assert profile.loop_model() == replace(load_profile("sim").loop_model(), tip_mass_kg=2e-3)
 

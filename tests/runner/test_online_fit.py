@@ -6,7 +6,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from rigd.engine import ChildError, FitTold, SearchEnded, Stop, Word
-from rigd.excitation import parse_target
+from rigd.excitation.targets import parse_target
 from rigd.runner._online_fit import OnlineFit
 
 REACHED = SearchEnded(True, "Reached: damping of mode 1 0.009, standard deviation 8e-05.", {})

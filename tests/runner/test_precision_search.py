@@ -16,8 +16,8 @@ from rigd.engine import (
     put_reference,
     shared_memory_fd,
 )
-from rigd.excitation import ExcitationError, Forecast, Piece, parse_target, until
-from rigd.excitation._targets import Precision
+from rigd.excitation import ExcitationError, Forecast, Piece, until
+from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview
 from rigd.runner._precision_search import Search, in_words, stated, targets_json

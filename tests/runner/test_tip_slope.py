@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
 from rigd.excitation import chirp, from_csv, multisine, step
-from rigd.identification import speeds_session
+from rigd.identification.experiments import speeds_session
 from rigd.runner import (
     excitation_for,
     largest_amplitude,

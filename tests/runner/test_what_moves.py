@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from rigd.devices._registry import WhatMoves, what_moves
-from rigd.devices._simulator import unreachable_simulators
+from rigd.devices.running_simulator import unreachable_simulators
 from rigd.runner._planning import RefusedError
 from rigd.runner._request import load_rig
 

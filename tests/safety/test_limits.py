@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.safety import Limits, LimitWatch
+from rigd.safety import LimitWatch
+from rigd.safety.limits import Limits
 
 LIMITS = Limits(
     angle_rad=1.0,

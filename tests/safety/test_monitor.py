@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine._cycle import make_watch
+from rigd.engine import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._planning import RefusedError
-from rigd.runner._request import make_room
+from rigd.runner import RefusedError, Series
 from rigd.safety import LOOK_EVERY
 
 PROFILE = load_profile("antenna_can")
@@ -214,13 +213,13 @@ def usage(free_mb):
 def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
     excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 27 MB with what is spare
     monkeypatch.setattr("shutil.disk_usage", usage(80.0))
-    make_room(tmp_path / "sessions", excitation, LIMITS)
+    Series(PROFILE, excitation, tmp_path / "sessions")
     assert (tmp_path / "sessions").is_dir()
     monkeypatch.setattr("shutil.disk_usage", usage(75.0))
     with pytest.raises(
         RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* free up space"
     ):
-        make_room(tmp_path / "sessions", excitation, LIMITS)
+        Series(PROFILE, excitation, tmp_path / "sessions")
 
 
 OVERLOADED = "The computer is overloaded: close other programs."

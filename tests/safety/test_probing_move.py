@@ -6,7 +6,7 @@ from cases import further
 
 from rigd.engine import probed_rig
 from rigd.profile import load_profile
-from rigd.safety import ProbeEnd, plan_probe
+from rigd.safety.probing_move import ProbeEnd, plan_probe
 
 STEP, RATED, INERTIA = "encoder.resolution_rad", "motor.rated_torque_nm", "motor.inertia_kg_m2"
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks._on_paper import travel_rows, worst_travel
-from rigd.checks._rows import Verdict
+from rigd.checks.on_paper import travel_rows, worst_travel
+from rigd.checks.rows import Verdict
 from rigd.profile import load_profile
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from analysis.identify import Measurement, Plant
-from analysis.identify._comparison import Comparison
+from analysis.identify import Comparison, Measurement, Plant
 from analysis.identify._drag_torque import DragLaw, DragResponse
 from rigd.beam import Damping, PointForceGrid
-from rigd.sim._plant import SimulatedPlant
+from rigd.sim import SimulatedPlant
 
 DRAG_M = 2.3e-3
 RATE_HZ = 1000.0

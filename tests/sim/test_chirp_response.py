@@ -32,7 +32,7 @@ from rigd.devices.parameters import (
     Selection,
     WrenchSensor,
 )
-from rigd.sim._plant import SimulatedPlant
+from rigd.sim import SimulatedPlant
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 PERIOD_S = 1e-3

@@ -16,9 +16,9 @@ from resting_beams import pressing_force_n
 from shipped_profile import load_shipped
 
 from rigd.beam import Damping, PointForceGrid
-from rigd.devices import ObstacleError
+from rigd.devices.obstacles import ObstacleError
+from rigd.sim import SimulatedPlant
 from rigd.sim._obstacle import _Wall
-from rigd.sim._plant import SimulatedPlant
 
 RIG = load_shipped("sim").rig
 BEAM, DAMPING = RIG.beam, RIG.damping

@@ -16,7 +16,7 @@ from rigd.devices.parameters import (
     Selection,
     WrenchSensor,
 )
-from rigd.sim._plant import SimulatedPlant
+from rigd.sim import SimulatedPlant
 
 MOTOR = Motor(
     inertia_kg_m2=2e-3,

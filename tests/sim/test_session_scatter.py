@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.devices import ObstacleError
+from rigd.devices.obstacles import ObstacleError
 from rigd.sim import SimulatedPlant, SimulatedRig, session_parameters
 
 SCATTER = {

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.devices._registry import open_devices
+from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Selection
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 
 PERIOD_NS = 1_000_000
 

@@ -7,7 +7,7 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.beam import LoadedBeam, PointForceGrid
-from rigd.sim._plant import OtherClock, SimulatedPlant
+from rigd.sim import SimulatedPlant
 
 TICKS = 12_000
 RATE_HZ = 1000.0
@@ -112,13 +112,3 @@ def test_a_slower_clock_shows_the_torque_ever_older(rig):
     )
     assert np.std(older - seen) < 2e-3 * np.std(usual)
     assert np.std(older - usual) > 0.1 * np.std(usual)
-
-
-def test_a_line_of_readings_grows_older():
-    line = OtherClock(periods=1, growth=0.25)
-    seen = []
-    for tick in range(1, 40):
-        line.append(float(tick))
-        seen.append(line[0])
-    expected = [tick - 1 - 0.25 * tick for tick in range(1, 40)]
-    assert seen[8:] == pytest.approx(expected[8:])

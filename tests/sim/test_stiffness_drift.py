@@ -10,10 +10,11 @@ from shipped_profile import load_shipped
 
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues
 from rigd.beam.realisation import RealisationError, realise
-from rigd.sim._plant import SimulatedPlant
-from rigd.sim._stiffness_drift import MOST_DRIFT
+from rigd.sim import SimulatedPlant
 
 RATE_HZ = 1000.0
+MOST_DRIFT = 0.05
+"""Share of the stiffness at which a drift ends."""
 FASTEST = 1e-3
 STATE = (
     "angle_rad", "velocity_rad_s", "coupling_torque_nm", "base_shear_n",

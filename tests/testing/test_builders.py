@@ -1,6 +1,7 @@
 """`rigd.testing`: what it builds is what it says, and its checks refuse what is wrong."""
 
 import doctest
+import inspect
 import re
 import subprocess
 import sys
@@ -15,12 +16,13 @@ from rigd import testing
 from rigd.beam import Beam, Damping
 from rigd.devices import open_devices
 from rigd.profile import load_profile
-from rigd.testing import _profiles, _sessions
 
 
-@pytest.mark.parametrize("module", [_profiles, _sessions], ids=lambda module: module.__name__)
-def test_the_examples_run_as_written(module):
-    failed, tried = doctest.testmod(module)
+@pytest.mark.parametrize(
+    "offered", [testing.write_profile, testing.chirp_signals], ids=lambda offered: offered.__name__
+)
+def test_the_examples_run_as_written(offered):
+    failed, tried = doctest.testmod(inspect.getmodule(offered))
     assert (failed, tried > 3) == (0, True)
 
 

@@ -5,14 +5,13 @@ import pytest
 from struck_beam import cut
 
 from rigd.touch import FreeBeam
-from rigd.touch._kernels import places
 
 
 @pytest.fixture(scope="module")
 def motions(model, struck):
     """Of one record, at many places, and at three of them alone."""
     record = cut(struck["middle"], 50)
-    x_m = places(model.beam.length_m, 0.007)
+    x_m = np.linspace(0.1, 1.0, 128) * model.beam.length_m
     beam = FreeBeam(model, x_m, record.rate_hz, record.angle_rad.size)
     some = [0, 70, -1]
     quiet = record.detected - 13

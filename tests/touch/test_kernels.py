@@ -1,10 +1,13 @@
-"""Contact kernels against closed forms and sums of modes."""
+"""Contact kernels against closed forms and sums of modes, and as a sensor's filter shows them."""
+
+from math import pi, sqrt
 
 import numpy as np
 import pytest
 from touch_records import DAMPED, LINK
 
 from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
+from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
     Hat,
     Line,
@@ -111,3 +114,34 @@ def test_few_nodes_tell_a_wave_at_all_places():
     at_places, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
     assert np.abs(between @ at_nodes - at_places).max() < 1e-7
     assert x_m[0] < nodes.min() < nodes.max() < x_m[-1]
+
+
+# What a filter of the sensor makes of them
+
+
+def test_a_mean_of_records_is_the_mean_of_late_kernels(at_point):
+    mean = SensorFilter(weights=(0.25,) * 4, spacing_s=2 * STEP_S)
+    seen = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, mean)
+    for name in ("torque", "shear"):
+        plain = getattr(at_point, name)[0]
+        late = [np.concatenate([np.zeros(2 * i), plain[: 400 - 2 * i]]) for i in range(4)]
+        assert getattr(seen, name)[0] == pytest.approx(
+            np.mean(late, axis=0), abs=2e-3 * np.abs(plain).max()
+        )
+    # The obstacle feels the beam, not the sensor.
+    assert np.array_equal(seen.displacement, at_point.displacement)
+    assert mean.weights_delay_s == 3 * STEP_S
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_low_pass_filter_is_the_one_of_the_books(at_point, order):
+    corner = 2 * pi * 150.0
+    low_pass = SensorFilter(corner_hz=150.0, order=order)
+    seen = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, low_pass)
+    u = np.array([1 / corner, 1.0])
+    from scipy.signal import TransferFunction, lsim  # half a second for every worker
+
+    system = TransferFunction([1.0], u if order == 1 else [u[0] ** 2, sqrt(2) * u[0], 1.0])
+    _, told, _ = lsim(system, at_point.shear[0], np.arange(400) * STEP_S)
+    assert seen.shear[0] == pytest.approx(told, abs=1e-2 * np.abs(told).max())
+    assert abs(low_pass.response(1j * corner)) == pytest.approx(sqrt(0.5))

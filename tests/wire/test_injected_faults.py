@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.devices._wired_rig import reset_drive
+from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
-from rigd.runner._rig import RigError
+from rigd.runner import RigError
 from rigd.session import read_session
 from rigd.session.layout import Status
-from rigd.sim.wire._simulator import inject
+from rigd.sim.wire import inject
 
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}

@@ -8,11 +8,10 @@ import pytest
 
 from rigd.devices.parameters import Selection
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import Order, Rig
+from rigd.runtime import StopRequest
 from rigd.session import read_session
-from rigd.sim.wire._simulator import inject
+from rigd.sim.wire import inject
 
 # Of the devices alone all of these are compared in tests/sim/wire/process: of whole sessions those
 # in which the loop itself does something else, or another line is read.

@@ -15,7 +15,7 @@ from struct import pack, unpack
 
 import numpy as np
 
-from rigd.devices import Wrench
+from rigd.devices.contracts import Wrench
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
 """Gauge at each place of a reading, on CAN and on the serial line."""

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from functools import partial
 from math import ceil
 
-from rigd.devices import DeviceError, LineHealth, RigParameters, Wrench
 from rigd.devices.ati import _netcanoem as netcanoem
 from rigd.devices.ati._calibration import (
     CAN_BAD_CALIBRATION,
@@ -20,6 +19,8 @@ from rigd.devices.ati._calibration import (
 )
 from rigd.devices.ati._netcanoem import REPLY_LENGTHS, Answer, GaugePolls, identifier
 from rigd.devices.canbus import CanExchange, CanLink
+from rigd.devices.contracts import DeviceError, LineHealth, Wrench
+from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
 _TRIES = 3

@@ -12,9 +12,10 @@ they are, a tick is left without a poll.
 import time
 from struct import Struct, unpack
 
-from rigd.devices import DeviceError
 from rigd.devices.ati._calibration import text_of
-from rigd.devices.canbus import CanExchange, ReplyPairing, pack_frame
+from rigd.devices.canbus import CanExchange, ReplyPairing
+from rigd.devices.canbus.port import pack_frame
+from rigd.devices.contracts import DeviceError
 
 GAUGES = 0x0
 GAUGES_REST = 0x1

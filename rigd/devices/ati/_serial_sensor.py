@@ -12,10 +12,12 @@ from struct import Struct
 
 import numpy as np
 
-from rigd.devices import DeviceError, LineHealth, RigParameters, SimulatorAddress, Wrench
 from rigd.devices.ati._calibration import SERIAL_CRITICAL, CalibrationBlock, serial_status
 from rigd.devices.ati._serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
 from rigd.devices.ati._serial_setup import SILENCE_S, SerialLine, SerialSetup, held_back
+from rigd.devices.contracts import DeviceError, LineHealth, Wrench
+from rigd.devices.parameters import RigParameters
+from rigd.devices.running_simulator import SimulatorAddress
 
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 # The error bit is not covered by the checksum; one flipped bit must not end a session.

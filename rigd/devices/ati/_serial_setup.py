@@ -14,7 +14,6 @@ from pathlib import Path
 
 import serial
 
-from rigd.devices import AtiSerial, DeviceError
 from rigd.devices.ati import _serial_protocol as modbus
 from rigd.devices.ati._calibration import (
     BLOCK_REGISTERS,
@@ -23,6 +22,8 @@ from rigd.devices.ati._calibration import (
     parse_block,
     same_serial_number,
 )
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import AtiSerial
 
 _READ_SIZE = 65_536
 

@@ -1,8 +1,8 @@
 """The CAN bus under the drivers: frames, ports to send and receive them, and the exchange.
 
-A port (`open_port`) carries frames of the kernel's ``struct can_frame`` without blocking. Where the
-kernel has CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket that
-carries the same 16 bytes; every other adapter goes through python-can. The drivers see no
+A port (`port.open_port`) carries frames of the kernel's ``struct can_frame`` without blocking.
+Where the kernel has CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket
+that carries the same 16 bytes; every other adapter goes through python-can. The drivers see no
 difference: `CanExchange` routes frames to them, `ReplyPairing` tells which request a reply answers,
 `bus_load` and `check_identifiers` judge a profile before anything is connected.
 """

@@ -5,10 +5,3 @@ from ._budget import check_identifiers as check_identifiers
 from ._exchange import CanExchange as CanExchange
 from ._exchange import CanLink as CanLink
 from ._exchange import ReplyPairing as ReplyPairing
-from ._port import BUS_OFF_FRAME as BUS_OFF_FRAME
-from ._port import FRAME_SIZE as FRAME_SIZE
-from ._port import CanPort as CanPort
-from ._port import SocketPort as SocketPort
-from ._port import open_port as open_port
-from ._port import pack_frame as pack_frame
-from ._port import unpack_frame as unpack_frame

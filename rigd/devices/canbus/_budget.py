@@ -10,7 +10,7 @@ The bus load counts every cyclic frame with the most bits that may be stuffed in
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rigd.devices import AtiCan, RigParameters, ServoDrive
+from rigd.devices.parameters import AtiCan, RigParameters, ServoDrive
 
 # Identifiers
 

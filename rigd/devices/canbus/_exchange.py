@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rigd.devices import CanBus, DeviceError, SimulatorAddress
 from rigd.devices.canbus._budget import FRAME_BITS
-from rigd.devices.canbus._port import (
+from rigd.devices.canbus.port import (
     BUS_OFF,
     ERROR_FLAG,
     ERROR_MASK,
@@ -26,6 +25,9 @@ from rigd.devices.canbus._port import (
     open_port,
     read_head,
 )
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.running_simulator import SimulatorAddress
 from rigd.runtime import HeldError, HeldFile
 
 # Pairing of replies

@@ -5,7 +5,7 @@ import time
 
 import can
 
-from rigd.devices.canbus._port import (
+from rigd.devices.canbus.port import (
     ERROR_FLAG,
     ERROR_MASK,
     LONG_FLAG,

@@ -1,12 +1,5 @@
 from ._assignments import parse_assignment as parse_assignment
 from ._drive import Cia402Drive as Cia402Drive
-from ._objects import MAX_SPEED_RPM as MAX_SPEED_RPM
-from ._objects import RATED_TORQUE as RATED_TORQUE
-from ._requirements import ACCEPTABLE as ACCEPTABLE
-from ._requirements import TORQUE_FEEDBACK as TORQUE_FEEDBACK
-from ._requirements import TORQUE_LIMIT as TORQUE_LIMIT
-from ._requirements import WATCHDOG as WATCHDOG
-from ._requirements import Watchdog as Watchdog
 from ._setup import Outfit as Outfit
 from ._suitability import Finding as Finding
 from ._suitability import Grade as Grade

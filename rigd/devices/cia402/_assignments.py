@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from rigd.devices.cia402._requirements import REQUIREMENTS, Access
+from rigd.devices.cia402.requirements import REQUIREMENTS, Access
 
 KINDS: Final = {
     "u8": (0, 0xFF),

@@ -8,10 +8,8 @@ refused by :meth:`Cia402Drive.connect` already.
 from collections.abc import Callable
 from math import isnan
 
-from rigd.devices import DeviceError, LineHealth, RigParameters
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.cia402._node import Node, ReceivedFrames
-from rigd.devices.cia402._objects import ACTUAL_TORQUE, HEARTBEAT_CONSUMER, HEARTBEAT_PRODUCER_MS
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
@@ -23,7 +21,6 @@ from rigd.devices.cia402._protocol import (
     NodeFrames,
     state_of,
 )
-from rigd.devices.cia402._requirements import Watchdog, torque_limit_per_mille
 from rigd.devices.cia402._setup import Outfit, set_up
 from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.cia402._transitions import (
@@ -33,6 +30,10 @@ from rigd.devices.cia402._transitions import (
     step_up,
     switch_off,
 )
+from rigd.devices.cia402.objects import ACTUAL_TORQUE, HEARTBEAT_CONSUMER, HEARTBEAT_PRODUCER_MS
+from rigd.devices.cia402.requirements import Watchdog, torque_limit_per_mille
+from rigd.devices.contracts import DeviceError, LineHealth
+from rigd.devices.parameters import RigParameters
 
 _HALF_TURN = 1 << 31
 _ALL_COUNTS = (1 << 32) - 1

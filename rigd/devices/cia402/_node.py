@@ -5,7 +5,6 @@ from collections.abc import Callable
 from math import ceil
 from struct import error as LengthError  # noqa: N812
 
-from rigd.devices import DeviceError, RigParameters, wired_stop_dropped
 from rigd.devices.canbus import CanExchange, ReplyPairing
 from rigd.devices.cia402._protocol import (
     BOOT_UP,
@@ -22,6 +21,8 @@ from rigd.devices.cia402._protocol import (
     unpack_short_tpdo,
     unpack_tpdo,
 )
+from rigd.devices.contracts import DeviceError, wired_stop_dropped
+from rigd.devices.parameters import RigParameters
 
 _TOGGLE_BIT = 0x80
 

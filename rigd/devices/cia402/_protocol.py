@@ -4,15 +4,15 @@
 
 `NodeFrames` holds the frames of one CANopen node, to send and to read; CANopen is little-endian.
 Identifiers are those of the predefined connection set (CiA 301). Frames are packed once, except for
-the torque. Indices of objects are in :mod:`rigd.devices.cia402._objects`.
+the torque. Indices of objects are in :mod:`rigd.devices.cia402.objects`.
 """
 
 from enum import Enum
 from struct import Struct
 from typing import Final
 
-from rigd.devices.canbus import FRAME_SIZE, pack_frame
-from rigd.devices.cia402._objects import (
+from rigd.devices.canbus.port import FRAME_SIZE, pack_frame
+from rigd.devices.cia402.objects import (
     CONTROLWORD,
     HEARTBEAT_CONSUMER,
     MODE_DISPLAY,

@@ -26,11 +26,12 @@ from canopen.objectdictionary import (
 from canopen.sdo.base import SdoVariable
 from canopen.sdo.client import SdoClient
 
-from rigd.devices import DeviceError, EdsError, read_eds
-from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _objects as objects
+from rigd.devices.canbus.port import CanPort
+from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import Assignment
 from rigd.devices.cia402._protocol import NMT_PRE_OPERATIONAL
+from rigd.devices.contracts import DeviceError
+from rigd.devices.eds import EdsError, read_eds
 
 EVERY_BIT = 0xFFFF_FFFF
 """Mask of an object all of whose bits count."""

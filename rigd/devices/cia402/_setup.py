@@ -1,6 +1,6 @@
 """Set-up of the drive, in pre-operational, before the cycle starts.
 
-What is asked of it stands in :mod:`rigd.devices.cia402._requirements`. An object that holds what is
+What is asked of it stands in :mod:`rigd.devices.cia402.requirements`. An object that holds what is
 needed is left alone, for it may be read-only; one that is absent or cannot be changed is judged by
 its row there.
 """
@@ -8,11 +8,12 @@ its row there.
 from dataclasses import dataclass
 from math import tau
 
-from rigd.devices import DeviceError, RigParameters, ServoDrive
-from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _objects as objects
+from rigd.devices.canbus.port import CanPort
+from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
-from rigd.devices.cia402._requirements import (
+from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
+from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
+from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
     WATCHDOG,
@@ -23,8 +24,8 @@ from rigd.devices.cia402._requirements import (
     wanted_values,
     watchdog,
 )
-from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
-from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters, ServoDrive
 
 _READ_ONLY = 0x0601_0002
 _ABORTS = {

@@ -8,9 +8,8 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from rigd.devices import DeviceError, RigParameters
-from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _objects as objects
+from rigd.devices.canbus.port import CanPort
+from rigd.devices.cia402 import objects
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     FAULT_BIT,
@@ -23,6 +22,8 @@ from rigd.devices.cia402._protocol import (
     state_of,
 )
 from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
 
 _POLL_S = 0.01
 _OFF_S = 0.2

@@ -1,6 +1,6 @@
 """Suitability of a drive for torque control, judged by its EDS file before it is connected.
 
-The file is compared with the table of :mod:`rigd.devices.cia402._requirements`, which the set-up
+The file is compared with the table of :mod:`rigd.devices.cia402.requirements`, which the set-up
 goes by. What it does not state the drive is asked when it is connected.
 """
 
@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from rigd.devices import Eds, EdsEntry
-from rigd.devices.cia402 import _objects as objects
-from rigd.devices.cia402._requirements import (
+from rigd.devices.cia402 import objects
+from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     REQUIREMENTS,
     WATCHDOG,
@@ -24,9 +23,10 @@ from rigd.devices.cia402._requirements import (
     wanted_values,
     watchdog,
 )
+from rigd.devices.eds import Eds, EdsEntry
 
 if TYPE_CHECKING:
-    from rigd.devices import RigParameters, ServoDrive
+    from rigd.devices.parameters import RigParameters, ServoDrive
 
 
 class Grade(Enum):

@@ -6,9 +6,7 @@ from contextlib import suppress
 from math import ceil, exp
 from typing import Final
 
-from rigd.devices import DeviceError, wired_stop_dropped
 from rigd.devices.cia402._node import Node
-from rigd.devices.cia402._objects import CONTROLWORD, CYCLIC_TORQUE
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
@@ -21,6 +19,8 @@ from rigd.devices.cia402._protocol import (
     read_mode,
     state_of,
 )
+from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE
+from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
 _FOREIGN_COMMAND: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"

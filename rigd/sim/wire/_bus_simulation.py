@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any, Protocol
 
 from rigd.beam.realisation import RealisationError
-from rigd.devices import Obstacle, ObstacleError
-from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
+from rigd.devices.canbus.port import BUS_OFF_FRAME, pack_frame, unpack_frame
+from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig, Stuck
 from rigd.sim.wire._faults import (

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from rigd.devices import Encounter, ObstacleError, parse_obstacle
 from rigd.devices.contracts import DeviceError
+from rigd.devices.obstacles import Encounter, ObstacleError, parse_obstacle
 from rigd.errors import UserError
 
 
@@ -124,7 +124,7 @@ _MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
 ENCOUNTERS = ("obstacle", "knock")
-"""Kinds that the beam meets; their keys are those of `rigd.devices.parse_obstacle`."""
+"""Kinds that the beam meets; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from rigd.devices.canbus import FRAME_SIZE
+from rigd.devices.canbus.port import FRAME_SIZE
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from struct import Struct, calcsize
 from typing import Final
 
-from rigd.devices import EdsEntry, EdsError, read_eds
 from rigd.devices.contracts import DeviceError
+from rigd.devices.eds import EdsEntry, EdsError, read_eds
 
 # Objects
 

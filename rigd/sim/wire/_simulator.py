@@ -20,19 +20,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigd.devices import (
+from rigd.devices import describe_unknown_values, fresh_seed, session_seed
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+from rigd.devices.running_simulator import (
     SimulatorAddress,
     announce,
     ask_simulator,
-    describe_unknown_values,
     described,
     find_simulator,
     forget,
-    fresh_seed,
-    session_seed,
 )
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import RigParameters
 from rigd.runtime import runtime_folder
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation

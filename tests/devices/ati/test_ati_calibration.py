@@ -237,6 +237,17 @@ def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_unit
         json.dumps(replace(block.calibration).as_dict(), allow_nan=False)
 
 
+@given(damage=st.dictionaries(st.integers(0, 132), st.integers(0, 0xFFFF), max_size=5))
+def test_a_damaged_calibration_block_is_read_or_refused(fakes, damage):
+    registers = fakes.calibration_registers()[:133]
+    for at, word in damage.items():
+        registers[at] = word
+    try:
+        json.dumps(parse_block(registers).calibration.as_dict(), allow_nan=False)
+    except ValueError as error:
+        assert str(error).endswith(("calibration.", "sensor repaired."))
+
+
 def test_status_words():
     assert can_status(0) == serial_status(0) == []
     assert can_status(0x8001) == ["its watchdog has reset the board"]

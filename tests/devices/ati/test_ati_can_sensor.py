@@ -3,17 +3,15 @@
 import json
 import math
 import socket
-import struct
 import threading
 from dataclasses import replace
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.ati import _netcanoem as netcanoem
-from rigd.devices.ati._can_sensor import AtiCanSensor
+from rigd.devices.ati import AtiCanSensor
 from rigd.devices.canbus import CanLink
 from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import SimulatorAddress
 
 
 class Bench:
@@ -57,27 +55,6 @@ def expected_wrench(fakes, gauges, counts=(1_000_000, 2_000_000)):
         sum(m * g for m, g in zip(row, gauges, strict=True)) / counts[axis // 3]
         for axis, row in enumerate(fakes.MATRIX)
     ]
-
-
-def test_requests_have_the_published_bytes():
-    assert netcanoem.request(0x20, 0x0) == struct.pack("=IB3x8s", 0x200, 0, b"")
-    assert netcanoem.request(0x7F, 0x2, 5) == struct.pack("=IB3x8s", 0x7F2, 1, b"\x05")
-    assert netcanoem.request(0x20, 0x5) == struct.pack("=IB3x8s", 0x205, 0, b"")
-    assert netcanoem.request(0x20, 0x6, 15) == struct.pack("=IB3x8s", 0x206, 1, b"\x0f")
-    assert netcanoem.request(0x20, 0x7) == struct.pack("=IB3x8s", 0x207, 0, b"")
-    assert netcanoem.request(0x20, 0x8) == struct.pack("=IB3x8s", 0x208, 0, b"")
-    assert netcanoem.request(0x20, 0xF) == struct.pack("=IB3x8s", 0x20F, 0, b"")
-
-
-def test_replies_are_big_endian():
-    assert netcanoem.read_gauges(bytes.fromhex("8001 0102 FFFE 7FFF")) == (0x8001, 258, -2, 32767)
-    assert netcanoem.read_gauges_rest(bytes.fromhex("8000 0001 FF00")) == (-32768, 1, -256)
-    # 1.0, -2.0, 0.5, 100.0, -0.25, 8000.0 as IEEE-754
-    row = bytes.fromhex("3F800000 C0000000 3F000000 42C80000 BE800000 45FA0000")
-    assert netcanoem.matrix_row(row) == (1.0, -2.0, 0.5, 100.0, -0.25, 8000.0)
-    assert netcanoem.serial_number(b"FT12345\0") == "FT12345"
-    assert netcanoem.counts_per_unit(bytes.fromhex("000F4240 001E8480")) == (1_000_000, 2_000_000)
-    assert netcanoem.firmware(bytes.fromhex("03 08 0102")) == (3, 8, 258)
 
 
 def test_connecting_selects_the_calibration_and_reads_it_before_the_first_poll(bench):

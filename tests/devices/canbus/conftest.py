@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from rigd.devices.canbus._port import SocketPort
+from rigd.devices.canbus.port import SocketPort
 
 
 @dataclass

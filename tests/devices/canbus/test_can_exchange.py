@@ -5,7 +5,8 @@ import time
 
 import pytest
 
-from rigd.devices.canbus import CanExchange, pack_frame
+from rigd.devices.canbus import CanExchange
+from rigd.devices.canbus.port import pack_frame
 from rigd.devices.contracts import DeviceError
 
 ERROR = 0x2000_0000

@@ -8,7 +8,7 @@ from can.interfaces.socketcan.socketcan import build_can_frame, dissect_can_fram
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.devices.canbus import FRAME_SIZE, pack_frame, unpack_frame
+from rigd.devices.canbus.port import FRAME_SIZE, pack_frame, unpack_frame
 
 identifiers = st.integers(0, 0x7FF)
 payloads = st.binary(max_size=8)

@@ -5,11 +5,10 @@ import socket
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.canbus import CanLink
-from rigd.devices.canbus._exchange import BusLock
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
+from rigd.devices.running_simulator import SimulatorAddress
 
 SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
 
@@ -86,17 +85,20 @@ def test_a_bus_that_does_not_open_counts_no_user():
         _ = link.exchange
 
 
-def test_a_bus_is_used_by_one_program_at_a_time(runtime_folder):
-    first, second = BusLock("can0", simulated=True), BusLock("can0", simulated=True)
-    first.acquire()
+def test_a_bus_is_used_by_one_program_at_a_time(hub, link, runtime_folder):
+    link.open()
+    second = CanLink(SETTINGS, SimulatorAddress(1, "", can_socket=hub.getsockname()))
     with pytest.raises(
         DeviceError, match=rf"another rigd is using it \(rigd, process {os.getpid()}\)"
     ):
-        second.acquire()
-    other = BusLock("can1", simulated=True)
-    other.acquire()
-    other.release()
-    first.release()
-    second.acquire()
-    second.release()
-    second.release()
+        second.open()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other_hub:
+        other_hub.bind(str(runtime_folder / "other"))
+        other_hub.listen()
+        other = CanLink(SETTINGS, SimulatorAddress(1, "", can_socket=other_hub.getsockname()))
+        other.open()
+        other.close()
+    link.close()
+    second.open()
+    second.close()
+    second.close()

@@ -10,12 +10,11 @@ from dataclasses import replace
 import can
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.canbus import open_port, pack_frame, unpack_frame
-from rigd.devices.canbus._exchange import CanExchange
-from rigd.devices.canbus._port import PythonCanPort, SocketPort
+from rigd.devices.canbus import CanExchange
+from rigd.devices.canbus.port import SocketPort, open_port, pack_frame, unpack_frame
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
+from rigd.devices.running_simulator import SimulatorAddress
 
 SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
 
@@ -219,7 +218,7 @@ def adapter(request):
     channel = request.node.name
     port = open_port(CanBus("virtual", channel, 1_000_000), None)
     with can.Bus(interface="virtual", channel=channel) as beside:
-        assert isinstance(port, PythonCanPort)
+        assert not isinstance(port, SocketPort)
         yield port, beside
         port.close()
 
@@ -327,13 +326,24 @@ class Scripted:
         raise RuntimeError("no such thread")
 
 
+@pytest.fixture
+def scripted_port(monkeypatch):
+    """Make a port on an adapter of python-can that follows a script."""
+
+    def make(*script):
+        monkeypatch.setattr(can, "Bus", lambda **_: Scripted(*script))
+        return open_port(CanBus("slcan", "slcan0", 1_000_000), None)
+
+    return make
+
+
 @pytest.mark.parametrize(
     "failure", [ValueError("invalid literal"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start")]
 )
-def test_a_damaged_line_is_an_error_frame_and_the_next_one_counts(failure):
+def test_a_damaged_line_is_an_error_frame_and_the_next_one_counts(scripted_port, failure):
     got = []
     exchange = CanExchange(
-        PythonCanPort(Scripted(failure, message(0x181, b"a"), failure, message(0x181, b"b")), "it")
+        scripted_port(failure, message(0x181, b"a"), failure, message(0x181, b"b"))
     )
     exchange.subscribe(0x181, got.append)
     exchange.drain()
@@ -341,37 +351,37 @@ def test_a_damaged_line_is_an_error_frame_and_the_next_one_counts(failure):
     assert exchange.error_frames == 2
 
 
-def test_nineteen_damaged_lines_between_sound_ones_end_nothing():
+def test_nineteen_damaged_lines_between_sound_ones_end_nothing(scripted_port):
     script = [ValueError()] * 19 + [message(0x181)] + [ValueError()] * 19
-    exchange = CanExchange(PythonCanPort(Scripted(*script), "it"))
+    exchange = CanExchange(scripted_port(*script))
     exchange.drain()
     assert exchange.error_frames == 38
 
 
-def test_silence_and_the_controller_s_reports_do_not_make_damaged_lines_sound():
+def test_silence_and_the_controller_s_reports_do_not_make_damaged_lines_sound(scripted_port):
     script = [ValueError("odd"), None, message(1, bytes(8), is_error_frame=True)] * 20
-    exchange = CanExchange(PythonCanPort(Scripted(*script), "slcan0 (slcan)"))
+    exchange = CanExchange(scripted_port(*script))
     with pytest.raises(DeviceError, match=r"slcan0 \(slcan\).*20 times in a row.*ValueError: odd"):
         for _ in range(60):
             exchange.drain()
 
 
-def test_a_frame_of_can_fd_is_none_of_ours():
-    port = PythonCanPort(Scripted(message(0x181, bytes(64), is_fd=True)), "it")
+def test_a_frame_of_can_fd_is_none_of_ours(scripted_port):
+    port = scripted_port(message(0x181, bytes(64), is_fd=True))
     assert unpack_frame(port.receive())[0] & 0x2000_0000
 
 
 @pytest.mark.parametrize("failure", [can.CanOperationError("gone"), OSError(5, "gone")])
-def test_an_adapter_that_has_failed_is_told_at_once(failure):
-    port = PythonCanPort(Scripted(failure, failure), "it")
+def test_an_adapter_that_has_failed_is_told_at_once(scripted_port, failure):
+    port = scripted_port(failure, failure)
     with pytest.raises(DeviceError, match=r"it cannot be read .*gone"):
         port.receive()
     with pytest.raises(DeviceError, match=r"it cannot be read .*gone"):
         port.wait(0.1)
 
 
-def test_whatever_an_adapter_s_driver_raises_is_told_and_closing_is_silent():
-    port = PythonCanPort(Scripted(), "it")
+def test_whatever_an_adapter_s_driver_raises_is_told_and_closing_is_silent(scripted_port):
+    port = scripted_port()
     with pytest.raises(DeviceError, match=r"takes no more frames \(AssertionError\)"):
         port.send(pack_frame(0x80))
     port.close()

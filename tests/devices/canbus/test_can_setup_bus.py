@@ -1,16 +1,13 @@
 """Set-up through canopen on our ports, and that the port stays as it was."""
 
 import socket
-import sys
 
 import can
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from rigd.devices.canbus import pack_frame, unpack_frame
-from rigd.devices.canbus._port import SocketPort
-from rigd.devices.canbus._setup_bus import from_message, to_message
+from rigd.devices.canbus.port import SocketPort, pack_frame, unpack_frame
 
 NODE = 5
 
@@ -101,21 +98,29 @@ def test_frames_of_another_kind_are_not_taken_for_a_node_s(ends, flag):
 
 
 @pytest.mark.parametrize(
-    "message",
+    ("message", "can_id"),
     [
-        can.Message(arbitration_id=0x123, is_extended_id=False, data=b"abc"),
-        can.Message(arbitration_id=0x1234_5678, is_extended_id=True, data=b"abc"),
-        can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True),
-        can.Message(arbitration_id=0x44, is_extended_id=False, is_error_frame=True, data=bytes(8)),
+        ({"arbitration_id": 0x123, "is_extended_id": False}, 0x123),
+        ({"arbitration_id": 0x1234_5678, "is_extended_id": True}, 0x9234_5678),
+        (
+            {"arbitration_id": 0x123, "is_extended_id": False, "is_remote_frame": True},
+            0x4000_0123,
+        ),
+        ({"arbitration_id": 0x44, "is_extended_id": False, "is_error_frame": True}, 0x2000_0044),
     ],
     ids=["data", "long", "remote", "error"],
 )
-def test_messages_of_python_can_come_back_as_they_were(message):
-    assert to_message(from_message(message)).equals(message, timestamp_delta=None)
+def test_frames_are_sent_with_the_flags_of_the_kernel(ends, message, can_id):
+    port, far = ends
+    data = b"" if "is_remote_frame" in message else b"abc"
+    port.open_bus().send(can.Message(**message, data=data))
+    assert far.receive() == (can_id, data)
 
 
-def test_the_flags_are_those_of_the_kernel():
-    remote = can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True)
-    assert int.from_bytes(from_message(remote)[:4], sys.byteorder) == 0x4000_0123
-    long = can.Message(arbitration_id=0x123, is_extended_id=True)
-    assert int.from_bytes(from_message(long)[:4], sys.byteorder) == 0x8000_0123
+def test_an_error_frame_is_received_as_one(ends):
+    port, far = ends
+    far.send(0x2000_0044, bytes(8))
+    received = port.open_bus().recv(1.0)
+    assert received.is_error_frame
+    assert received.arbitration_id == 0x44
+    assert bytes(received.data) == bytes(8)

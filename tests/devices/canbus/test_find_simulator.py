@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress, announce, find_simulator
-from rigd.devices._simulator import runtime_folder as current_folder
+from rigd.devices.running_simulator import SimulatorAddress, announce, find_simulator
+from rigd.runtime import runtime_folder as current_folder
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.canbus._exchange import ReplyPairing
+from rigd.devices.canbus import ReplyPairing
 
 
 class Box:

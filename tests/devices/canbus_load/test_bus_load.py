@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.canbus._budget import Traffic, bus_load, frame_bits, sum_up, worst_frame_bits
+from rigd.devices.canbus import bus_load
 from rigd.profile import load_profile
 
 
@@ -37,25 +37,6 @@ def _binary(value, width):
     return [value >> shift & 1 for shift in reversed(range(width))]
 
 
-@settings(max_examples=200)
-@given(st.integers(0, 0x7FF), st.binary(max_size=8))
-def test_every_frame_lies_between_plain_and_worst(can_id, data):
-    bits = bits_on_the_wire(can_id, data)
-    assert frame_bits(len(data)) <= bits <= worst_frame_bits(len(data))
-
-
-@pytest.mark.parametrize(
-    ("length", "plain", "worst"),
-    [(0, 47, 55), (1, 55, 65), (2, 63, 75), (4, 79, 95), (6, 95, 115), (8, 111, 135)],
-)
-def test_bits_of_a_frame(length, plain, worst):
-    assert (frame_bits(length), worst_frame_bits(length)) == (plain, worst)
-
-
-def test_a_real_frame_comes_near_the_worst():
-    assert bits_on_the_wire(0x078, b"\x3c" * 8) >= worst_frame_bits(8) - 4
-
-
 @pytest.fixture(scope="module")
 def can_rig():
     return load_profile("antenna_can").rig
@@ -64,6 +45,28 @@ def can_rig():
 @pytest.fixture(scope="module")
 def serial_rig():
     return load_profile("antenna_serial").rig
+
+
+def bits_per_second(frames, data_of):
+    return sum(each.rate_hz * bits_on_the_wire(each.can_id, data_of(each)) for each in frames)
+
+
+@settings(max_examples=100)
+@given(st.data())
+def test_the_load_of_any_data_lies_between_plain_and_worst(can_rig, data):
+    load = bus_load(can_rig)
+    load_of_data = bits_per_second(
+        load.traffic,
+        lambda frame: data.draw(st.binary(min_size=frame.length, max_size=frame.length)),
+    )
+    assert load.plain * 1e6 <= load_of_data <= load.worst * 1e6
+
+
+def test_real_frames_come_near_the_worst(can_rig):
+    """Data of 3C has a bit stuffed after every four; heads and checksums are as they are."""
+    load = bus_load(can_rig)
+    stuffed = bits_per_second(load.traffic, lambda frame: b"\x3c" * frame.length)
+    assert stuffed > load.worst * 1e6 - 9 * load.frames_per_s
 
 
 def test_motor_and_sensor_at_1_mbit(can_rig):
@@ -109,8 +112,3 @@ def test_frames_carry_the_identifiers_of_the_profile(can_rig):
 def test_no_bus_no_load():
     with pytest.raises(ValueError, match="no CAN bus"):
         bus_load(load_profile("sim").rig)
-
-
-def test_an_idle_bus():
-    assert sum_up((), 1e6).worst == 0
-    assert sum_up((Traffic("", 1, 8, 100.0),), 1e6).worst == pytest.approx(0.0135)

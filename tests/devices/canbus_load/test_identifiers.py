@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.devices.canbus._budget import check_identifiers
+from rigd.devices.canbus import check_identifiers
 from rigd.profile import load_profile
 
 RIG = load_profile("antenna_can").rig

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.canbus import CanLink
-from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.parameters import Acquisition, CanBus, ServoDrive
+from rigd.devices.running_simulator import SimulatorAddress
 from rigd.profile import load_profile
 
 NODE, HOST = 5, 100

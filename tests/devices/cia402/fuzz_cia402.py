@@ -9,7 +9,7 @@ import sys
 import time
 
 from rigd.devices.canbus import CanExchange
-from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.cia402._node import Node
 from rigd.devices.contracts import DeviceError
 

@@ -11,13 +11,9 @@ import canopen
 import pytest
 
 import rigd.devices.cia402 as package
-from rigd.devices._simulator import SimulatorAddress
-from rigd.devices.canbus import CanExchange, open_port
-from rigd.devices.canbus._port import SocketPort
-from rigd.devices.cia402._setup import set_up
-from rigd.devices.cia402._standing import reset_fault
+from rigd.devices.canbus.port import SocketPort
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import CanBus
 
 NODE = 5
 EDS = str(Path(package.__file__).with_name("drive.eds"))
@@ -109,6 +105,14 @@ def node(path):
         lambda index, subindex, od: node.sdo[0x6060].raw if index == 0x6061 else None
     )
     network.add_node(node)
+
+    def on_sync(*_):
+        # The library's node answers no SYNC by itself: switch-on disabled, position and torque 0.
+        network.send_message(0x180 + NODE, bytes.fromhex("5002000000000000"))
+        operational = node.nmt.state == "OPERATIONAL"
+        network.send_message(0x700 + NODE, b"\x05" if operational else b"\x7f")
+
+    network.subscribe(0x80, on_sync)
     yield node
     node.nmt.stop_heartbeat()
     for thread in threading.enumerate():
@@ -119,15 +123,32 @@ def node(path):
 
 
 @pytest.fixture
-def port(path):
-    address = SimulatorAddress(pid=1, control_socket="", can_socket=path)
-    port = open_port(CanBus("socketcan", "can0", 1_000_000), address)
-    yield port
-    port.close()
+def make_drive(node, path, link_to):
+    drives = []
+
+    def make(rig):
+        drives.append(Cia402Drive(rig, link_to(path)))
+        return drives[-1]
+
+    yield make
+    for drive in drives:
+        drive.close()
 
 
-def test_the_whole_set_up(node, port, rig):
-    identity = set_up(port, rig, "Drive").identity
+@pytest.fixture
+def connect(make_drive, rig):
+    """Connect the driver to the node; return what it found it to have."""
+
+    def connect(rig=rig):
+        drive = make_drive(rig)
+        drive.connect()
+        return drive.outfit()
+
+    return connect
+
+
+def test_the_whole_set_up(node, connect, rig):
+    identity = connect().identity
     assert identity["device_name"] == "CANOPEN NODE"
     assert identity["serial_number"] == 4
 
@@ -150,11 +171,11 @@ def test_the_whole_set_up(node, port, rig):
     assert (raw(0x1800, 1), raw(0x1800, 2)) == ("85 01 00 40", "01")
     assert (raw(0x1400, 1), raw(0x1400, 2)) == ("05 02 00 00", "01")
     assert (raw(0x1801, 1), raw(0x1401, 1)) == ("85 02 00 c0", "05 03 00 80")
-    assert node.nmt.state == "PRE-OPERATIONAL"
+    assert node.nmt.state == "OPERATIONAL"
 
 
-def test_what_canopen_itself_reads_of_the_pdos(node, port, rig):
-    set_up(port, rig, "Drive")
+def test_what_canopen_itself_reads_of_the_pdos(node, connect, rig):
+    connect()
     for pdo in (node.tpdo[1], node.rpdo[1]):
         pdo.read(from_od=False)
     assert node.tpdo[1].cob_id == 0x185
@@ -168,30 +189,30 @@ def test_what_canopen_itself_reads_of_the_pdos(node, port, rig):
     assert node.rpdo[1].trans_type == 1
 
 
-def test_a_node_without_an_object(node, port, rig):
+def test_a_node_without_an_object(node, connect, rig):
     del node.object_dictionary[0x6007]
     with pytest.raises(DeviceError, match=r"no object 6007.*\"abort_option\""):
-        set_up(port, rig, "Drive")
+        connect()
 
 
-def test_limits_that_are_read_only_as_elmos(node, port, rig):
+def test_limits_that_are_read_only_as_elmos(node, connect, rig):
     for index in (0x60E0, 0x60E1):
         entry = node.object_dictionary[index]
         node.sdo[index].raw = 50_000
         entry.access_type = "ro"
-    outfit = set_up(port, rig, "Drive")
+    outfit = connect()
     assert outfit.has(0x60E0)
     assert outfit.accepted == ()
 
 
-def test_a_limit_that_is_read_only_and_too_low(node, port, rig):
+def test_a_limit_that_is_read_only_and_too_low(node, connect, rig):
     node.sdo[0x60E1].raw = 500
     node.object_dictionary[0x60E1].access_type = "ro"
     with pytest.raises(DeviceError, match=r"60E1 .*is 500, needed is 1800.*read-only"):
-        set_up(port, rig, "Drive")
+        connect()
 
 
-def test_objects_that_are_missing_as_maxons(node, port, rig):
+def test_objects_that_are_missing_as_maxons(node, connect, rig):
     for index in (0x6072, 0x1006):
         del node.object_dictionary[index]
     limit = canopen.objectdictionary.ODVariable("Output current limit", 0x3001, 2)
@@ -202,20 +223,20 @@ def test_objects_that_are_missing_as_maxons(node, port, rig):
     settings = replace(
         rig.cia402, accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",)
     )
-    outfit = set_up(port, replace(rig, cia402=settings), "Drive")
+    outfit = connect(replace(rig, cia402=settings))
     assert node.get_data(0x3001, 2).hex(" ") == "c4 09 00 00"
     assert {row.place for row in outfit.lacks} >= {"6072", "1006"}
     assert outfit.accepted == ("torque_limit",)
     assert node.get_data(0x1A00, 0) == b"\x03"
 
 
-def test_a_node_without_any_watchdog(node, port, rig):
+def test_a_node_without_any_watchdog(node, connect, rig):
     del node.object_dictionary[0x1016]
     with pytest.raises(DeviceError, match=r"no object 1016:1.*own_watchdog_s"):
-        set_up(port, rig, "Drive")
+        connect()
 
 
-def test_the_bytes_of_a_fault_reset(node, port, rig):
+def test_the_bytes_of_a_fault_reset(node, make_drive, rig):
     node.sdo[0x6041].raw = 0x0218
     node.sdo[0x603F].raw = 0x3220
     words = []
@@ -228,16 +249,5 @@ def test_the_bytes_of_a_fault_reset(node, port, rig):
                 node.sdo[0x6041].raw = 0x0231 if data[0] == 0x06 else 0x0250
 
     node.add_write_callback(on_write)
-    assert "under-voltage" in reset_fault(port, rig, "Drive")
+    assert "under-voltage" in make_drive(rig).reset_fault()
     assert [word[0] for word in words] == [0x00, 0x00, 0x80, 0x00, 0x06, 0x00]
-
-
-def test_the_port_is_free_for_the_cycle_afterwards(node, port, rig):
-    set_up(port, rig, "Drive")
-    exchange = CanExchange(port)
-    heard = []
-    exchange.subscribe(0x700 + NODE, heard.append)
-    exchange.start()
-    deadline = 10**18
-    assert exchange.wait_until(lambda: bool(heard), deadline)
-    assert heard[0] == b"\x7f"

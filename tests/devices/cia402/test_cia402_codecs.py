@@ -1,6 +1,5 @@
 """Golden bytes of every frame, written by hand from CiA 301 and 402, and tables in full."""
 
-import struct
 from collections import Counter
 from pathlib import Path
 
@@ -8,26 +7,15 @@ import canopen
 import pytest
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import datatypes
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import rigd.devices.cia402 as package
-from rigd.devices.canbus import unpack_frame
-from rigd.devices.cia402 import _objects as objects
-from rigd.devices.cia402 import _protocol as states
-from rigd.devices.cia402._node import ReceivedFrames
-from rigd.devices.cia402._protocol import (
-    DriveState,
-    NodeFrames,
-    describe_error,
-    is_written,
-    read_emergency,
-    read_mode,
-    state_of,
-    unpack_tpdo,
-)
+from rigd.devices.canbus.port import unpack_frame
+from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import objects
 
-FRAMES = NodeFrames(5, 100)
+FRAMES = protocol.NodeFrames(5, 100)
 EDS = Path(package.__file__).with_name("drive.eds")
 
 
@@ -56,7 +44,7 @@ def test_frames_sent(frame, can_id, data):
 
 
 def test_identifiers_of_the_drives_frames():
-    last = NodeFrames(127, 1)
+    last = protocol.NodeFrames(127, 1)
     assert (last.tpdo_id, last.emergency_id, last.heartbeat_id, last.reply_id, last.rpdo_id) == (
         0x1FF, 0x0FF, 0x77F, 0x5FF, 0x27F,
     )  # fmt: skip
@@ -73,7 +61,7 @@ def test_identifiers_of_the_drives_frames():
     ],
 )
 def test_tpdo(data, told):
-    assert unpack_tpdo(bytes.fromhex(data)) == told
+    assert protocol.unpack_tpdo(bytes.fromhex(data)) == told
 
 
 @given(
@@ -85,7 +73,7 @@ def test_tpdo_and_rpdo_round_trip(word, position, torque):
     def little(value, size):
         return (value % 256**size).to_bytes(size, "little")
 
-    assert unpack_tpdo(little(word, 2) + little(position, 4) + little(torque, 2)) == (
+    assert protocol.unpack_tpdo(little(word, 2) + little(position, 4) + little(torque, 2)) == (
         word,
         position,
         torque,
@@ -94,13 +82,13 @@ def test_tpdo_and_rpdo_round_trip(word, position, torque):
 
 
 def test_emergency():
-    assert read_emergency(bytes.fromhex("11 86 20 02 00 00 00 00")) == (
+    assert protocol.read_emergency(bytes.fromhex("11 86 20 02 00 00 00 00")) == (
         0x8611,
         0x20,
         bytes.fromhex("02 00 00 00 00"),
     )
-    assert read_emergency(bytes.fromhex("30 81 11")) == (0x8130, 0x11, b"")
-    assert read_emergency(b"\x30\x81") is None
+    assert protocol.read_emergency(bytes.fromhex("30 81 11")) == (0x8130, 0x11, b"")
+    assert protocol.read_emergency(b"\x30\x81") is None
 
 
 @pytest.mark.parametrize(
@@ -119,43 +107,43 @@ def test_emergency():
     ],
 )
 def test_reply_to_the_question_for_the_mode(data, mode):
-    assert read_mode(bytes.fromhex(data)) == mode
+    assert protocol.read_mode(bytes.fromhex(data)) == mode
 
 
 def test_confirmation_of_a_write():
-    assert is_written(bytes.fromhex("60 40 60 00 00 00 00 00"), 0x6040, 0)
-    assert is_written(bytes.fromhex("60 16 10 01 00 00 00 00"), 0x1016, 1)
-    assert not is_written(bytes.fromhex("80 40 60 00 22 00 00 08"), 0x6040, 0)
-    assert not is_written(bytes.fromhex("60 40 60 00"), 0x6040, 0)
-    assert not is_written(bytes.fromhex("60 41 60 00 00 00 00 00"), 0x6040, 0)
+    assert protocol.is_written(bytes.fromhex("60 40 60 00 00 00 00 00"), 0x6040, 0)
+    assert protocol.is_written(bytes.fromhex("60 16 10 01 00 00 00 00"), 0x1016, 1)
+    assert not protocol.is_written(bytes.fromhex("80 40 60 00 22 00 00 08"), 0x6040, 0)
+    assert not protocol.is_written(bytes.fromhex("60 40 60 00"), 0x6040, 0)
+    assert not protocol.is_written(bytes.fromhex("60 41 60 00 00 00 00 00"), 0x6040, 0)
 
 
 def test_the_state_of_every_statusword():
     """CiA 402: bits 0 to 3 and 6, with bit 5 where the state tells a quick stop from the rest."""
     words = {
-        0b000_0000: DriveState.NOT_READY,
-        0b100_0000: DriveState.SWITCH_ON_DISABLED,
-        0b000_1111: DriveState.FAULT_REACTION,
-        0b000_1000: DriveState.FAULT,
+        0b000_0000: protocol.DriveState.NOT_READY,
+        0b100_0000: protocol.DriveState.SWITCH_ON_DISABLED,
+        0b000_1111: protocol.DriveState.FAULT_REACTION,
+        0b000_1000: protocol.DriveState.FAULT,
     }
     with_bit_5 = {
-        0b010_0001: DriveState.READY,
-        0b010_0011: DriveState.SWITCHED_ON,
-        0b010_0111: DriveState.OPERATION_ENABLED,
-        0b000_0111: DriveState.QUICK_STOP,
+        0b010_0001: protocol.DriveState.READY,
+        0b010_0011: protocol.DriveState.SWITCHED_ON,
+        0b010_0111: protocol.DriveState.OPERATION_ENABLED,
+        0b000_0111: protocol.DriveState.QUICK_STOP,
     }
     seen = Counter()
     for word in range(0x10000):
         expected = words.get(word & 0b100_1111, with_bit_5.get(word & 0b110_1111))
-        state = state_of(word)
-        assert state is (expected or DriveState.UNKNOWN), f"{word:#06x}"
+        state = protocol.state_of(word)
+        assert state is (expected or protocol.DriveState.UNKNOWN), f"{word:#06x}"
         seen[state] += 1
-    assert set(seen) == set(DriveState)
+    assert set(seen) == set(protocol.DriveState)
 
 
 def test_no_two_states_share_a_statusword():
     for word in range(0x80):
-        assert sum(word & mask == value for mask, value, _ in states._TABLE) <= 1
+        assert sum(word & mask == value for mask, value, _ in protocol._TABLE) <= 1
 
 
 def test_every_error_code_has_words_of_its_class():
@@ -175,19 +163,19 @@ def test_every_error_code_has_words_of_its_class():
     }
     for code in range(0x10000):
         theirs = EmcyError(code, 0, b"", 0).get_desc()
-        words = describe_error(code)
+        words = protocol.describe_error(code)
         assert f"0x{code:04X}" in words
         if theirs in ours and code >> 12 != 0xF:
             wanted = ours[theirs]
             wanted = (wanted,) if isinstance(wanted, str) else wanted
             assert any(word in words for word in wanted), words
-    assert "see its manual" in describe_error(0xFF03)
-    assert "additional function" in describe_error(0xF001)
-    assert "heartbeat" in describe_error(0x8130)
-    assert "communication" in describe_error(0x8150)
-    assert "protocol" in describe_error(0x8250)
-    assert "encoder" in describe_error(0x7305)
-    assert describe_error(0xB000) == "error code 0xB000"
+    assert "see its manual" in protocol.describe_error(0xFF03)
+    assert "additional function" in protocol.describe_error(0xF001)
+    assert "heartbeat" in protocol.describe_error(0x8130)
+    assert "communication" in protocol.describe_error(0x8150)
+    assert "protocol" in protocol.describe_error(0x8250)
+    assert "encoder" in protocol.describe_error(0x7305)
+    assert protocol.describe_error(0xB000) == "error code 0xB000"
 
 
 def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
@@ -223,35 +211,3 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
 def test_the_mapping_of_the_pdos():
     assert objects.TPDO_ENTRIES == (0x60410010, 0x60640020, 0x60770010)
     assert objects.RPDO_ENTRIES == (0x60400010, 0x60710010)
-
-
-@settings(max_examples=300)
-@given(st.binary(max_size=8), st.sampled_from(["tpdo", "emergency", "heartbeat", "reply"]))
-def test_handlers_take_anything(data, kind):
-    inbox = ReceivedFrames("Drive")
-    inbox.watching = True
-    getattr(inbox, f"take_{kind}")(data)
-    valid = {"tpdo": len(data) == 8, "emergency": len(data) >= 3, "heartbeat": len(data) >= 1}
-    assert inbox.malformed == (not valid.get(kind, True))
-    assert inbox.replies == (kind == "tpdo")
-    assert inbox.legible == (kind == "tpdo" and len(data) == 8)
-
-
-def test_the_first_alarm_stays():
-    inbox = ReceivedFrames("Drive")
-    inbox.watching = True
-    inbox.take_emergency(struct.pack("<HB5x", 0x8130, 0x11))
-    first = inbox.alarm
-    inbox.take_emergency(struct.pack("<HB5x", 0x2310, 0x02))
-    inbox.take_heartbeat(b"\x7f")
-    assert inbox.alarm == first
-    assert "heartbeat of this computer" in first
-
-
-def test_a_toggle_bit_and_an_unknown_state_in_a_heartbeat():
-    inbox = ReceivedFrames("Drive")
-    inbox.watching = True
-    inbox.take_heartbeat(b"\x85")
-    assert not inbox.alarm
-    inbox.take_heartbeat(b"\x50")
-    assert "state 80" in inbox.alarm

@@ -432,6 +432,22 @@ def test_an_emergency_message_before_enabling_ends_the_session_too(ticks, script
     )
 
 
+def test_the_first_of_several_alarms_is_told(ticks, scripted):
+    scripted.emergency(0x8130)
+    scripted.emergency(0x2310)
+    scripted.heartbeat(0x7F)
+    with pytest.raises(DeviceError, match="heartbeat of this computer lost"):
+        ticks(2)
+
+
+def test_the_toggle_bit_of_a_heartbeat_is_no_state(ticks, scripted):
+    scripted.heartbeat(0x85)
+    ticks(3)
+    scripted.heartbeat(0x50)
+    with pytest.raises(DeviceError, match="state 80"):
+        ticks(3)
+
+
 def test_the_end_of_an_emergency_is_none(ticks, scripted):
     scripted.emergency(0x0000)
     ticks(3)

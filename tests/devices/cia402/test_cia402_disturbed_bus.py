@@ -16,7 +16,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.devices.canbus import CanLink
-from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Acquisition, CanBus
 

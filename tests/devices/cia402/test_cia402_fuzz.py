@@ -1,11 +1,13 @@
 """The fuzzing of ``fuzz_cia402.py``, a short one."""
 
 import importlib.util
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rigd.devices.canbus import CanExchange
 from rigd.devices.parameters import Acquisition
 
 
@@ -30,10 +32,16 @@ def test_only_device_errors_leave_the_driver(rig, settings, mode):
     assert 100 < ends < 12_000
 
 
-def test_the_fuzzer_finds_a_handler_that_raises(rig, settings, monkeypatch):
-    fuzzer = load()
-    from rigd.devices.cia402 import _node as inbox
+def test_the_fuzzer_finds_a_handler_that_raises(rig, monkeypatch):
+    subscribe = CanExchange.subscribe
 
-    monkeypatch.setattr(inbox, "LengthError", ZeroDivisionError)
-    with pytest.raises(Exception, match="unpack requires a buffer of 8 bytes"):
-        fuzzer.fuzz(replace(rig, acquisition=Acquisition("same_tick", 1.0)), 12_000)
+    def subscribe_fragile(exchange, can_id, handler):
+        def fragile(data):
+            struct.unpack("8s", data)
+            handler(data)
+
+        subscribe(exchange, can_id, fragile)
+
+    monkeypatch.setattr(CanExchange, "subscribe", subscribe_fragile)
+    with pytest.raises(struct.error, match="unpack requires a buffer of 8 bytes"):
+        load().fuzz(replace(rig, acquisition=Acquisition("same_tick", 1.0)), 12_000)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from rigd.devices.cia402._requirements import (
+from rigd.devices.cia402.requirements import (
     ACCEPTABLE,
     CORE,
     OPTIONAL,
@@ -58,7 +58,7 @@ def test_what_an_object_may_hold_that_cannot_be_written():
 
 def test_the_table_loads_no_library():
     code = (
-        "import sys, rigd.devices.cia402._requirements as r;"
+        "import sys, rigd.devices.cia402.requirements as r;"
         "print([m for m in ('can', 'canopen', 'numpy', 'pydantic') if m in sys.modules])"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -66,7 +66,7 @@ def test_the_table_loads_no_library():
 
 
 def test_what_is_mapped_is_what_the_pdos_carry():
-    from rigd.devices.cia402 import _objects as objects
+    from rigd.devices.cia402 import objects
 
     sent = {each.index for each in REQUIREMENTS if Access.SENT in each.access}
     received = {each.index for each in REQUIREMENTS if Access.RECEIVED in each.access}

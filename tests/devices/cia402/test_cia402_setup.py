@@ -6,15 +6,16 @@ import time
 from dataclasses import replace
 from math import tau
 
+import can
+import canopen
 import pytest
 
-from rigd.devices.cia402._drive import Cia402Drive
-from rigd.devices.cia402._requirements import (
+from rigd.devices.cia402 import Cia402Drive
+from rigd.devices.cia402.requirements import (
     interpolation_time,
     sync_period_us,
     torque_limit_per_mille,
 )
-from rigd.devices.cia402._sdo import SdoAccess
 from rigd.devices.contracts import DeviceError
 
 TPDO1, RPDO1 = 0x40000185, 0x205
@@ -382,42 +383,38 @@ class TestResettingADriveThatTurns:
             drive.reset_fault()
 
     def test_whatever_an_adapter_raises_at_first_it_is_told_again(
-        self, drive, turning, monkeypatch
+        self, drive, turning, failing_bus
     ):
         """A full queue, or a library with its own errors."""
-        for method, trouble in (
-            ("write", RuntimeError("a library's own")),
-            ("tell_pre_operational", DeviceError("CAN bus can0 takes no commands.")),
-            ("read", OSError(5, "Input/output error")),
-        ):
-            monkeypatch.setattr(
-                SdoAccess, method, _failing_once(getattr(SdoAccess, method), trouble)
-            )
+        failing_bus({
+            0x605: [RuntimeError("a library's own"), OSError(5, "Input/output error")],
+            0x000: [can.CanOperationError("the queue is full")],
+        })  # fmt: skip
         assert drive.reset_fault() is None
         assert (turning.state, turning.torque) == ("switch-on disabled", 0)
 
     def test_an_adapter_that_goes_on_failing_is_told_with_what_was_not_seen(
-        self, drive, turning, monkeypatch
+        self, drive, turning, failing_bus
     ):
-        def fail(*_):
-            raise OSError(5, "Input/output error")
-
-        for method in ("write", "read", "tell_pre_operational"):
-            monkeypatch.setattr(SdoAccess, method, fail)
-        with pytest.raises(DeviceError, match=r"Input/output error.*not shown that .*STO"):
+        failing_bus({can_id: [RuntimeError("a library's own")] * 1000 for can_id in (0x605, 0x000)})
+        with pytest.raises(DeviceError, match=r"a library's own.*not shown that .*STO"):
             drive.reset_fault()
 
 
-def _failing_once(method, trouble):
-    """Have a method raise an error before it works."""
-    left = [trouble]
+@pytest.fixture
+def failing_bus(monkeypatch):
+    """Have the library's network raise errors, by the frame's identifier, before it sends."""
+    really_send = canopen.Network.send_message
 
-    def failing(*arguments):
-        if left:
-            raise left.pop()
-        return method(*arguments)
+    def fail(troubles):
+        def send(network, can_id, data, remote=False):
+            if troubles.get(can_id):
+                raise troubles[can_id].pop(0)
+            return really_send(network, can_id, data, remote)
 
-    return failing
+        monkeypatch.setattr(canopen.Network, "send_message", send)
+
+    return fail
 
 
 @pytest.mark.parametrize("late", [1, 2])

@@ -13,9 +13,9 @@ from eds_files import (
     without,
 )
 
-from rigd.devices._eds import read_eds
-from rigd.devices.cia402._requirements import CORE, OPTIONAL, requirement
-from rigd.devices.cia402._suitability import Grade, judge
+from rigd.devices.cia402 import Grade, judge
+from rigd.devices.cia402.requirements import CORE, OPTIONAL, requirement
+from rigd.devices.eds import read_eds
 from rigd.profile import load_profile
 
 

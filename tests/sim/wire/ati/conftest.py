@@ -195,8 +195,9 @@ def can_host(rig, load):
 
 @pytest.fixture
 def make_can_host(load, rig):
-    def make(simulated=load, **options):
-        return CanHost(rig, simulated, **options)
+    def make(simulated=load, *, serial_number="", sensor=rig.sensor, **options):
+        settings = replace(rig.ati_can, serial_number=serial_number)
+        return CanHost(replace(rig, ati_can=settings, sensor=sensor), simulated, **options)
 
     return make
 

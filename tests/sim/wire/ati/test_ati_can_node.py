@@ -9,9 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.contracts import DeviceError
-from rigd.sim._devices import SimulatedRig
-from rigd.sim.wire._ati_can_node import AtiCanNode
+from rigd.sim import SimulatedRig
 
 UNLOADED = [612, -1043, 385, 871, -724, 198]
 
@@ -217,22 +215,12 @@ def test_a_frozen_box_answers_nothing_and_takes_nothing_in(can_host, load):
     assert can_host.gauges()[0] == 0
 
 
-def test_the_serial_number_is_the_profile_s(rig, load):
-    frames = []
-    settings_ = replace(rig.ati_can, serial_number="FT09876X")
-    node = AtiCanNode(
-        replace(rig, ati_can=settings_), load, lambda *frame: frames.append(frame), print
-    )
-    node.receive(0x115, b"")
-    assert frames == [(0x115, b"FT09876X")]
+def test_the_serial_number_is_the_profile_s(make_can_host):
+    host = make_can_host(serial_number="FT09876X")
+    assert host.ask(0x5) == [(0x115, b"FT09876X")]
 
 
 def test_time_passes_without_effect(can_host):
     before = can_host.ask(0x0)
     can_host.node.tick(1e3)
     assert can_host.ask(0x0) == before
-
-
-def test_a_profile_without_the_section_is_refused(rig, load):
-    with pytest.raises(DeviceError, match=r"\[ati_can\]"):
-        AtiCanNode(replace(rig, ati_can=None), load, print, print)

@@ -8,9 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.contracts import DeviceError
-from rigd.sim._devices import SimulatedRig
-from rigd.sim.wire._ati_serial_device import AtiSerialDevice
+from rigd.sim import SimulatedRig
 
 UNLOADED = [612, -1043, 385, 871, -724, 198]
 JAM = bytes(range(1, 15))
@@ -461,8 +459,3 @@ def test_gauges_polled_before_the_first_period_are_a_reading_of_their_own(serial
     load.wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
     assert serial_host.registers(0, 6, function=4) != unloaded
     assert load.measured == 2
-
-
-def test_a_profile_without_the_section_is_refused(rig, load):
-    with pytest.raises(DeviceError, match=r"\[ati_serial\]"):
-        AtiSerialDevice(replace(rig, ati_serial=None), load, print, print)

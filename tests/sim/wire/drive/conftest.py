@@ -8,8 +8,9 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.devices.parameters import ServoDrive
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
+from rigd.sim.wire._object_dictionary import read_device
 
 NODE = 5
 HOST = 100
@@ -236,5 +237,21 @@ def make_bench():
     def make(options=None, *, booted=True, **changes):
         made = Bench(make_rig(**changes), **(options or {}))
         return made.boot() if booted else made
+
+    return make
+
+
+@pytest.fixture
+def bench_on():
+    """Make the bench of a whole rig."""
+    return Bench
+
+
+@pytest.fixture
+def eds_bench():
+    """Make the bench of a drive as an EDS file describes it."""
+
+    def make(path):
+        return Bench(make_rig(), file=read_device(path, NODE)).boot()
 
     return make

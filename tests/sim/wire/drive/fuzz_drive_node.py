@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from rigd.devices.parameters import RigParameters, ServoDrive
 from rigd.profile import load_profile
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire._drive_node import DriveNode
 
 NODE = 5

@@ -7,7 +7,6 @@ import pytest
 from eds_files import FILES, WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.wire._object_dictionary import read_device
 
 ABSENT, NO_SUB = 0x06020000, 0x06090011
 READ_ONLY, WRITE_ONLY, VALUE = 0x06010002, 0x06010001, 0x06090030
@@ -15,14 +14,6 @@ NOT_MAPPABLE, PDO_LENGTH = 0x06040041, 0x06040042
 NODE = 5
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}
 """Bytes of the data types that are told in one frame."""
-
-
-@pytest.fixture
-def eds_bench(make_bench):
-    def make(path):
-        return make_bench({"file": read_device(path, NODE)})
-
-    return make
 
 
 @pytest.fixture
@@ -253,6 +244,6 @@ def test_identity_stands_in_the_head_of_a_file_too(made_of):
     assert (bench.read(0x1018, 1), bench.read(0x1018, 2)) == (7, 0x1B)
 
 
-def test_a_file_that_cannot_be_read_is_refused_with_a_sentence(tmp_path):
+def test_a_file_that_cannot_be_read_is_refused_with_a_sentence(eds_bench, tmp_path):
     with pytest.raises(DeviceError, match=r"none\.eds: cannot be read"):
-        read_device(tmp_path / "none.eds", NODE)
+        eds_bench(tmp_path / "none.eds")

@@ -102,6 +102,32 @@ def test_a_segmented_download_in_two_segments(bench):
     assert bench.read(0x1006) == 2000
 
 
+@pytest.mark.parametrize("announced", [True, False])
+@pytest.mark.parametrize("sizes", [(4,), (1, 3), (3, 1), (2, 2), (1, 1, 1, 1)])
+def test_a_download_in_segments_of_any_size(bench, sizes, announced):
+    value = bytes.fromhex("01020304")
+    head = "21 06 10 00 04 00 00 00" if announced else "20 06 10 00 00 00 00 00"
+    assert bench.request(head) == "60 06 10 00 00 00 00 00"
+    toggle = 0
+    for number, size in enumerate(sizes, 1):
+        command = toggle | (7 - size) << 1 | (number == len(sizes))
+        part, value = value[:size], value[size:]
+        reply = bench.request((bytes([command]) + part.ljust(7, b"\xee")).hex())
+        assert reply == f"{0x20 | toggle:02x} 00 00 00 00 00 00 00"
+        toggle ^= 0x10
+    assert bench.read(0x1006) == 0x04030201
+
+
+def test_a_new_transfer_takes_the_place_of_one_that_has_not_ended(bench):
+    bench.request("20 06 10 00 00 00 00 00")
+    bench.request("0a aa aa 00 00 00 00 00")
+    assert bench.request("40 08 10 00 00 00 00 00") == "41 08 10 00 15 00 00 00"
+    assert bench.request("60 00 00 00 00 00 00 00") == "00 " + b"simulat".hex(" ")
+    assert bench.read(0x1006) == 0
+    assert bench.write(0x1006, 0, 2, 4) == 0
+    assert bench.read(0x1006) == 2
+
+
 @pytest.mark.parametrize(
     ("request_", "reply"),
     [
@@ -114,6 +140,7 @@ def test_a_segmented_download_in_two_segments(bench):
         ("21 17 10 00 03 00 00 00", "80 17 10 00 10 00 07 06"),  # segmented, three for two
         ("2f 60 60 00 08 00 00 00", "80 60 60 00 30 00 09 06"),  # a mode it has not
         ("2b 07 60 00 04 00 00 00", "80 07 60 00 30 00 09 06"),
+        ("2b 07 60 00 ff ff 00 00", "80 07 60 00 30 00 09 06"),
         ("2b 5a 60 00 03 00 00 00", "80 5a 60 00 30 00 09 06"),
         ("2f 29 10 01 03 00 00 00", "80 29 10 01 30 00 09 06"),
         ("23 05 10 00 80 00 00 40", "80 05 10 00 30 00 09 06"),  # SYNC producer

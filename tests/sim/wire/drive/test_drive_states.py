@@ -174,3 +174,46 @@ def test_states_are_logged_in_order(bench):
     assert [values for _, what, values in bench.events if what == "mode"] == [{"mode": 10}]
     writes = [values for _, what, values in bench.events if what == "sdo write"]
     assert {"index": "6060", "sub": 0, "value": 10} in writes
+
+
+def control(bench, *words):
+    for word in words:
+        bench.write(0x6040, 0, word, 2)
+
+
+def statusword(bench):
+    """Let a period pass; return the statusword of the TPDO at its SYNC."""
+    bench.now_s += 1e-3
+    word, *_ = bench.sync()
+    bench.node.tick(bench.now_s)
+    return word
+
+
+def test_a_drive_without_a_code_shows_the_wired_stop_in_its_statusword(make_bench):
+    bench = make_bench(sto_error_code=0).configure().enable()
+    assert statusword(bench) & 0x7F == 0x37
+    bench.node.sto_dropped = True
+    assert not bench.plant.enabled
+    assert statusword(bench) & 0x7F == 0x40  # switch on disabled, and no voltage
+    control(bench, 0x06, 0x07, 0x0F)
+    assert statusword(bench) & 0x4F == 0x40
+    bench.node.sto_dropped = False
+    assert statusword(bench) & 0x7F == 0x50
+    assert not bench.plant.enabled  # nothing happens by itself
+    control(bench, 0x06, 0x07, 0x0F)
+    assert bench.plant.enabled
+
+
+def test_a_drive_with_a_code_goes_to_fault_and_stays_there_while_the_wired_stop_lasts(make_bench):
+    bench = make_bench(sto_error_code=0xFF20).configure().enable()
+    bench.node.sto_dropped = True
+    assert not bench.plant.enabled
+    assert (0x80 + bench.node_id, bytes.fromhex("20ff010000000000")) in bench.sent
+    for _ in range(60):
+        word = statusword(bench)
+    assert word & 0x4F == 0x08
+    control(bench, 0x00, 0x80)
+    assert statusword(bench) & 0x4F == 0x08
+    bench.node.sto_dropped = False
+    control(bench, 0x00, 0x80)
+    assert statusword(bench) & 0x4F == 0x40

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.sim._devices import SimulatedDrive, SimulatedRig
+from rigd.devices import open_devices
+from rigd.devices.contracts import DeviceError
 
 RATED_NM = 0.5
 
@@ -41,7 +42,8 @@ def test_the_rig_moves_as_it_does_without_a_wire(make_bench, direction):
         _, counts, _ = bench.sync()
         angles.append(direction * counts * bench.rig.encoder.resolution_rad)
         bench.rpdo(0x0F, direction * value)
-    direct = SimulatedDrive(SimulatedRig(bench.rig), 1000.0)
+    direct = open_devices(bench.rig).drive
+    direct.connect()
     direct.enable()
     expected = []
     for k, value in enumerate(per_mille):
@@ -232,17 +234,11 @@ def test_a_log_entry_for_each_change_of_torque_or_enabling_and_no_other(running)
     ]
 
 
-def test_a_profile_a_drive_cannot_serve_is_refused(rig, make_bench):
-    from rigd.devices.contracts import DeviceError
-    from rigd.sim.wire._drive_node import DriveNode
-
-    def build(changed):
-        return DriveNode(changed, SimulatedRig(rig), None, None, None)
-
+def test_a_profile_a_drive_cannot_serve_is_refused(rig, bench_on, make_bench):
     with pytest.raises(DeviceError, match=r"\[cia402\]"):
-        build(replace(rig, cia402=None))
+        bench_on(replace(rig, cia402=None))
     with pytest.raises(DeviceError, match="resolution_rad"):
-        build(replace(rig, encoder=replace(rig.encoder, resolution_rad=0.0)))
+        bench_on(replace(rig, encoder=replace(rig.encoder, resolution_rad=0.0)))
     with pytest.raises(DeviceError, match="rated_torque_unit_nm"):
         make_bench(rated_torque_unit_nm=1.0)
     identity = make_bench(vendor_id=0, product_code=0)

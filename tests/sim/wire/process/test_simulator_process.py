@@ -14,8 +14,9 @@ import pytest
 import serial
 from cases import further
 
-from rigd.devices import DeviceError
-from rigd.devices._simulator import ask_simulator, find_simulator
+from rigd.devices.contracts import DeviceError
+from rigd.devices.running_simulator import SimulatorAddress, ask_simulator, find_simulator
+from rigd.sim.wire import WrongUseError, parse_fault
 
 RUN = (
     "import typer\n"
@@ -225,7 +226,8 @@ def test_a_killed_one_is_not_found_and_does_not_stand_in_the_way(simulate, conne
 
 
 def test_a_host_drives_the_motor(simulate, connect):
-    host = connect(simulate("antenna_can", "--lock-step"))
+    simulator = simulate("antenna_can", "--lock-step")
+    host = connect(simulator)
     host.set_up()
     host.enable()
     start = host.tick()[1]
@@ -235,6 +237,54 @@ def test_a_host_drives_the_motor(simulate, connect):
     assert per_mille == 400
     # 0.2 N·m less 0.03 of friction on some 2 to 3 g·m² for 0.1 s.
     assert 0.1 < (counts - start) * 7e-5 < 0.5
+    # What matters is in the file although it is still open; the rest comes with the end.
+    (enabled,) = simulator.events("drive", "state")[-1:]
+    assert enabled["state"] == "operation enabled"
+    _, out, _ = simulator.end()
+    torques = simulator.events("drive", "torque")
+    assert {"torque_nm": 0.2, "enabled": True}.items() <= torques[-1].items()
+    assert torques[-1]["t_s"] > enabled["t_s"] > 0
+    assert f"{enabled['t_s']:10.3f} s  drive: state  state operation enabled\n" in out
+    assert "torque" not in out.partition("rigd inject")[2]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_ends_the_log_and_nothing_else(simulate, connect):
+    simulator = simulate("antenna_can", "--lock-step", "--log", "/dev/full")
+    connect(simulator).set_up()
+    assert ask_simulator(simulator.address, {"status": True})["clients"] == 1
+    code, out, _ = simulator.end()
+    assert code == 0
+    assert out.count("cannot be written any more (No space left") == 1
+
+
+def test_requests_come_as_lines_whatever_else_is_sent(simulate):
+    address = simulate().address
+
+    def control():
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        link.connect(address.control_socket)
+        link.settimeout(30.0)
+        return link
+
+    control().close()  # only looks whether it runs
+    with control() as link, link.makefile("rb") as replies:
+        for piece in (b'{"status": true}\n{"inj', b'ect": "nonsense"}', b"\n"):
+            link.sendall(piece)
+            time.sleep(0.02)
+        assert json.loads(replies.readline())["rig"] == "antenna_can"
+        assert "unknown fault" in json.loads(replies.readline())["error"]
+        for line in (b"hello\n", b"[1]\n", b"\xff\n", b"\n"):
+            link.sendall(line)
+            assert "one JSON object" in json.loads(replies.readline())["error"]
+        link.sendall(b'{"status": true}\n')
+        assert json.loads(replies.readline())["rig"] == "antenna_can"
+
+
+def test_a_simulator_that_is_gone_is_told(tmp_path):
+    address = SimulatorAddress(pid=4711, control_socket=str(tmp_path / "gone"))
+    with pytest.raises(DeviceError, match="process 4711"):
+        ask_simulator(address, {"status": True})
 
 
 @pytest.mark.further  # as test_lock_step.py
@@ -443,10 +493,11 @@ def test_a_rig_that_is_not_started_leaves_no_log(runtime, rigd_here, tmp_path):
 
 
 def test_the_help_names_every_fault(rigd_here):
-    from rigd.sim.wire._faults import KINDS
-
+    with pytest.raises(WrongUseError) as refused:
+        parse_fault("none")
+    kinds = str(refused.value).partition("choose ")[2].rstrip(".").split(", ")
     shown = rigd_here("inject", "--help").stdout
-    assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in KINDS)
+    assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in kinds)
 
 
 def test_its_noise_differs_from_run_to_run_and_session_to_session_unless_a_seed_is_stated(simulate):

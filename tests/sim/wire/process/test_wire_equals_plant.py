@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.devices._registry import open_devices
-from rigd.devices._simulator import ask_simulator, find_simulator
-from rigd.devices.canbus._budget import bus_load
+from rigd.devices import open_devices
+from rigd.devices.canbus import bus_load
+from rigd.devices.running_simulator import ask_simulator, find_simulator
 from rigd.profile import load_profile
-from rigd.sim._devices import SimulatedRig
+from rigd.sim import SimulatedRig
 
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
@@ -31,7 +31,7 @@ AND_A_DRIFT = (
 RUN = (
     "import sys\n"
     "from rigd.profile import load_profile\n"
-    "from rigd.sim.wire._simulator import SimulatorOptions, run_simulator\n"
+    "from rigd.sim.wire import SimulatorOptions, run_simulator\n"
     "options = SimulatorOptions(lock_step=True, quiet=True)\n"
     "sys.exit(run_simulator(load_profile(sys.argv[1]).rig, options))\n"
 )

@@ -7,8 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from rigd.devices import Knock, Obstacle
-from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError, parse_fault
+from rigd.devices.obstacles import Knock, Obstacle
+from rigd.sim.wire import WrongUseError, parse_fault
 
 PERIOD_NS = 1_000_000
 RPDO, POLL = 0x201, 0x680
@@ -290,6 +290,7 @@ def test_a_fault_with_an_end_ends(make_world, spec, device, attribute, normal, v
     assert [time_s for time_s, *_ in rig.log.of("fault over")] == [0.004]
 
 
+LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
 ENDLESS = [
     ("freeze,device=drive", "drive", "frozen", False),
     ("freeze,device=sensor", "sensor", "frozen", False),
@@ -323,8 +324,11 @@ def test_a_fault_without_an_end_is_ended(make_world, spec, device, attribute, no
 
 
 def test_every_fault_that_lasts_is_ended_here():
+    with pytest.raises(WrongUseError) as refused:
+        parse_fault("end,fault=none")
+    lasting = str(refused.value).partition("give ")[2].rstrip(".")
     held = {spec.partition(",")[0] for spec, *_ in ENDLESS}
-    assert {*held, *LINE_KINDS, "cut", "obstacle"} == set(LASTING)
+    assert {*held, *LINE_KINDS, "cut", "obstacle"} == set(lasting.split(" or "))
 
 
 def turned_into_an_obstacle(rig, ticks):
@@ -392,11 +396,11 @@ def test_in_real_time_the_rig_goes_on_while_an_obstacle_is_made(make_world):
 
 def test_what_the_beam_cannot_meet_is_refused(make_world):
     rig = make_world(lock_step=True)
-    with pytest.raises(FaultError, match="beyond the tip"):
+    with pytest.raises(WrongUseError, match="beyond the tip"):
         rig.world.inject(parse_fault("obstacle,x=1.5,angle=0.1"))
     for _ in range(4):
         rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
-    with pytest.raises(FaultError, match="4 obstacles and knocks were added"):
+    with pytest.raises(WrongUseError, match="4 obstacles and knocks were added"):
         rig.world.inject(parse_fault("knock,x=0.5,force=1,duration=0.01"))
 
 
@@ -486,7 +490,7 @@ def test_the_bus_is_cut_by_who_holds_it(make_world):
 )
 def test_a_fault_that_this_rig_cannot_have_is_refused(make_world, spec, said):
     rig = make_world()
-    with pytest.raises(FaultError, match=said):
+    with pytest.raises(WrongUseError, match=said):
         rig.world.inject(parse_fault(spec + "@5"))
 
 
@@ -545,7 +549,7 @@ def test_bytes_are_lost_across_records(make_world):
 
 def test_on_a_serial_line_there_are_no_identifiers(make_world):
     rig = make_world(serial=True)
-    with pytest.raises(FaultError, match="id is for a sensor on CAN"):
+    with pytest.raises(WrongUseError, match="id is for a sensor on CAN"):
         rig.world.inject(parse_fault("drop,from=sensor,id=1"))
     rig.world.inject(parse_fault("cut,device=sensor"))
     assert rig.cuts == ["sensor"]

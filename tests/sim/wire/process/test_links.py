@@ -1,21 +1,16 @@
-"""The bus on a Unix socket: who hears whom, torn frames, clients that do not read."""
+"""The bus on a Unix socket and the serial line: who hears whom, torn frames, deaf clients."""
 
 import os
 import select
 import socket
 import struct
+from dataclasses import replace
 
 import pytest
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.wire._links import (
-    VirtualBus,
-    VirtualCan,
-    interface_kind,
-    is_virtual,
-    kind_in_reply,
-    listen,
-)
+from rigd.profile import load_profile
+from rigd.sim.wire import _links as links
 
 
 def frame(n):
@@ -30,7 +25,9 @@ class Bench:
         self.handlers = {}
         self.heard = []
         self.told = []
-        self.hub = VirtualBus(path, self.handlers, self._hear, lambda *told: self.told.append(told))
+        self.hub = links.VirtualBus(
+            path, self.handlers, self._hear, lambda *told: self.told.append(told)
+        )
         self.links = []
 
     def _hear(self, frames, origin):
@@ -164,17 +161,17 @@ def test_a_cut_bus_refuses_everybody(bench):
 
 def test_what_a_dead_process_left_is_replaced(tmp_path):
     path = tmp_path / "bus"
-    first = listen(path)
+    first = links.listen(path)
     first.close()
     assert path.exists()
-    listen(path).close()
+    links.listen(path).close()
 
 
 def test_a_socket_that_cannot_be_made_is_told(tmp_path):
     with pytest.raises(DeviceError, match="XDG_RUNTIME_DIR"):
-        listen(tmp_path / ("x" * 120))
+        links.listen(tmp_path / ("x" * 120))
     with pytest.raises(DeviceError, match="cannot make its socket"):
-        listen(tmp_path / "no such folder" / "bus")
+        links.listen(tmp_path / "no such folder" / "bus")
 
 
 # The kernel's virtual bus. Where there is none, a pair of sockets that keep packets apart takes
@@ -185,7 +182,7 @@ def test_a_socket_that_cannot_be_made_is_told(tmp_path):
 def virtual():
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
-    bus = VirtualCan.__new__(VirtualCan)
+    bus = links.VirtualCan.__new__(links.VirtualCan)
     handlers, heard = {}, []
     bus._serve(ours, handlers, lambda frames, origin: heard.append((frames, origin)))
     yield bus, theirs, handlers, heard
@@ -222,13 +219,13 @@ def test_a_full_or_cut_virtual_bus_loses_frames(virtual):
 
 
 def test_a_channel_that_is_not_there_is_no_virtual_bus():
-    assert is_virtual("nocan77") is False
+    assert links.is_virtual("nocan77") is False
 
 
 def test_an_interface_that_is_not_a_virtual_bus_is_refused():
     with pytest.raises(DeviceError, match="must not answer beside real ones"):
-        is_virtual("lo")
-    assert interface_kind("lo") == ""
+        links.is_virtual("lo")
+    assert links.interface_kind("lo") == ""
 
 
 def test_the_kernel_s_word_for_a_virtual_bus_is_understood():
@@ -238,9 +235,138 @@ def test_the_kernel_s_word_for_a_virtual_bus_is_understood():
     name = bytes.fromhex("0a00 0300 7663616e3000 0000".replace(" ", ""))
     body = struct.pack("=BxHiII", 0, 280, 3, 0x40C1, 0) + name + linkinfo
     head = struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 4711)
-    assert kind_in_reply(head + body) == "vcan"
+    assert links.kind_in_reply(head + body) == "vcan"
     without = struct.pack("=BxHiII", 0, 280, 3, 0x40C1, 0) + name
-    assert kind_in_reply(struct.pack("=IHHII", 16 + len(without), 16, 0, 1, 0) + without) == ""
+    assert (
+        links.kind_in_reply(struct.pack("=IHHII", 16 + len(without), 16, 0, 1, 0) + without) == ""
+    )
     error = struct.pack("=IHHIIi", 36, 2, 0, 1, 0, -19) + bytes(16)
-    assert kind_in_reply(error) == ""
-    assert kind_in_reply(b"") == ""
+    assert links.kind_in_reply(error) == ""
+    assert links.kind_in_reply(b"") == ""
+
+
+# The serial line
+
+
+class Line:
+    def __init__(self):
+        self.handlers = {}
+        self.heard = b""
+        self.told = []
+        self.pty = links.PtyLine(self.handlers, self._hear, self.told.append)
+        self.port = None
+
+    def _hear(self, data):
+        self.heard += data
+
+    def open(self):
+        self.port = os.open(self.pty.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self.pty.look()
+
+    def turn(self):
+        for descriptor in select.select(self.handlers, (), (), 30.0 if self.handlers else 0)[0]:
+            self.handlers[descriptor]()
+
+    def read(self):
+        select.select([self.port], (), (), 30.0)
+        return os.read(self.port, 65536)
+
+    def close(self):
+        self.pty.close()
+        if self.port is not None:
+            os.close(self.port)
+
+
+@pytest.fixture
+def line():
+    line = Line()
+    yield line
+    line.close()
+
+
+def test_bytes_go_both_ways_unchanged(line):
+    line.open()
+    every = bytes(range(256))
+    line.pty.write(every)
+    assert line.read() == every
+    os.write(line.port, every)
+    line.turn()
+    assert line.heard == every
+    assert line.told == [True]
+
+
+def test_an_open_line_with_nothing_on_it_keeps_nobody_busy(line):
+    line.pty.look()
+    assert line.handlers == {}
+    line.open()
+    assert select.select(line.handlers, (), (), 0)[0] == []
+
+
+def test_what_is_sent_while_nobody_listens_is_lost(line):
+    line.pty.write(b"nobody hears this")
+    line.open()
+    line.pty.write(b"this is heard")
+    assert line.read() == b"this is heard"
+    assert line.pty.lost == 0
+
+
+def test_a_host_that_does_not_read_loses_bytes_and_nobody_waits(line):
+    line.open()
+    for _ in range(1000):
+        line.pty.write(bytes(91))
+    assert 0 < line.pty.lost < 91_000
+
+
+def test_the_port_can_be_closed_and_opened_again(line):
+    line.open()
+    os.write(line.port, b"first")
+    line.turn()
+    os.close(line.port)
+    line.turn()
+    assert line.handlers == {}
+    line.open()
+    os.write(line.port, b", second")
+    line.turn()
+    assert line.heard == b"first, second"
+    assert line.told == [True, False, True]
+
+
+def test_a_cut_line_is_dead(line):
+    line.open()
+    line.pty.close()
+    line.pty.write(b"lost")
+    line.pty.look()
+    assert line.handlers == {}
+    assert os.read(line.port, 10) == b""
+
+
+# Delays
+
+
+def test_what_the_exchange_takes_is_not_simulated_on_top():
+    rig = load_profile("antenna_can").rig
+    assert links.without_transport(rig) is rig
+    late = replace(
+        rig,
+        acquisition=replace(rig.acquisition, mode="previous_tick"),
+        encoder=replace(rig.encoder, delay_s=1.055e-3),
+        sensor=replace(rig.sensor, delay_s=1.0e-3),
+    )
+    left = links.without_transport(late)
+    assert left.encoder.delay_s == pytest.approx(5.5e-5)
+    assert left.sensor.delay_s == pytest.approx(0.0, abs=1e-12)
+    assert left.actuation == late.actuation
+
+
+@pytest.mark.parametrize("device", ["encoder", "sensor"])
+def test_a_profile_that_states_less_than_the_exchange_takes_is_refused(device):
+    rig = load_profile("antenna_can").rig
+    rig = replace(
+        rig,
+        acquisition=replace(rig.acquisition, mode="previous_tick"),
+        encoder=replace(rig.encoder, delay_s=1.0e-3),
+        sensor=replace(rig.sensor, delay_s=1.0e-3),
+    )
+    rig = replace(rig, **{device: replace(getattr(rig, device), delay_s=0.5e-3)})
+    with pytest.raises(DeviceError, match=rf"{device}\.delay_s = 0\.0005 s"):
+        links.without_transport(rig)

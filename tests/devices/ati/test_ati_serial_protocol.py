@@ -1,4 +1,7 @@
-"""The record stream: however it is cut and disturbed, what comes out is what the sensor sent."""
+"""The serial protocol: Modbus frames against the bytes in devices.md 2.1, and the record stream.
+
+However the stream is cut and disturbed, what comes out is what the sensor sent.
+"""
 
 import random
 
@@ -6,11 +9,129 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.ati._serial_protocol import RECORD_SIZE, SYNC_RECORDS, RecordStream
+from rigd.devices.ati import _serial_protocol as protocol
+
+
+def hexed(text):
+    return bytes.fromhex(text)
+
+
+def test_requests_have_the_published_bytes():
+    assert hexed("0A 46 55 A3 9D") == protocol.START_STREAMING
+    assert hexed("0A 6A AA FF 1D") == protocol.UNLOCK
+    assert hexed("0A 6A 18 7F 68") == protocol.LOCK
+    assert protocol.read_registers(protocol.STATUS_WORD, 1) == hexed("0A 03 00 1D 00 01 15 77")
+    assert protocol.read_registers(0x00E3, 0x40) == hexed("0A 03 00 E3 00 40 B4 B7")
+
+
+def test_published_replies_are_understood():
+    assert protocol.content_of(protocol.START_STREAMING, hexed("0A 46 01 A2 62")) == b"\x01"
+    assert protocol.content_of(protocol.UNLOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
+    assert protocol.content_of(protocol.LOCK, hexed("0A 6A 01 BE A2")) == b"\x01"
+
+
+def test_gains_and_offsets_are_written_in_twelve_bytes(fakes):
+    body = hexed("0A 10 00 06 00 06 0C 7C 62 7D 00 80 00 80 E8 84 D0 88 6F")
+    request = protocol.write_registers(
+        protocol.ACTIVE_OFFSETS, (31842, 32000, 32768, 33000, 34000, 34927)
+    )
+    assert request == body + fakes.crc_bitwise(body)
+    assert protocol.ACTIVE_GAINS == 0
+    confirmed = body[:6] + fakes.crc_bitwise(body[:6])
+    assert protocol.reply_length(request) == len(confirmed) == 8
+    assert protocol.content_of(request, confirmed) == body[2:6]
+
+
+def test_registers_are_read_high_byte_first(fakes):
+    request = protocol.read_registers(0x1D, 2)
+    reply = hexed("0A 03 04 12 34 FF FE")
+    reply += fakes.crc_bitwise(reply)
+    assert protocol.reply_length(request) == len(reply)
+    assert protocol.registers_of(protocol.content_of(request, reply)) == (0x1234, 0xFFFE)
+
+
+@settings(max_examples=100)
+@given(data=st.binary(max_size=80))
+def test_the_checksum_is_that_of_modbus(fakes, data):
+    assert protocol.crc16(data).to_bytes(2, "little") == fakes.crc_bitwise(data)
+
+
+def test_the_checksum_of_the_standard_example():
+    assert protocol.crc16(b"123456789") == 0x4B37
+
+
+def reply_to_status(fakes, body):
+    return protocol.content_of(
+        protocol.read_registers(protocol.STATUS_WORD, 1), body + fakes.crc_bitwise(body)
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(1, "function"), (2, "no such register"), (4, "failed"), (99, "code 99")]
+)
+def test_a_refusal_is_told_in_words(fakes, code, words):
+    with pytest.raises(protocol.Refused, match=words):
+        reply_to_status(fakes, bytes((0x0A, 0x83, code)))
+
+
+def test_a_declined_start_and_lock_are_refusals(fakes):
+    for request in (protocol.START_STREAMING, protocol.UNLOCK):
+        body = request[:2] + b"\x00"
+        with pytest.raises(protocol.Refused, match="code 0"):
+            protocol.content_of(request, body + fakes.crc_bitwise(body))
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("0B 03 02 00 00", "another request"),
+        ("0A 04 02 00 00", "another request"),
+        ("0A 03 03 00 00", "3 bytes of registers"),
+        ("0A 03 02 00", "6 bytes came instead of 7"),
+        ("0A 03 04 00 00 00 00", "9 bytes came instead of 7"),
+    ],
+)
+def test_replies_that_do_not_fit_the_request(fakes, body, words):
+    with pytest.raises(protocol.BadReply, match=words):
+        reply_to_status(fakes, hexed(body))
+
+
+def test_confirmation_of_other_registers(fakes):
+    request = protocol.write_registers(0, (1, 2))
+    body = hexed("0A 10 00 00 00 03")
+    with pytest.raises(protocol.BadReply, match="other registers"):
+        protocol.content_of(request, body + fakes.crc_bitwise(body))
+
+
+def test_silence_is_a_bad_reply():
+    with pytest.raises(protocol.BadReply, match="no reply"):
+        protocol.content_of(protocol.UNLOCK, b"")
+
+
+@settings(max_examples=200)
+@given(
+    at=st.integers(0, 6),
+    mask=st.integers(1, 255),
+    cut=st.integers(0, 7),
+    extra=st.binary(max_size=3),
+)
+def test_a_damaged_reply_is_never_taken(fakes, at, mask, cut, extra):
+    body = hexed("0A 03 02 5A A5")
+    sound = body + fakes.crc_bitwise(body)
+    damaged = bytearray(sound)
+    damaged[at] ^= mask
+    request = protocol.read_registers(protocol.STATUS_WORD, 1)
+    for reply in (bytes(damaged), sound[:cut] + extra):
+        if reply != sound:
+            with pytest.raises(protocol.BadReply):
+                protocol.content_of(request, reply)
+
+
+# The record stream
 
 
 def split(data):
-    return [data[i : i + RECORD_SIZE] for i in range(0, len(data), RECORD_SIZE)]
+    return [data[i : i + protocol.RECORD_SIZE] for i in range(0, len(data), protocol.RECORD_SIZE)]
 
 
 def feed_all(stream, data, sizes=(91,)):
@@ -20,12 +141,12 @@ def feed_all(stream, data, sizes=(91,)):
         size = sizes[i % len(sizes)]
         out += stream.feed(data[at : at + size])
         at, i = at + size, i + 1
-    assert len(out) % RECORD_SIZE == 0
+    assert len(out) % protocol.RECORD_SIZE == 0
     return split(out)
 
 
 def aligned_stream():
-    stream = RecordStream()
+    stream = protocol.RecordStream()
     stream.start(aligned=True)
     return stream
 
@@ -43,7 +164,7 @@ def test_a_record_by_hand(fakes):
     record = bytes.fromhex("0001 FFFE 0003 0004 FFFB 0006 05")
     # 1 + 0xFF + 0xFE + 3 + 4 + 0xFF + 0xFB + 6 = 0x405
     assert fakes.record_of((1, 4, -2, -5, 3, 6)) == record
-    assert aligned_stream().feed(record * SYNC_RECORDS) == record * SYNC_RECORDS
+    assert aligned_stream().feed(record * protocol.SYNC_RECORDS) == record * protocol.SYNC_RECORDS
 
 
 @settings(max_examples=80)
@@ -60,7 +181,7 @@ def test_every_record_of_a_sound_stream_comes_out_once(fakes, gauges, sizes):
 @given(seeds, st.binary(max_size=40), sizes)
 def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
     records = fuzz.noisy_records(random.Random(seed), 60)
-    stream = RecordStream()
+    stream = protocol.RecordStream()
     found = feed_all(stream, rubbish + b"".join(records), sizes)
     assert stream.synchronised
     assert found == records[len(records) - len(found) :]
@@ -71,7 +192,7 @@ def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
 @given(
     seed=seeds,
     kind=st.sampled_from(["flip", "drop", "insert"]),
-    at=st.integers(SYNC_RECORDS * 13, 40 * 13),
+    at=st.integers(protocol.SYNC_RECORDS * 13, 40 * 13),
     extra=st.binary(min_size=1, max_size=40),
     mask=st.integers(1, 127),
     sizes=sizes,
@@ -113,7 +234,7 @@ def test_one_damaged_record_costs_no_other(fuzz, seed, which, byte, mask, sizes)
     data[13 * which + byte] ^= mask
     stream = aligned_stream()
     found = feed_all(stream, bytes(data), sizes)
-    if which < SYNC_RECORDS:
+    if which < protocol.SYNC_RECORDS:
         # Not yet in sync: the beginning has to be looked for.
         assert found == records[len(records) - len(found) :]
     else:
@@ -153,7 +274,7 @@ def test_records_that_are_all_alike_keep_the_beginning_they_had(ambiguous, sizes
 @pytest.mark.parametrize("sizes", [(91,), (1,)])
 def test_a_beginning_that_was_found_is_kept_as_well(fuzz, ambiguous, sizes):
     noisy = b"".join(fuzz.noisy_records(random.Random(2), 20))
-    stream = RecordStream()
+    stream = protocol.RecordStream()
     feed_all(stream, noisy[5:])
     damaged = bytearray(ambiguous * 20)
     damaged[3] ^= 0x11
@@ -161,7 +282,7 @@ def test_a_beginning_that_was_found_is_kept_as_well(fuzz, ambiguous, sizes):
 
 
 def test_records_that_are_all_alike_are_not_guessed_at(ambiguous):
-    assert feed_all(RecordStream(), ambiguous[5:] + ambiguous * 40) == []
+    assert feed_all(protocol.RecordStream(), ambiguous[5:] + ambiguous * 40) == []
 
 
 def test_the_error_bit_is_not_part_of_the_sum(fakes):
@@ -172,9 +293,9 @@ def test_the_error_bit_is_not_part_of_the_sum(fakes):
 def test_records_are_not_delivered_before_enough_fit(fakes):
     record = fakes.record_of((1, -2, 300, 4, -500, 6))
     stream = aligned_stream()
-    for _ in range(SYNC_RECORDS - 1):
+    for _ in range(protocol.SYNC_RECORDS - 1):
         assert stream.feed(record) == b""
-    assert stream.feed(record) == record * SYNC_RECORDS
+    assert stream.feed(record) == record * protocol.SYNC_RECORDS
 
 
 @pytest.mark.parametrize("part", ["stream, disturbed", "stream, rubbish", "Modbus"])

@@ -49,6 +49,13 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     """List the differences of the simulated rig from a profile's: one phrase per key.
 
     The seed of the noise is none: each session has its own.
+
+    Parameters
+    ----------
+    rig
+        Parameters of the profile.
+    simulator
+        Address of the simulated rig.
     """
     ours, theirs = described(rig), simulator.rig
     return [

@@ -78,7 +78,15 @@ ON_ARRIVAL: Final = 255
 
 
 def mapping_entry(index: int, bits: int) -> int:
-    """Return the mapping entry of an object without sub-indices."""
+    """Return the mapping entry of an object without sub-indices.
+
+    Parameters
+    ----------
+    index
+        Index of the object.
+    bits
+        Its size.
+    """
     return index << 16 | bits
 
 

@@ -92,7 +92,7 @@ class Violation:
 
     Examples
     --------
-    >>> from rigd.safety import Violation
+    >>> from rigd.safety.limits import Violation
     >>> print(Violation("angle", 1.02, 1.0, "rad", key="limits.angle_rad"))
     Angle 1.02 rad exceeds limit 1 rad (limits.angle_rad).
     """

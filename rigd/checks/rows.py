@@ -20,7 +20,15 @@ def name_of(key: str) -> str:
 
 
 def value_of(key: str, value: object) -> str:
-    """Return the value of a key with its unit; numbers to four digits."""
+    """Return the value of a key with its unit; numbers to four digits.
+
+    Parameters
+    ----------
+    key
+        Key that ends in its unit.
+    value
+        Number, text, or a list of them.
+    """
     unit = UNITS.get(_end(key), "")
     factor = 1.0
     if unit in _MILLISECONDS:
@@ -104,7 +112,13 @@ def overall(rows: Iterable[Row]) -> str:
 
 
 def grade(*, fail: bool, warn: bool = False) -> Verdict:
-    """Return the verdict on a comparison."""
+    """Return the verdict on a comparison.
+
+    Parameters
+    ----------
+    fail, warn
+        Whether it fails, and else whether it is a warning.
+    """
     if fail:
         return Verdict.FAIL
     return Verdict.WARNING if warn else Verdict.OK

@@ -13,7 +13,9 @@ from contextlib import suppress
 from struct import Struct
 from typing import TYPE_CHECKING, Protocol
 
-from rigd.devices import CanBus, DeviceError, SimulatorAddress
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.running_simulator import SimulatorAddress
 
 if TYPE_CHECKING:
     import can
@@ -63,7 +65,7 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
 
     Examples
     --------
-    >>> from rigd.devices.canbus import pack_frame, unpack_frame
+    >>> from rigd.devices.canbus.port import pack_frame, unpack_frame
     >>> raw = pack_frame(0x181, b"rigd")
     >>> len(raw), unpack_frame(raw)
     (16, (385, b'rigd'))
@@ -103,7 +105,7 @@ class CanPort(Protocol):
     """Name of the bus, for messages."""
 
     def send(self, frame: bytes) -> None:
-        """Send 16 bytes made by :func:`rigd.devices.canbus.pack_frame`.
+        """Send 16 bytes made by :func:`rigd.devices.canbus.port.pack_frame`.
 
         Raises
         ------
@@ -240,6 +242,13 @@ class PythonCanPort:
     that it raises while it receives is a frame that it could not read: the parser of slcan raises
     ValueError for a damaged line. One such frame is an error on the line, and many in a row are an
     adapter that has failed.
+
+    Parameters
+    ----------
+    bus
+        Open bus of python-can.
+    name
+        Name of the bus, for messages.
     """
 
     def __init__(self, bus: "can.BusABC", name: str) -> None:

@@ -69,7 +69,7 @@ def parse_target(quantity: str, text: str) -> Target:
 
     Examples
     --------
-    >>> from rigd.excitation import parse_target
+    >>> from rigd.excitation.targets import parse_target
     >>> print(parse_target("damping", "2:0.5%"), "/", parse_target("alpha", "0.01"))
     damping of mode 2 to 0.5 % / alpha to 0.01
     """

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import transfer
-from rigd.safety._probing_move import ProbedRig, ProbeEnd, ProbingMove
+from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 
 Real = NDArray[np.float64]
 

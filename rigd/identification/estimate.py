@@ -6,11 +6,11 @@ between commands,
     ``s u(t - D) = J θ'' + B θ' + C sign(θ') + z + τ_c``,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
-reading is differentiated; frequency by frequency this gives linear rows, moments of the readings
-(`moments`). All integrals are exact for a command that changes at any moment of a period. The
+reading is differentiated; frequency by frequency this gives linear rows, _moments of the readings
+(`_moments`). All integrals are exact for a command that changes at any moment of a period. The
 measured coupling torque τ_c stands alone on its side because it carries the noise.
 
-The rows are fitted by weighted least squares (`fit`). The mean of repeats is fitted, because the
+The rows are fitted by weighted least squares (`_fit`). The mean of repeats is fitted, because the
 loop feeds the noise of a reading back into the command and so biases a fit of single ones; their
 scatter gives the weights, what is left of that bias, and the standard deviations.
 """
@@ -42,13 +42,17 @@ class Timing:
     """Rate and delays of the readings, and where the search for the command's delay begins."""
 
     rate_hz: float
+    """Rate of the samples."""
     angle_delay_s: float
+    """Age of an angle when it is read."""
     torque_delay_s: float
+    """Age of a torque when it is read."""
     actuation_delay_s: float
+    """Start value of the search."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stack:
+class _Stack:
     """Repeats of one motion, each array (r, n)."""
 
     angle_rad: Real
@@ -60,7 +64,7 @@ class Stack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class _Rows:
     """Moments of a stack: ``y = x p``, a row a repeat and frequency."""
 
     y: Complex
@@ -69,7 +73,7 @@ class Rows:
     """(r, m, p), of what belongs to each unknown."""
 
 
-def moments(stack: Stack, timing: Timing, delay_s: float, scale: float, unknowns: int) -> Rows:
+def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int) -> _Rows:
     """Integrate a stack with the test functions; times count from the window's first angle."""
     period_s = 1.0 / timing.rate_hz
     repeats, n = stack.angle_rad.shape
@@ -107,7 +111,7 @@ def moments(stack: Stack, timing: Timing, delay_s: float, scale: float, unknowns
     x[..., COULOMB] = -stack.direction * constant
     x[..., DELAY] = scale * slope
     x[..., ZERO + stack.session] = -constant
-    return Rows(y, x)
+    return _Rows(y, x)
 
 
 def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
@@ -134,8 +138,8 @@ _SMOOTHED_BINS = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """The unknowns in the order of `moments`, and the fit's own diagnostics."""
+class _Fit:
+    """The unknowns in the order of `_moments`, and the fit's own diagnostics."""
 
     values: Real
     """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""
@@ -144,8 +148,8 @@ class Fit:
     friction_departure_nm: float
 
 
-def fit(stacks: Sequence[Stack], timing: Timing, *, hold_scale: bool) -> Fit | None:
-    """Fit by least squares, iterated for delay and weights; None if it does not settle.
+def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit | None:
+    """_Fit by least squares, iterated for delay and weights; None if it does not settle.
 
     Parameters
     ----------
@@ -161,7 +165,7 @@ def fit(stacks: Sequence[Stack], timing: Timing, *, hold_scale: bool) -> Fit | N
     delay_s, scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
     weights: list[Real] = []
     for _ in range(_MAX_ITERATIONS):
-        rows = [moments(stack, timing, delay_s, scale, unknowns) for stack in stacks]
+        rows = [_moments(stack, timing, delay_s, scale, unknowns) for stack in stacks]
         weights = weights or [np.ones(row.y.shape[1]) for row in rows]
         solution = _solve(rows, weights, free)
         residuals = [row.y - row.x @ solution for row in rows]
@@ -178,8 +182,8 @@ def fit(stacks: Sequence[Stack], timing: Timing, *, hold_scale: bool) -> Fit | N
     return None
 
 
-def _solve(rows: Sequence[Rows], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
-    """Fit the means of the repeats; the scale, where it is not free, is 1."""
+def _solve(rows: Sequence[_Rows], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
+    """_Fit the means of the repeats; the scale, where it is not free, is 1."""
     solution = np.zeros(free.size)
     solution[SCALE] = 1.0
     matrix, side = [], []
@@ -196,7 +200,7 @@ def _solve(rows: Sequence[Rows], weights: Sequence[Real], free: NDArray[np.bool_
     return solution
 
 
-def _weights(residuals: Sequence[Complex], stacks: Sequence[Stack]) -> list[Real]:
+def _weights(residuals: Sequence[Complex], stacks: Sequence[_Stack]) -> list[Real]:
     """Return 1 over the variance of the mean of repeats, for each stack and frequency (m,).
 
     The variance is that of single repeats, pooled over the stacks of a session (their noise is the
@@ -218,13 +222,13 @@ def _weights(residuals: Sequence[Complex], stacks: Sequence[Stack]) -> list[Real
 
 
 def _judge(
-    rows: Sequence[Rows],
+    rows: Sequence[_Rows],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
     free: NDArray[np.bool_],
     solution: Real,
     delay_s: float,
-) -> Fit:
+) -> _Fit:
     """Remove the bias by noise from the solution, and estimate its uncertainty."""
     chosen = np.flatnonzero(free)
     normal = np.zeros((chosen.size, chosen.size))
@@ -264,7 +268,7 @@ def _judge(
     values[chosen] -= inverse @ bias
     values[DELAY] += delay_s
     stds[chosen] = widening * np.sqrt(variance)
-    return Fit(values, stds, misfit, departure_nm)
+    return _Fit(values, stds, misfit, departure_nm)
 
 
 def _coverage(freedom: Real) -> Real:
@@ -297,8 +301,11 @@ class Window:
     """Readings during one pass at constant nominal speed, each of shape (n,)."""
 
     angle_rad: Real
+    """Angle of the shaft."""
     torque_command_nm: Real
+    """Torque commanded."""
     coupling_torque_nm: Real
+    """Torque between motor and beam."""
     speed_rad_s: float
     """Nominal, signed."""
     top_hz: float
@@ -314,7 +321,9 @@ class Quantity:
     """An estimate and its standard deviation; None: it was not estimated."""
 
     value: float
+    """The estimate."""
     std: float | None
+    """Its standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,7 +354,7 @@ class MotorEstimate:
 def estimate_motor(
     windows: Sequence[Window], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
 ) -> MotorEstimate:
-    """Fit the motor's equation to windows in which its speed keeps its sign.
+    """_Fit the motor's equation to windows in which its speed keeps its sign.
 
     Parameters
     ----------
@@ -371,14 +380,14 @@ def estimate_motor(
     """
     moving = [window for window in windows if _keeps_moving(window, timing.rate_hz)]
     stacks = _stack(moving, len(windows))
-    found = fit(stacks, timing, hold_scale=False)
+    found = _fit(stacks, timing, hold_scale=False)
     scale_known = (
         found is not None
         and found.stds[SCALE] < _MAX_SCALE_STD
         and _SCALES[0] < found.values[SCALE] < _SCALES[1]
     )
     if not scale_known:
-        found = fit(stacks, timing, hold_scale=True)
+        found = _fit(stacks, timing, hold_scale=True)
     if found is None:
         raise EstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
@@ -418,7 +427,7 @@ def _keeps_moving(window: Window, rate_hz: float) -> bool:
     return bool(np.min(along) > _LEAST_SPEED_PART * abs(window.speed_rad_s))
 
 
-def _stack(windows: Sequence[Window], given: int) -> list[Stack]:
+def _stack(windows: Sequence[Window], given: int) -> list[_Stack]:
     groups: dict[Hashable, list[Window]] = {}
     for window in windows:
         groups.setdefault(window.key, []).append(window)
@@ -431,7 +440,7 @@ def _stack(windows: Sequence[Window], given: int) -> list[Stack]:
         )
     sessions = {number: place for place, number in enumerate(sorted({g[0].session for g in full}))}
     return [
-        Stack(
+        _Stack(
             np.array([window.angle_rad for window in group]),
             np.array([window.torque_command_nm for window in group]),
             np.array([window.coupling_torque_nm for window in group]),

@@ -131,7 +131,7 @@ def parse_obstacle(text: str) -> Encounter:
 
     Examples
     --------
-    >>> from rigd.devices import parse_obstacle
+    >>> from rigd.devices.obstacles import parse_obstacle
     >>> parse_obstacle("x=0.62,angle=0.6,stiffness=3000").stiffness_n_per_m
     3000.0
     """

@@ -57,13 +57,19 @@ class Layout:
     speeds_rad_s: tuple[float, ...]
     """Speeds of a cycle; each is run forward, then back."""
     cycles: int
+    """Number of cycles."""
     rest_s: float = 0.5
+    """Rest at the beginning."""
     approach_s: float = 2.0
     """To the end of the stroke where the passes begin."""
     turn_s: float = 0.4
+    """Turn before each pass."""
     settle_s: float = 0.15
+    """Time to settle after a turn."""
     window_s: float = 1.2
+    """Window of a pass."""
     end_s: float = 0.5
+    """Way back and rest at the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +77,25 @@ class Pass:
     """A window of constant nominal speed."""
 
     first: int
+    """Its first tick."""
     end: int
-    """Ticks, the end exclusive."""
+    """The tick after its last."""
     speed_rad_s: float
     """Signed."""
     cycle: int
+    """Number of its cycle, from 0 on."""
 
 
 def lay_out_passes(layout: Layout, rate_hz: float) -> list[Pass]:
-    """Return the passes of a session in their order."""
+    """Return the passes of a session in their order.
+
+    Parameters
+    ----------
+    layout
+        Layout of the session.
+    rate_hz
+        Rate of the samples.
+    """
     turn, settle, window = (
         round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
     )

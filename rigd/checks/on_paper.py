@@ -37,19 +37,21 @@ from typing import TYPE_CHECKING
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.realisation import RealisationError
-from rigd.checks._rows import Row, Verdict, grade
+from rigd.checks.rows import Row, Verdict, grade
 from rigd.control import ControlDesignError, stable_loop
-from rigd.devices import MAY_BE_UNKNOWN, RigParameters, unknown_values
+from rigd.devices import MAY_BE_UNKNOWN, unknown_values
+from rigd.devices.parameters import RigParameters
 from rigd.excitation import chirp
 from rigd.profile import Profile
-from rigd.safety import ENCODER_FAILURE_S, Limits
+from rigd.safety import ENCODER_FAILURE_S
+from rigd.safety.limits import Limits
 from rigd.session.limits import MAX_SAMPLES
 
 # Modules of devices that a rig does not have are not loaded: these checks precede every session.
 if TYPE_CHECKING:
     from rigd.control import Margins
-    from rigd.devices import AtiSerial, Motor
     from rigd.devices.canbus import BusLoad
+    from rigd.devices.parameters import AtiSerial, Motor
 
 # Closed loop
 
@@ -362,8 +364,8 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
     rig
         Parameters of the profile that the drive is to serve, or None.
     """
-    from rigd.devices import EdsError, read_eds
     from rigd.devices.cia402 import Grade, judge
+    from rigd.devices.eds import EdsError, read_eds
 
     verdicts = {
         Grade.FITS: Verdict.OK,

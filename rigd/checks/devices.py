@@ -13,20 +13,16 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rigd.checks._rows import Row, Verdict, grade, name_of, value_of
-from rigd.devices import (
-    DeviceError,
-    Devices,
-    RigParameters,
-    WhatMoves,
-    find_simulator,
-    open_devices,
-    reality,
-)
-from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
+from rigd.checks.rows import Row, Verdict, grade, name_of, value_of
+from rigd.devices import WhatMoves, open_devices, reality
+from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
+from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.parameters import RigParameters
+from rigd.devices.running_simulator import find_simulator
 from rigd.engine import RealClock
 from rigd.profile import Profile
-from rigd.safety import MEASURED
+from rigd.safety.probing_move import MEASURED
 
 _SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
 """What a drive need not state of its position, and the objects."""
@@ -64,7 +60,7 @@ class OutfittedDrive(Protocol):
         """Return what it turned out to have."""
 
 
-def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
+def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
     """Show identity and rated torque; what contradicts the profile was refused on connecting."""
     settings = rig.cia402
     wanted = {
@@ -146,7 +142,15 @@ class MeasurableSensor(Protocol):
 
 
 def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[Row]:
-    """Show identity and calibration, and compare ranges with the profile's."""
+    """Return the rows of identity and calibration, and compare ranges with the profile's.
+
+    Parameters
+    ----------
+    found
+        Calibration as the sensor reports it.
+    rig
+        Parameters of the profile.
+    """
     for key in _SHOWN:
         if key in found:
             yield Row("sensor", name_of(key), _value(key, found), _wanted(key, rig), Verdict.OK)
@@ -182,7 +186,7 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
         yield Row("sensor", "more", f"{len(more)} values, below", "", Verdict.OK, detail)
 
 
-def measured_rows(
+def _measured_rows(
     measured: Mapping[str, float], rig: RigParameters, cause: str = ""
 ) -> Iterator[Row]:
     """Judge rate and turn-round of the sensor; `cause` is what it says of gaps in its stream."""
@@ -246,7 +250,7 @@ _MANY_MISSING = 0.2
 _GROUP = "exchange"
 
 
-def exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
+def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
     """Run some ticks without a torque, and judge how quickly and how surely the replies come.
 
     Parameters
@@ -329,7 +333,7 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row
 # Probing move
 
 
-def probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
+def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
     """Say whether scales and signs are known, or verified before the first session."""
     if moves is WhatMoves.SIMULATED:
         return
@@ -378,8 +382,8 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
         drive.connect()
         yield Row("drive", "connection", _answer(moves), "an answer, no fault", Verdict.OK)
         if isinstance(drive, InspectableDrive):
-            yield from drive_rows(drive, rig)
-        yield from probing_rows(profile, moves)
+            yield from _drive_rows(drive, rig)
+        yield from _probing_rows(profile, moves)
 
     def about_sensor() -> Iterator[Row]:
         sensor.connect()
@@ -391,7 +395,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
             yield Row("sensor", "rate", f"not measured: {moves.value}", "", Verdict.SKIPPED)
         else:
             measured = sensor.measure(MEASURED_S)
-            yield from measured_rows(measured, rig, sensor.health().cause)
+            yield from _measured_rows(measured, rig, sensor.health().cause)
 
     # The drive last: once it is operational it expects a SYNC every period.
     sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
@@ -399,7 +403,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
     if moves is WhatMoves.SIMULATED:
         rows.append(Row("exchange", "ticks", "simulated in this process", "", Verdict.SKIPPED))
     elif drive_answers and sensor_answers:
-        _try("exchange", exchange_rows(profile, devices, moves), rows)
+        _try("exchange", _exchange_rows(profile, devices, moves), rows)
     else:
         why = "not without drive and sensor"
         rows.append(Row("exchange", "ticks", why, "", Verdict.SKIPPED))

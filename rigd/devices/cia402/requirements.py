@@ -15,10 +15,10 @@ from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
 from rigd.devices import unknown_values
-from rigd.devices.cia402 import _objects as objects
+from rigd.devices.cia402 import objects
 
 if TYPE_CHECKING:
-    from rigd.devices import RigParameters, ServoDrive
+    from rigd.devices.parameters import RigParameters, ServoDrive
 
 WATCHDOG: Final = "watchdog"
 TORQUE_LIMIT: Final = "torque_limit"
@@ -80,7 +80,13 @@ class Fit(Enum):
     """It is only read."""
 
     def allows(self, found: int, wanted: int) -> bool:
-        """Whether a value does where another one is wanted."""
+        """Whether a value does where another one is wanted.
+
+        Parameters
+        ----------
+        found, wanted
+            Value that the object holds, and the one that is needed.
+        """
         if self in (Fit.EQUAL, Fit.EQUAL_OR_UNUSED):
             return found == wanted or (self is Fit.EQUAL_OR_UNUSED and found == 0)
         return self is Fit.ANY or found >= wanted
@@ -493,6 +499,11 @@ _BY_PLACE: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 def requirement(index: int, sub: int = 0) -> Requirement:
     """Return the row of an object.
 
+    Parameters
+    ----------
+    index, sub
+        Index and sub-index of the object.
+
     Raises
     ------
     KeyError
@@ -573,7 +584,7 @@ def sync_period_us(rate_hz: float) -> int:
     """
     period_us = 1e6 / rate_hz
     if abs(period_us - round(period_us)) > _ROUNDING * period_us:
-        from rigd.devices import DeviceError  # which loads numpy
+        from rigd.devices.contracts import DeviceError  # which loads numpy
 
         raise DeviceError(
             f"rig.rate_hz = {rate_hz:g} Hz: the period of a CANopen drive must be a whole "
@@ -596,7 +607,7 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
         value = 10.0**-exponent / rate_hz
         if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
             return round(value), exponent
-    from rigd.devices import DeviceError
+    from rigd.devices.contracts import DeviceError
 
     raise DeviceError(
         f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "

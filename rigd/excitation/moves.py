@@ -48,7 +48,7 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
 
     Examples
     --------
-    >>> from rigd.excitation import quintic
+    >>> from rigd.excitation.moves import quintic
     >>> quintic(0.004, 1000.0).round(4)
     array([0.1035, 0.5   , 0.8965, 1.    ])
     """
@@ -291,7 +291,7 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
 
     Examples
     --------
-    >>> from rigd.excitation import braking_path
+    >>> from rigd.excitation.moves import braking_path
     >>> braking = braking_path(0.1, rate_hz=1000)
     >>> path_rad = braking.path(0.6, speed_rad_s=1.0)
     >>> round(path_rad[-1], 6)  # half the way of a motor that goes on

@@ -34,7 +34,7 @@ from rigd.excitation._piece_search import (
 )
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
-from rigd.excitation._targets import OF_MODES, Precision, Quantities, Target
+from rigd.excitation.targets import OF_MODES, Precision, Quantities, Target
 
 Real = NDArray[np.float64]
 
@@ -263,7 +263,9 @@ def design_excitation(
     --------
     >>> import numpy as np
     >>> from rigd.beam import Beam, Damping
-    >>> from rigd.excitation import BeamEstimate, design_excitation, parse_target
+    >>> from rigd.excitation import BeamEstimate
+    >>> from rigd.excitation.experiment_design import design_excitation
+    >>> from rigd.excitation.targets import parse_target
     >>> from rigd.profile import load_profile
     >>> from rigd.runner import LoopPreview
     >>> estimate = BeamEstimate(
