@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench import Figures, Measurement, figures, measurement
 from rigd.bench import _loops as loops
-from rigd.bench._measure import UsageMeter
+from rigd.bench.measure import Figures, Measurement, UsageMeter, figures, measurement
 from rigd.checks import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile

@@ -28,7 +28,7 @@ from rigd.devices import SimulatorAddress, Wrench, WrenchSensor, find_simulator
 from rigd.devices.ati import AtiCanSensor, AtiSerialSensor
 from rigd.devices.canbus import CanExchange, SocketPort
 from rigd.devices.cia402 import Cia402Drive
-from rigd.engine import collect_no_garbage, obtain
+from rigd.engine.realtime import collect_no_garbage, obtain
 from rigd.profile import load_profile
 
 BLOCKS, TICKS, SETTLING = 20, 250, 20

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench._measure import Measurement, UsageMeter, measurement
+from rigd.bench.measure import Measurement, UsageMeter, measurement
 from rigd.devices import Selection, unknown_values
-from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
+from rigd.engine import put_reference
+from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.checks._rows import Row, Verdict, grade
-from rigd.engine import LOCKED, REFUSED, isolated_cores
+from rigd.engine.realtime import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime import OWN_PYTHON
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
 from rigd.daemon._states import Document, State, fit_document
-from rigd.engine import Event
+from rigd.engine.shared_state import Event
 from rigd.runner import RigError, Series, SessionProgress, SessionResult, result_line
 from rigd.runtime import StopRequest
 

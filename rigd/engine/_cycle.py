@@ -22,7 +22,7 @@ from rigd.control import PidController
 from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
-from rigd.runtime import UnsafeFolderError, runtime_folder
+from rigd.runtime.addresses import UnsafeFolderError, runtime_folder
 from rigd.safety import (
     BY_NAME,
     BeamPrediction,

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from rigd.engine._cycle import Cycle
-from rigd.engine._messages import TouchOrder
+from rigd.engine.messages import TouchOrder
 from rigd.excitation import after_touch
 from rigd.session import Status
 from rigd.touch import TouchDetector

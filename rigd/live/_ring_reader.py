@@ -5,17 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rigd.engine import (
-    EVENT,
-    SAMPLE,
-    TIMING,
-    TOPICS,
-    Channels,
-    ChannelSpecs,
-    Observer,
-    Ring,
-    read_events,
-)
+from rigd.engine import Observer, Ring
+from rigd.engine.channels import EVENT, SAMPLE, TIMING, TOPICS, Channels, ChannelSpecs
+from rigd.engine.shared_state import read_events
 from rigd.session import decode_samples, decode_timings
 from rigd.view import LastResponse, Note, Scene, Subject
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 from rigd.printable import counts_text, progress_bar
 from rigd.session import touch_line
 

@@ -11,7 +11,7 @@ import typer
 
 from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
-from rigd.engine import Event
+from rigd.engine.shared_state import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile, with_specimen

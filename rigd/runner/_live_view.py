@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from rigd.beam import undamped_frequencies_rad_s
-from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
+from rigd.engine.messages import Failed
+from rigd.engine.processes import LIVE, ChildError, Pulse
+from rigd.engine.shared_state import Event, Level, Word
 from rigd.live import LiveAddress, LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup

@@ -4,22 +4,18 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.engine import (
-    FIT,
-    ChildError,
-    Event,
+from rigd.engine.messages import (
     Failed,
     FileHeader,
     FitJob,
     FitReady,
     FitTold,
     PieceTold,
-    Pulse,
     RecordEnded,
     SearchEnded,
-    Stop,
-    Word,
 )
+from rigd.engine.processes import FIT, ChildError, Pulse
+from rigd.engine.shared_state import Event, Stop, Word
 from rigd.runner._precision_search import Stated, in_words, stated, targets_json
 from rigd.runner._process_group import await_ready
 

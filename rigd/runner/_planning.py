@@ -26,7 +26,7 @@ from rigd.control import (
     design_damper,
     stable_loop,
 )
-from rigd.engine import Ending
+from rigd.engine.messages import Ending
 from rigd.errors import UserError
 from rigd.excitation import (
     KINDS,

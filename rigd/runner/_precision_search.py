@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine import FitTold, PieceTold, PieceWriter, SearchEnded
+from rigd.engine import PieceWriter
+from rigd.engine.messages import FitTold, PieceTold, SearchEnded
 from rigd.errors import RigdError
 from rigd.excitation import (
     BAND_HZ,

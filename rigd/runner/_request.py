@@ -29,7 +29,7 @@ from rigd.devices import (
     what_moves,
     with_obstacles,
 )
-from rigd.engine import Connected, Ending, FileHeader
+from rigd.engine.messages import Connected, Ending, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile

@@ -9,24 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 from rigd.devices import DeviceError, WhatMoves, describe_unknown_values
-from rigd.engine import (
-    CONTROL,
-    LIVE,
-    ChildError,
-    Connected,
-    ControlJob,
-    Ended,
-    Measured,
-    Precedence,
-    Probe,
-    Pulse,
-    Refused,
-    SharedState,
-    Stop,
-    Tare,
-    Word,
-    Zero,
-)
+from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
+from rigd.engine.processes import CONTROL, LIVE, ChildError, Pulse
+from rigd.engine.realtime import Precedence
+from rigd.engine.shared_state import SharedState, Stop, Word
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView

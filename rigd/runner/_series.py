@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 from rigd.devices import session_seed
-from rigd.engine import Event
+from rigd.engine.shared_state import Event
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
 from rigd.runner._planning import (

@@ -13,32 +13,23 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
-from rigd.engine import (
-    CONTROL,
-    RECORDER,
-    REFUSED,
+from rigd.engine import Observer, is_whole, put_reference
+from rigd.engine.messages import (
     Armed,
-    ChildError,
     Close,
     Closed,
     Connected,
     Ended,
-    Event,
     Failed,
     Finished,
-    Observer,
     Opened,
-    Phase,
-    Pulse,
     Ready,
     RecorderJob,
     SessionJob,
-    Stop,
-    Word,
-    is_whole,
-    put_reference,
-    read_events,
 )
+from rigd.engine.processes import CONTROL, RECORDER, ChildError, Pulse
+from rigd.engine.realtime import REFUSED
+from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import OnlineFit

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigd.bench._measure import Measurement
+from rigd.bench.measure import Measurement
 
 
 @pytest.fixture

@@ -5,10 +5,9 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from rigd.bench._loops import LoopError
-from rigd.bench._program import Results
+from rigd.bench import LoopError, Results
 from rigd.cli.app import app
-from rigd.runtime._locks import RigLock
+from rigd.runtime import RigLock
 
 
 @pytest.fixture

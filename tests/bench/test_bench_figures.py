@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.bench._measure import UsageMeter, figures, measurement, pooled, usage_of, wake_ups_us
 from rigd.bench._report import counts_of, edges_us, histogram_lines
-from rigd.engine._shared_state import Phase
-from rigd.session._format import SAMPLE_DTYPE
+from rigd.bench.measure import UsageMeter, figures, measurement, pooled, usage_of, wake_ups_us
+from rigd.engine.shared_state import Phase
+from rigd.session import SAMPLE_DTYPE
 
 
 def samples(ticks, lateness_ns, work_ns=1000):
@@ -118,7 +118,7 @@ def test_usage_is_taken_between_looks_at_a_running_record():
 
 
 def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
-    monkeypatch.setattr("rigd.bench._measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
+    monkeypatch.setattr("rigd.bench.measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
     meter = UsageMeter(1)
     meter.look(Phase.RUNNING)
     assert meter.cpu_percent is None

@@ -6,11 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from rigd.bench import Bench, as_json, report_lines
+from rigd.bench import Bench, as_json, cores_beside, report_lines
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench._program import cores_beside
-from rigd.engine._realtime import REFUSED
+from rigd.engine.realtime import REFUSED
 from rigd.profile import load_profile
 
 GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}

@@ -30,9 +30,8 @@ from typing import Any
 
 import numpy as np
 
-from rigd.devices import ask_simulator
-from rigd.devices._simulator import find_simulator
-from rigd.safety._limits import OVERLOADED
+from rigd.devices import ask_simulator, find_simulator
+from rigd.safety import OVERLOADED
 from rigd.session import Status, read_session
 
 BIN = Path(sys.executable).parent

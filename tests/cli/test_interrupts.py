@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
+from rigd.runner import SessionResult
 from rigd.runner._foreground import _tell_stop
-from rigd.runner._session import SessionResult
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runtime import StopRequest
 
 DURING = {
     # What defines a dataclass or a named tuple is an `exec` of text.

@@ -7,7 +7,8 @@ import pytest
 from processes import eventually
 
 from rigd.cli.live import _follow
-from rigd.live._address import LiveAddress, announce
+from rigd.live import LiveAddress
+from rigd.live._address import announce
 
 VIEWER = """#!/bin/sh
 echo "$@" > "$SEEN.arguments"

@@ -22,18 +22,22 @@ from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
 
 from analysis.models import WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
-from rigd.session import SessionError, SessionWriter, Status, read_session
-from rigd.session._format import (
+from rigd.session import (
     SAMPLE_SIZE,
     TIMING_SIZE,
+    SessionError,
+    SessionWriter,
+    Status,
     pack_sample_into,
     pack_timing_into,
+    read_session,
 )
+from rigd.view import GREEN, GREY, ORANGE, SKY_BLUE, nominal_damping
 from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
-from rigd.view._plots import AGES, GREEN, GREY, HEALTH, LOOP, ORANGE, SKY_BLUE
-from rigd.view._recorded import nominal_damping, subject_of_session
+from rigd.view._plots import AGES, HEALTH, LOOP
+from rigd.view._recorded import subject_of_session
 
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")
@@ -557,7 +561,7 @@ def unseen(viewer, colors: dict) -> list:
 def test_a_port_that_somebody_takes_first_is_not_insisted_on(
     rerun_program, recording, tmp_path, monkeypatch
 ):
-    from rigd.live._viewer import PageOfFile
+    from rigd.live import PageOfFile
 
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
@@ -573,8 +577,8 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
+    from rigd.live import PageOfFile, Window
     from rigd.live._program import RerunProgram
-    from rigd.live._viewer import PageOfFile, Window
 
     headless = ("--headless", "--window-size", "960x600")
     if way == "window":

@@ -12,7 +12,8 @@ import pytest
 import typer
 
 from rigd.cli import start
-from rigd.daemon._address import peer_of, socket_path
+from rigd.daemon import socket_path
+from rigd.daemon._address import peer_of
 
 DONE = {
     "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,

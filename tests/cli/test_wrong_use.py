@@ -145,7 +145,7 @@ def test_both_commands_say_which_version_they_are(rigd_here):
 
 
 def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
-    from rigd.runtime._stop_signals import StopRequest
+    from rigd.runtime import StopRequest
 
     stop = StopRequest()
     stop.requested = True  # told is what is planned, and nothing is run

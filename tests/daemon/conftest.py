@@ -15,17 +15,16 @@ from rigd.daemon._address import own_sockets
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._service import Service
 from rigd.daemon._states import Peer, State
-from rigd.devices._registry import WhatMoves, open_devices
+from rigd.devices import WhatMoves, open_devices
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.engine import control_process as control
 from rigd.engine import recorder
-from rigd.engine._ipc import CONTROL, ChildError
+from rigd.engine.processes import CONTROL, ChildError
 from rigd.profile import load_profile
+from rigd.runner import ProcessGroup, Rig
 from rigd.runner import _rig as rig_module
-from rigd.runner._process_group import ProcessGroup
-from rigd.runner._rig import Rig
-from rigd.runtime import read_processes
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runtime import StopRequest
+from rigd.runtime.processes import read_processes
 from rigd.session import SessionError, SessionWriter
 
 _ENDED = object()

@@ -12,16 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from rigd.daemon import Client, DaemonGoneError, RefusedByDaemonError, await_end, stop_session
 from rigd.daemon import _client as client_module
-from rigd.daemon._client import (
-    STOP_SIGNAL,
-    Client,
-    DaemonGoneError,
-    RefusedByDaemonError,
-    await_end,
-    stop_session,
-    what_is_left,
-)
+from rigd.daemon._client import STOP_SIGNAL, what_is_left
 
 CROWDED = {"reply": None, "ok": False, "error": "too many", "wrong_use": False, "crowded": True}
 

@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rigd.daemon import AddressError, UnknownGroupError, find, running, socket_path
 from rigd.daemon import _address as address
 from rigd.daemon import _server as server
-from rigd.daemon._address import AddressError, UnknownGroupError, bind, find, running, socket_path
+from rigd.daemon._address import bind
 from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.daemon._states import Peer, State
 from rigd.runner import _signal_blocks
-from rigd.runtime import answers
+from rigd.runtime.addresses import answers
 
 LONG = {
     "command": "start",

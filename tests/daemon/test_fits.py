@@ -9,7 +9,7 @@ from online_fits import online_fit
 from rigd.daemon._protocol import parse_request
 from rigd.daemon._series import SeriesTeller, ServedSeries
 from rigd.daemon._states import fit_document
-from rigd.engine import Event, Phase
+from rigd.engine.shared_state import Event, Phase
 from rigd.runner import SessionProgress, SessionResult
 
 

@@ -9,10 +9,10 @@ from rigd.cli.status_view import _rows
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._states import Peer, State
-from rigd.devices._registry import WhatMoves
+from rigd.devices import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine._ipc import ChildError
-from rigd.engine._shared_state import Word
+from rigd.engine.processes import ChildError
+from rigd.engine.shared_state import Word
 from rigd.session import read_session
 from rigd.view._recorded import subject_of_session
 

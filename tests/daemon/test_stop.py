@@ -14,11 +14,13 @@ import pytest
 from processes import eventually
 from stop_scenarios import SITUATIONS, can_isolate, isolated
 
-from rigd.daemon import Client
+from rigd.daemon import Client, socket_path
 from rigd.daemon import _stop as stop_module
-from rigd.daemon._address import socket_path
-from rigd.engine import CONTROL, IDLE_NAME, SESSION_NAME, supervisor_of_control
-from rigd.runtime import STOP_SIGNAL, answers, read_process, read_processes
+from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
+from rigd.engine.processes import CONTROL
+from rigd.runtime import STOP_SIGNAL
+from rigd.runtime.addresses import answers
+from rigd.runtime.processes import read_process, read_processes
 
 
 def control_of(pid):

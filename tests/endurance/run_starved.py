@@ -25,7 +25,7 @@ import numpy as np
 from run_viewers import Reading
 
 from rigd.live._address import find
-from rigd.safety._limits import OVERLOADED
+from rigd.safety import OVERLOADED
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

@@ -19,10 +19,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench._measure import measurement
-from rigd.live._address import LiveAddress, find
+from rigd.bench.measure import measurement
+from rigd.live import LiveAddress, Viewer
+from rigd.live._address import find
 from rigd.live._program import RerunProgram
-from rigd.live._viewer import Viewer
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

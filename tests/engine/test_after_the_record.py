@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.control import DamperSettings
-from rigd.engine._messages import Ending, Finished, Ready
+from rigd.engine.messages import Ending, Finished, Ready
 from rigd.excitation import chirp, step
 from rigd.runner import plan_session
 

@@ -5,7 +5,8 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine._timing import SUSPENDED_S, RealClock, SuspendWatch, TickScheduler, VirtualClock
+from rigd.engine import RealClock, TickScheduler, VirtualClock
+from rigd.engine._timing import SUSPENDED_S, SuspendWatch
 
 
 class LateClock:

@@ -7,8 +7,9 @@ from math import exp
 import pytest
 
 from rigd.engine import _cycle as watch
-from rigd.engine._cycle import make_watch, recalled_heat_nm2, remember_heat
-from rigd.engine._messages import Finished
+from rigd.engine import make_watch
+from rigd.engine._cycle import recalled_heat_nm2, remember_heat
+from rigd.engine.messages import Finished
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 

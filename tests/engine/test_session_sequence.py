@@ -10,12 +10,11 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine._messages import Connected, Finished, Ready
-from rigd.engine._shared_state import Phase, Stop, Word
-from rigd.engine._timing import VirtualClock
+from rigd.engine import VirtualClock
+from rigd.engine.messages import Connected, Finished, Ready
+from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.excitation import hold
-from rigd.session import MAX_SAMPLES
-from rigd.session._format import Status, decode_samples
+from rigd.session import MAX_SAMPLES, Status, decode_samples
 
 
 def books(**counts):

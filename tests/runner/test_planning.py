@@ -8,17 +8,17 @@ from cases import further
 
 from rigd.control import ControlDesignError, PidController, close_loop, design_pid
 from rigd.excitation import chirp, from_csv, hold, multisine, step
-from rigd.runner import with_tip_slope
-from rigd.runner._console import plan_lines
-from rigd.runner._planning import (
+from rigd.runner import (
     RefusedError,
     excitation_for,
     largest_amplitude,
     plan_document,
+    plan_lines,
     plan_session,
-    predict,
     predict_session,
+    with_tip_slope,
 )
+from rigd.runner._planning import predict
 
 
 def test_the_papers_chirp_stays_within_the_shipped_limits(profile):

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 
 from rigd.beam import modes
-from rigd.engine import (
-    FitTold,
-    PieceTold,
-    PieceWriter,
-    SearchEnded,
-    SharedState,
-    Word,
-    put_reference,
-    shared_memory_fd,
-)
-from rigd.excitation import ExcitationError, Forecast, Piece, parse_target, until
-from rigd.excitation._targets import Precision
+from rigd.engine import PieceWriter, put_reference, shared_memory_fd
+from rigd.engine.messages import FitTold, PieceTold, SearchEnded
+from rigd.engine.shared_state import SharedState, Word
+from rigd.excitation import ExcitationError, Forecast, Piece, Precision, parse_target, until
 from rigd.profile import load_profile
 from rigd.runner import LoopPreview
 from rigd.runner._precision_search import Search, in_words, stated, targets_json

@@ -8,14 +8,19 @@ from pathlib import Path
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._console import ProgressLine, plan_lines, result_line
-from rigd.runner._planning import RefusedError
-from rigd.runner._request import NoRoomError
-from rigd.runner._series import Series, _await_look
-from rigd.runner._session import SessionResult
+from rigd.runner import (
+    NoRoomError,
+    ProgressLine,
+    RefusedError,
+    Series,
+    SessionResult,
+    plan_lines,
+    result_line,
+)
+from rigd.runner._series import _await_look
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 

@@ -7,10 +7,10 @@ from unittest.mock import MagicMock
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Closed, Connected, Finished
+from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._session import Session, SessionFailedError, always
+from rigd.runner import Order, SessionFailedError
+from rigd.runner._session import Session, always
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."

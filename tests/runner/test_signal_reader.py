@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Phase, Word, shared_memory_fd
-from rigd.engine._ring import Ring
+from rigd.engine import Ring, shared_memory_fd
+from rigd.engine.shared_state import Phase, Word
 from rigd.runner import _signal_blocks
 from rigd.runner._signal_blocks import SignalReader
-from rigd.session._format import SAMPLE_SIZE, pack_sample_into
+from rigd.session import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 1000.0
 

@@ -5,9 +5,9 @@ import os
 import numpy as np
 import pytest
 
-from rigd.engine._ring import Ring, shared_memory_fd
+from rigd.engine import Ring, shared_memory_fd
 from rigd.runner._status import SignalWatch
-from rigd.session._format import SAMPLE_SIZE, pack_sample_into
+from rigd.session import SAMPLE_SIZE, pack_sample_into
 
 
 @pytest.fixture

@@ -6,10 +6,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from rigd.devices._registry import WhatMoves, what_moves
-from rigd.devices._simulator import unreachable_simulators
-from rigd.runner._planning import RefusedError
-from rigd.runner._request import load_rig
+from rigd.devices import WhatMoves, unreachable_simulators, what_moves
+from rigd.runner import RefusedError, load_rig
 
 
 @pytest.fixture

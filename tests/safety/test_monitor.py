@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine._cycle import make_watch
+from rigd.engine import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._planning import RefusedError
+from rigd.runner import RefusedError
 from rigd.runner._request import make_room
 from rigd.safety import LOOK_EVERY
 

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine._shared_state import Event, Phase
+from rigd.engine.shared_state import Event, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runner._session import SessionProgress, SessionResult
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import Order, Rig, SessionProgress, SessionResult
+from rigd.runtime import StopRequest
 from rigd.sim.wire._simulator import inject
 
 

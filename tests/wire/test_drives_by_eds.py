@@ -6,7 +6,7 @@ import pytest
 from eds_files import eds_path
 
 from rigd.devices._wired_rig import reset_drive
-from rigd.runner._rig import Rig, RigError
+from rigd.runner import Rig, RigError
 from rigd.sim.wire._simulator import inject
 
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1, "duration_s": 0.5}

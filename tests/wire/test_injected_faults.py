@@ -9,7 +9,7 @@ from processes import eventually
 
 from rigd.devices._wired_rig import reset_drive
 from rigd.devices.contracts import DeviceError
-from rigd.runner._rig import RigError
+from rigd.runner import RigError
 from rigd.session import Status, read_session
 from rigd.sim.wire._simulator import inject
 

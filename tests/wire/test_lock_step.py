@@ -8,9 +8,8 @@ import pytest
 
 from rigd.devices.parameters import Selection
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import Order, Rig
+from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire._simulator import inject
 

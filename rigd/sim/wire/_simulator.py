@@ -33,7 +33,7 @@ from rigd.devices import (
 )
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.runtime import runtime_folder
+from rigd.runtime.addresses import runtime_folder
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog, Fault, FaultError, WrongUseError, parse_fault

@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
     from rigd.control import DamperSettings
     from rigd.devices import WhatMoves
     from rigd.engine._reference import ReferenceSpec
-    from rigd.engine._topics import ChannelSpecs
+    from rigd.engine.channels import ChannelSpecs
     from rigd.excitation import Approach, PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
     from rigd.touch import DetectorSettings, TouchModel, WatchedBeam

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 
 HELD = 0.999
 """Share of its ticks that a computer has to run in their periods to hold a rate."""
@@ -140,7 +140,7 @@ def figures(values_us: npt.NDArray[np.float64]) -> Figures:
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.bench import figures
+    >>> from rigd.bench.measure import figures
     >>> found = figures(np.arange(101.0))
     >>> found.p50, found.p99, found.largest
     (50.0, 99.0, 100.0)

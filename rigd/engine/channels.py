@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
-from rigd.engine._shared_state import EVENT_SIZE, SharedState, Stop, Word
+from rigd.engine.shared_state import EVENT_SIZE, SharedState, Stop, Word
 from rigd.safety import BUFFERED_S
 from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
