@@ -41,7 +41,7 @@ from rigd.excitation._fisher_information import RecordSoFar, covariance_of
 from rigd.excitation._piece_search import PieceSearch
 from rigd.excitation._targets import Quantities
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]

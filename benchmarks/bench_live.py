@@ -21,7 +21,7 @@ from rigd.engine.processes import LIVE
 from rigd.engine.shared_state import Phase
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
-from rigd.runner import Order
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest, use_one_thread
 from rigd.session import read_session
 

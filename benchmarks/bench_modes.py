@@ -33,7 +33,7 @@ from analysis.models import STRUCTURES
 from rigd.beam import SMALL_SLOPE_RAD, transfer
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 POLE_RAD_S = 80.0
 

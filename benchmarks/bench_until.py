@@ -30,7 +30,7 @@ from analysis.identify import Plant, mode_poles
 from rigd.beam import SMALL_SLOPE_RAD, Beam, Damping, LoadedBeam, modes, tip_motion
 from rigd.excitation import BeamEstimate, chirp, expected_precisions, parse_target
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 Real = NDArray[np.float64]
 

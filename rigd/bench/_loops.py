@@ -14,13 +14,14 @@ import numpy as np
 
 from rigd.bench.measure import Measurement, UsageMeter, measurement
 from rigd.devices import Selection, unknown_values
-from rigd.engine import put_reference
 from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.reference import put_reference
 from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner import Order, ProcessGroup, Rig, SessionProgress
+from rigd.runner import ProcessGroup, Rig, SessionProgress
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples, read_session
 

@@ -21,7 +21,9 @@ class Usage:
     """Processor time and page faults since a process began."""
 
     cpu_s: float
+    """Processor time, s."""
     page_faults: int
+    """Page faults, those that wait for a disk included."""
 
 
 def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
@@ -29,6 +31,13 @@ def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
 
     The scheduler's own account counts nanoseconds; the usual one looks who runs at each of its
     ticks, which a loop in step with them can miss altogether.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+    proc
+        Process table of the kernel.
 
     Raises
     ------
@@ -204,7 +213,15 @@ def measurement(
 
 
 def pooled(name: str, parts: list[Measurement]) -> Measurement:
-    """Return several measurements of the same as one."""
+    """Return several measurements of the same as one.
+
+    Parameters
+    ----------
+    name
+        Name of the measurement.
+    parts
+        Measurements at one rate, at least one.
+    """
     costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
     faults = [part.page_faults for part in parts if part.page_faults is not None]
     return Measurement(

@@ -24,7 +24,7 @@ from rigd.devices import (
     reality,
 )
 from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
-from rigd.engine import RealClock
+from rigd.engine.timing import RealClock
 from rigd.profile import Profile
 from rigd.safety import MEASURED
 

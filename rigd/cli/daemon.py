@@ -67,7 +67,7 @@ def serve(
     Example: rigd serve --profile antenna_can --output /data/sessions --web
     """
     from rigd.daemon import run_daemon
-    from rigd.runner import load_rig, make_folder
+    from rigd.runner.request import load_rig, make_folder
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)

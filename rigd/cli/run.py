@@ -138,7 +138,8 @@ def run_sessions(
     notes = session_notes(operator, specimen, note, meta)
     fit = watch_fit or kind == "until"
     stop, group = start_processes(live=live, touch=kind == "touch", fit=fit)
-    from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
+    from rigd.runner import SeriesFailedError, run_in_foreground
+    from rigd.runner.planning import excitation_for
     from rigd.runtime import ignore
 
     try:

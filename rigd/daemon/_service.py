@@ -48,8 +48,8 @@ from rigd.runner import (
     RigStatus,
     Series,
     SessionFailedError,
-    what_is_kept,
 )
+from rigd.runner.request import what_is_kept
 
 LOOK_S = 0.2
 """Time between two checks of the rig."""

@@ -2,7 +2,9 @@ from . import channels as channels
 from . import messages as messages
 from . import processes as processes
 from . import realtime as realtime
+from . import reference as reference
 from . import shared_state as shared_state
+from . import timing as timing
 from ._control_names import IDLE_NAME as IDLE_NAME
 from ._control_names import SESSION_NAME as SESSION_NAME
 from ._control_names import supervisor_of_control as supervisor_of_control
@@ -10,13 +12,6 @@ from ._cycle import Cycle as Cycle
 from ._cycle import make_observers as make_observers
 from ._cycle import make_watch as make_watch
 from ._probed_rig import probed_rig as probed_rig
-from ._reference import PieceWriter as PieceWriter
-from ._reference import ReferenceSpec as ReferenceSpec
-from ._reference import is_whole as is_whole
-from ._reference import put_reference as put_reference
 from ._ring import Observer as Observer
 from ._ring import Ring as Ring
 from ._ring import shared_memory_fd as shared_memory_fd
-from ._timing import RealClock as RealClock
-from ._timing import TickScheduler as TickScheduler
-from ._timing import VirtualClock as VirtualClock

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rigd.control import PidController
 from rigd.devices import DeviceError, Devices, GaugeSensor, Wrench
-from rigd.engine._timing import TickScheduler
+from rigd.engine.timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime.addresses import UnsafeFolderError, runtime_folder
 from rigd.safety import (

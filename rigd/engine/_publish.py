@@ -7,10 +7,10 @@ from math import isfinite
 from rigd.devices import Devices, LineHealth
 from rigd.engine._cycle import Cycle
 from rigd.engine._ring import Ring
-from rigd.engine._timing import Clock, TickScheduler
 from rigd.engine.channels import CONTROL, Channels
 from rigd.engine.processes import Pulse
 from rigd.engine.shared_state import UNKNOWN, SharedState, Word
+from rigd.engine.timing import Clock, TickScheduler
 from rigd.session import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 

@@ -16,19 +16,13 @@ from rigd.control import VibrationDamper
 from rigd.devices import DeviceError
 from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._publish import Display, SampleLog
-from rigd.engine._reference import PieceReader
-from rigd.engine._timing import (
-    SIGN_OF_LIFE_S,
-    SUSPENDED_S,
-    Clock,
-    SuspendWatch,
-    TickScheduler,
-)
 from rigd.engine.channels import Channels
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults
+from rigd.engine.reference import PieceReader
 from rigd.engine.shared_state import Event, Level, Phase, Stop, Word, write_event
+from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.excitation import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest

@@ -24,15 +24,7 @@ from rigd.engine._cycle import (
     remember_heat,
 )
 from rigd.engine._publish import Display
-from rigd.engine._reference import PieceReader, map_reference
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
-from rigd.engine._timing import (
-    SIGN_OF_LIFE_S,
-    Clock,
-    RealClock,
-    TickScheduler,
-    VirtualClock,
-)
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.messages import (
     Connected,
@@ -49,7 +41,9 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine.reference import PieceReader, map_reference
 from rigd.engine.shared_state import Event, Phase, Word, write_event
+from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.runtime.processes import name_this_process

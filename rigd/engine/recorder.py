@@ -14,7 +14,6 @@ from math import ceil
 from pathlib import Path
 from types import MappingProxyType
 
-from rigd.engine._reference import is_whole
 from rigd.engine.channels import (
     CONTROL,
     EVENT,
@@ -28,6 +27,7 @@ from rigd.engine.channels import (
 from rigd.engine.messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import Precedence
+from rigd.engine.reference import is_whole
 from rigd.engine.shared_state import Phase, SharedState, Word, read_events
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import (

@@ -214,7 +214,15 @@ class Event:
 
 
 def write_event(ring: Ring, event: Event) -> None:
-    """Append an event; where the ring is full it is dropped rather than waited for."""
+    """Append an event; it is dropped if the ring is full.
+
+    Parameters
+    ----------
+    ring
+        Ring of events.
+    event
+        Event; its text is cut to the size of a record.
+    """
     offset = ring.slot()
     if offset < 0:
         return

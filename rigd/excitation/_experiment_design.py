@@ -264,7 +264,7 @@ def design_excitation(
     >>> from rigd.beam import Beam, Damping
     >>> from rigd.excitation import BeamEstimate, design_excitation, parse_target
     >>> from rigd.profile import load_profile
-    >>> from rigd.runner import LoopPreview
+    >>> from rigd.runner.planning import LoopPreview
     >>> estimate = BeamEstimate(
     ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
     ...     damping=Damping(zeta=7e-5, gamma=0.02),

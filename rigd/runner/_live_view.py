@@ -15,7 +15,7 @@ from rigd.engine.shared_state import Event, Level, Word
 from rigd.live import LiveAddress, LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of, sweep_of
 

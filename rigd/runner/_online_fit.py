@@ -20,7 +20,7 @@ from rigd.runner._precision_search import Stated, in_words, stated, targets_json
 from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
-    from rigd.engine import ReferenceSpec
+    from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
     from rigd.runner._process_group import ProcessGroup

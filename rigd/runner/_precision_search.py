@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine import PieceWriter
 from rigd.engine.messages import FitTold, PieceTold, SearchEnded
+from rigd.engine.reference import PieceWriter
 from rigd.errors import RigdError
 from rigd.excitation import (
     BAND_HZ,
@@ -29,7 +29,7 @@ from rigd.excitation import (
     next_piece,
 )
 from rigd.profile import Profile
-from rigd.runner._planning import LoopPreview
+from rigd.runner.planning import LoopPreview
 from rigd.session import Validity
 from rigd.units import with_half_width, with_share
 

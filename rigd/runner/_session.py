@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
-from rigd.engine import Observer, is_whole, put_reference
+from rigd.engine import Observer
 from rigd.engine.messages import (
     Armed,
     Close,
@@ -29,13 +29,14 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import CONTROL, RECORDER, ChildError, Pulse
 from rigd.engine.realtime import REFUSED
+from rigd.engine.reference import is_whole, put_reference
 from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import OnlineFit
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order, another_path, file_header, part_of
 from rigd.runner._touch_search import TouchEstimates
+from rigd.runner.request import Order, another_path, file_header, part_of
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02

@@ -14,11 +14,12 @@ import subprocess
 import threading
 from typing import Any, BinaryIO, Final, Self, cast
 
-from rigd.engine import Observer, PieceWriter
+from rigd.engine import Observer
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitTold, RecordEnded
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import keep_off_loop
+from rigd.engine.reference import PieceWriter
 from rigd.engine.shared_state import Word
 from rigd.runner._precision_search import Search
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED

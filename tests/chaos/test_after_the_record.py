@@ -13,7 +13,8 @@ from rigd.engine.messages import FileHeader
 from rigd.engine.recorder import Recorder
 from rigd.engine.shared_state import Phase, Word
 from rigd.excitation import hold
-from rigd.runner import Order, Rig
+from rigd.runner import Rig
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.session import SessionWriter, pack_sample_into, read_session
 

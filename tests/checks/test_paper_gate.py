@@ -16,7 +16,8 @@ from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, DeviceError, open_devices, unknown_values
 from rigd.excitation import KINDS, hold
 from rigd.profile import ProfileError, UnknownValueError, load_profile
-from rigd.runner import Rig, RigError, Series, excitation_for
+from rigd.runner import Rig, RigError, Series
+from rigd.runner.planning import excitation_for
 from rigd.testing import write_profile
 
 FACTORS = {

@@ -12,7 +12,7 @@ import pytest
 from processes import eventually
 
 from rigd.daemon import socket_path
-from rigd.daemon._client import STOP_SIGNAL
+from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
 from rigd.session import read_session
 

@@ -12,7 +12,8 @@ from shipped_profile import load_shipped
 
 from rigd.engine.processes import CONTROL
 from rigd.excitation import hold
-from rigd.runner import Order, ProcessGroup, Rig
+from rigd.runner import ProcessGroup, Rig
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 
 COARSE_KB = 4096

@@ -8,11 +8,13 @@ from shipped_profile import load_shipped
 
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine import VirtualClock, put_reference, shared_memory_fd
+from rigd.engine import shared_memory_fd
 from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.control_process import attend
 from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.reference import put_reference
 from rigd.engine.shared_state import Phase, Word, read_events
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples

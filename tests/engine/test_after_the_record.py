@@ -8,7 +8,7 @@ import pytest
 from rigd.control import DamperSettings
 from rigd.engine.messages import Ending, Finished, Ready
 from rigd.excitation import chirp, step
-from rigd.runner import plan_session
+from rigd.runner.planning import plan_session
 
 RATE_HZ = 1000.0
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine import VirtualClock
-from rigd.engine._timing import SuspendWatch
 from rigd.engine.messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
 from rigd.engine.shared_state import Phase, Word
+from rigd.engine.timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session import Status
 

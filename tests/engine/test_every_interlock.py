@@ -9,9 +9,10 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine import VirtualClock, make_watch
+from rigd.engine import make_watch
 from rigd.engine.messages import Finished, Tare
 from rigd.engine.shared_state import Word
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety import INTERLOCKS, Action

@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from rigd.engine import put_reference, shared_memory_fd
-from rigd.engine._reference import map_reference
+from rigd.engine import shared_memory_fd
 from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
 from rigd.engine.processes import Child, ChildError
+from rigd.engine.reference import map_reference, put_reference
 from rigd.profile import load_profile
 from rigd.session import MAX_SAMPLES
 

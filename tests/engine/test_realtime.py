@@ -13,9 +13,9 @@ import pytest
 from rigd.engine.realtime import (
     NICE,
     WAKE_UP_US,
-    _lock_memory,
     cores_of,
     isolated_cores,
+    lock_memory,
     page_faults,
 )
 from rigd.profile import load_profile
@@ -103,7 +103,7 @@ def test_memory_under_a_limit_is_not_locked_for_the_future(monkeypatch, limit, f
     monkeypatch.setattr("rigd.engine.realtime.resource.getrlimit", lambda _: (limit, limit))
     monkeypatch.setattr("rigd.engine.realtime.os.geteuid", lambda: 1000)
     libc = Libc()
-    assert report in _lock_memory(libc)
+    assert report in lock_memory(libc)
     assert libc.flags == flags
 
 

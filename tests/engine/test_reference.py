@@ -10,9 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.devices.contracts import LineHealth
-from rigd.engine import PieceWriter, ReferenceSpec, is_whole, put_reference, shared_memory_fd
-from rigd.engine._reference import PieceReader, map_reference
+from rigd.engine import shared_memory_fd
 from rigd.engine.messages import SessionJob
+from rigd.engine.reference import (
+    PieceReader,
+    PieceWriter,
+    ReferenceSpec,
+    is_whole,
+    map_reference,
+    put_reference,
+)
 from rigd.engine.shared_state import SharedState, Stop, Word
 
 UNIT_RAD = 1e-7

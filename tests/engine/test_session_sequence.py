@@ -10,9 +10,9 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine import VirtualClock
 from rigd.engine.messages import Connected, Finished, Ready
 from rigd.engine.shared_state import Phase, Stop, Word
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session import MAX_SAMPLES, Status, decode_samples
 

@@ -10,10 +10,10 @@ from rigd.beam import clamped_free_eigenvalues
 from rigd.excitation import KINDS, ExcitationError, modal_state, move
 from rigd.identified_beam import MOVE, IdentifiedBeamError
 from rigd.profile import load_profile
-from rigd.runner import (
+from rigd.runner import Series
+from rigd.runner.planning import (
     LoopPreview,
     RefusedError,
-    Series,
     excitation_for,
     plan_document,
     plan_session,

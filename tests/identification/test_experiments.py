@@ -19,7 +19,7 @@ from rigd.identification._experiments import (
     trial_session,
 )
 from rigd.identification._records import read_recording
-from rigd.runner import plan_session
+from rigd.runner.planning import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 

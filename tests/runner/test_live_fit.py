@@ -6,8 +6,8 @@ import pytest
 from shipped_profile import load_shipped
 
 from rigd.excitation import make_excitation
-from rigd.runner import Order
 from rigd.runner._live_view import subject_of
+from rigd.runner.request import Order
 
 
 @pytest.mark.parametrize(

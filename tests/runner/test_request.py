@@ -8,8 +8,7 @@ import pytest
 from rigd.engine.messages import Connected
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner import Order
-from rigd.runner._request import file_header, software_commit
+from rigd.runner.request import Order, file_header, software_commit
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ from shipped_profile import load_shipped
 
 from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
-from rigd.runner import Order, Rig, RigError
+from rigd.runner import Rig, RigError
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 

@@ -11,16 +11,10 @@ from shipped_profile import load_shipped
 from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner import (
-    NoRoomError,
-    ProgressLine,
-    RefusedError,
-    Series,
-    SessionResult,
-    plan_lines,
-    result_line,
-)
+from rigd.runner import ProgressLine, Series, SessionResult, plan_lines, result_line
 from rigd.runner._series import _await_look
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import NoRoomError
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 

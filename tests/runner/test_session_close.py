@@ -9,8 +9,9 @@ from shipped_profile import load_shipped
 
 from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
-from rigd.runner import Order, SessionFailedError
+from rigd.runner import SessionFailedError
 from rigd.runner._session import Session, always
+from rigd.runner.request import Order
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."

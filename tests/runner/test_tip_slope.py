@@ -8,15 +8,15 @@ import pytest
 from rigd.beam import SMALL_SLOPE_RAD, linear_model_error
 from rigd.excitation import chirp, from_csv, multisine, step
 from rigd.identification import speeds_session
-from rigd.runner import (
+from rigd.runner import with_tip_slope
+from rigd.runner._tip_slope import TipSlopeError
+from rigd.runner.planning import (
     excitation_for,
     largest_amplitude,
     plan_document,
     predict_session,
-    with_tip_slope,
+    predicted_metadata,
 )
-from rigd.runner._planning import predicted_metadata
-from rigd.runner._tip_slope import TipSlopeError
 
 MAKE = {
     "chirp": lambda rad: chirp(rate_hz=1000.0, amplitude_rad=rad, duration_s=20.0),

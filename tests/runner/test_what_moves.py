@@ -7,7 +7,8 @@ from contextlib import contextmanager
 import pytest
 
 from rigd.devices import WhatMoves, unreachable_simulators, what_moves
-from rigd.runner import RefusedError, load_rig
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import load_rig
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rigd.engine import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner import RefusedError
-from rigd.runner._request import make_room
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import make_room
 from rigd.safety import LOOK_EVERY
 
 PROFILE = load_profile("antenna_can")

@@ -79,10 +79,15 @@ class Prediction:
     """
 
     peak_angle_rad: float
+    """Angle from the rig's zero."""
     peak_velocity_rad_s: float
+    """Speed of the output shaft."""
     peak_torque_nm: float
+    """Torque command at the output shaft."""
     peak_tracking_error_rad: float
+    """Reference minus angle."""
     peak_coupling_torque_nm: float
+    """Torque between hub and antenna."""
     tip: TipMotion | None = None
     """Motion of the beam's free end in a vacuum; None without a beam, or where it is irrelevant."""
 
@@ -511,6 +516,13 @@ def _scan_in_words(excitation: Excitation) -> str:
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     """Predict the peaks of a session.
+
+    Parameters
+    ----------
+    loop
+        Linear closed loop of the rig.
+    excitation
+        Excitation of the session.
 
     Raises
     ------

@@ -33,8 +33,8 @@ from rigd.engine.messages import Connected, Ending, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
-from rigd.runner._planning import RefusedError
 from rigd.runner._touch_search import TouchSearch
+from rigd.runner.planning import RefusedError
 from rigd.safety import Limits
 from rigd.session import META_PREFIX, NOTES, PART_SUFFIX
 from rigd.units import unit_of
