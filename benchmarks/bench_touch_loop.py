@@ -23,10 +23,10 @@ from rigd.bench.measure import Figures, Measurement, UsageMeter, figures, measur
 from rigd.checks import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
-from rigd.runner import SessionProgress
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import LoopPreview
 from rigd.runner.request import Order
+from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest, use_one_thread
 from rigd.session import Status, read_session
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rigd.daemon import Client, DaemonGoneError, RefusedByDaemonError
+from rigd.daemon.client import Client, DaemonGoneError, RefusedByDaemonError
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.runtime.processes import read_process, read_processes
 from rigd.testing import write_profile

@@ -1,5 +1,4 @@
 from . import measure as measure
-from ._loops import LoopError as LoopError
 from ._program import HIGHEST_HZ as HIGHEST_HZ
 from ._program import Bench as Bench
 from ._program import Results as Results

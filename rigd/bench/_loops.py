@@ -20,8 +20,9 @@ from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner import ProcessGroup, Rig, SessionProgress
+from rigd.runner import ProcessGroup, Rig
 from rigd.runner.request import Order
+from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples, read_session
 

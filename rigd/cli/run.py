@@ -41,7 +41,7 @@ from rigd.cli.start import SessionCommands, start_processes, start_sessions
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
-    from rigd.runner import SessionResult
+    from rigd.runner.session import SessionResult
 
 run_app = typer.Typer(
     name="run",
@@ -449,7 +449,7 @@ def until(
 
 
 def _write_json(results: "list[SessionResult]") -> None:
-    from rigd.runner import results_document
+    from rigd.runner.session import results_document
 
     try:
         typer.echo(json.dumps(results_document(results)))

@@ -34,7 +34,7 @@ from rigd.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rigd.daemon import Client
+    from rigd.daemon.client import Client
     from rigd.excitation import Value
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
@@ -194,7 +194,8 @@ def _follow(
 ) -> dict[str, Any]:
     """Show the progress of a series to its end, and return what the daemon says of it."""
     from rigd.engine.shared_state import Phase
-    from rigd.runner import ProgressLine, QuickLook, result_line
+    from rigd.runner import ProgressLine, result_line
+    from rigd.runner.quick_looks import QuickLook
 
     asked = False
     done = 0

@@ -20,8 +20,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.daemon._address import COMMON, SUFFIX, own_sockets, peer_at
-from rigd.daemon._client import UNKNOWN_STATE, await_end, stop_session
+from rigd.daemon.address import COMMON, SUFFIX, own_sockets, peer_at
+from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
 from rigd.runtime import STOP_SIGNAL, held_rig, holds_rig

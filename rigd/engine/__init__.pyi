@@ -1,4 +1,5 @@
 from . import channels as channels
+from . import cycle as cycle
 from . import messages as messages
 from . import processes as processes
 from . import realtime as realtime
@@ -8,9 +9,6 @@ from . import timing as timing
 from ._control_names import IDLE_NAME as IDLE_NAME
 from ._control_names import SESSION_NAME as SESSION_NAME
 from ._control_names import supervisor_of_control as supervisor_of_control
-from ._cycle import Cycle as Cycle
-from ._cycle import make_observers as make_observers
-from ._cycle import make_watch as make_watch
 from ._probed_rig import probed_rig as probed_rig
 from ._ring import Observer as Observer
 from ._ring import Ring as Ring

@@ -6,11 +6,11 @@ controller is another one, and there is no record.
 
 from typing import TYPE_CHECKING, Any, cast
 
-from rigd.engine._cycle import Cycle, Standstill
 from rigd.engine._probed_rig import probed_rig
 from rigd.engine._publish import Display
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
+from rigd.engine.cycle import Cycle, Standstill
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.shared_state import Phase, Word

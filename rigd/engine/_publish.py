@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from math import isfinite
 
 from rigd.devices import Devices, LineHealth
-from rigd.engine._cycle import Cycle
 from rigd.engine._ring import Ring
 from rigd.engine.channels import CONTROL, Channels
+from rigd.engine.cycle import Cycle
 from rigd.engine.processes import Pulse
 from rigd.engine.shared_state import UNKNOWN, SharedState, Word
 from rigd.engine.timing import Clock, TickScheduler

@@ -14,9 +14,9 @@ import numpy as np
 
 from rigd.control import VibrationDamper
 from rigd.devices import DeviceError
-from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._publish import Display, SampleLog
 from rigd.engine.channels import Channels
+from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine.messages import Ending
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rigd.engine._cycle import Cycle
+from rigd.engine.cycle import Cycle
 from rigd.engine.messages import TouchOrder
 from rigd.excitation import after_touch
 from rigd.session import Status

@@ -13,7 +13,10 @@ from dataclasses import asdict
 from rigd.control import PidController, design_pid
 from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
-from rigd.engine._cycle import (
+from rigd.engine._publish import Display
+from rigd.engine._session_sequence import SessionEnd, SessionSequence
+from rigd.engine.channels import Channels, attach_channels
+from rigd.engine.cycle import (
     Cycle,
     Rest,
     Standstill,
@@ -23,9 +26,6 @@ from rigd.engine._cycle import (
     recalled_heat_nm2,
     remember_heat,
 )
-from rigd.engine._publish import Display
-from rigd.engine._session_sequence import SessionEnd, SessionSequence
-from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.messages import (
     Connected,
     ControlJob,

@@ -17,10 +17,10 @@ from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
-from rigd.runner._signal_blocks import SignalBlock, SignalReader
-from rigd.runner._status import RigStatus, StatusWatch
 from rigd.runner.request import Order
+from rigd.runner.session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner.signal_blocks import SignalBlock, SignalReader
+from rigd.runner.status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
@@ -169,7 +169,7 @@ class Rig:
         stop
             The operator's, which ends it.
         watcher, listens
-            See :class:`rigd.runner._session.Session`.
+            See :class:`rigd.runner.session.Session`.
 
         Raises
         ------

@@ -3,35 +3,55 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
 from rigd.bench import Bench, as_json, cores_beside, report_lines
-from rigd.bench import _cyclictest as cyclictest
-from rigd.bench import _loops as loops
 from rigd.engine.realtime import REFUSED
 from rigd.profile import load_profile
 
 GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
 
 
+CYCLICTEST = """#!/bin/sh
+echo "$@" >> "$0.asked"
+cat "$0.fails" >&2 && exit 1
+cat "$0.says"
+"""
+"""Says what the test has written beside it, or fails with what the test has written."""
+
+
 @pytest.fixture
-def computer(monkeypatch, measured):
-    """Stands in for the loop and cyclictest: holds rates up to one, and notes what it ran."""
+def cyclictest(tmp_path, monkeypatch):
+    """A program in the place of cyclictest, which measures 10 µs at each of 1000 wake-ups."""
+    program = tmp_path / "cyclictest"
+    program.write_text(CYCLICTEST)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    told = {name: program.with_suffix(f".{name}") for name in ("asked", "fails", "says")}
+    made = SimpleNamespace(program=program, **told)
+    made.says.write_text("000010 001000\n")
+    return made
+
+
+@pytest.fixture
+def computer(monkeypatch, measured, cyclictest):
+    """Stands in for the loop: holds rates up to one, and notes what it ran."""
 
     class Computer:
         holds_hz = 4000.0
-        peer_late_us = 10.0
-        peer_missing = False
         unlucky = 0
 
         def __init__(self):
             self.granted = dict(GRANTED)
             self.ran = []
+            self.profiles = []
 
         def loop(self, name, profile, seconds, look, *, live=False):
             rate_hz = profile.rig.rate_hz
             self.ran.append((name, rate_hz, live))
+            self.profiles.append(profile)
             look()
             holds = rate_hz <= self.holds_hz
             if holds and self.unlucky:
@@ -39,17 +59,9 @@ def computer(monkeypatch, measured):
                 holds = False
             return measured(name, rate_hz=rate_hz, held=1.0 if holds else 0.9)
 
-        def peer(self, rate_hz, seconds, *, cpu, priority):
-            self.ran.append((cyclictest.NAME, rate_hz, priority))
-            if self.peer_missing:
-                raise cyclictest.CyclictestError("it is gone")
-            return measured("cyclictest", late_us=(self.peer_late_us,), works=False)
-
     made = Computer()
     monkeypatch.setattr("rigd.bench._program.loops.run_alone", made.loop)
     monkeypatch.setattr("rigd.bench._program.loops.run_session", made.loop)
-    monkeypatch.setattr("rigd.bench._program.cyclictest.run", made.peer)
-    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: True)
     monkeypatch.setattr("rigd.bench._program.settings_granted", lambda _: made.granted)
     return made
 
@@ -74,8 +86,9 @@ def bench(computer):
 
 def test_loop_and_cyclictest_take_turns(bench, computer):
     results = bench()
-    names = [name for name, *_ in computer.ran[:6]]
-    assert names == ["loop alone", "cyclictest"] * 3
+    told = [what for what, _ in bench.told[:6]]
+    assert told == ["loop alone", "cyclictest"] * 3
+    assert [name for name, *_ in computer.ran[:3]] == ["loop alone"] * 3
     assert len(results.rounds) == 3
     assert results.ratios() == (3.0, 3.0)
     assert results.alone.scheduled == 3000
@@ -145,9 +158,10 @@ def test_the_time_left_only_shrinks(bench, monkeypatch):
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, installed):
-    computer.peer_missing = True
-    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: installed)
+def test_without_cyclictest_the_rest_is_measured(bench, cyclictest, monkeypatch, installed):
+    cyclictest.fails.write_text("it is gone\n")
+    if not installed:
+        monkeypatch.setenv("PATH", "/nowhere")
     results = bench()
     assert results.peer is None
     assert results.ratios() is None
@@ -156,21 +170,19 @@ def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, i
     assert as_json(results)["ratio_to_cyclictest"] is None
 
 
-def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer):
+def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer, cyclictest):
     computer.granted["scheduling"] = f"{REFUSED}not permitted"
     results = bench()
-    assert (cyclictest.NAME, 1000.0, 0) in computer.ran
+    asked = cyclictest.asked.read_text().splitlines()
+    assert len(asked) == 3
+    assert all({"--priority=0", "--interval=1000"} <= set(line.split()) for line in asked)
     assert "Not granted: scheduling" in "\n".join(report_lines(results))
 
 
-def test_what_the_computer_itself_misses_is_told(bench, computer):
-    computer.peer_late_us = 2500.0
+def test_what_the_computer_itself_misses_is_told(bench, computer, cyclictest):
+    cyclictest.says.write_text("002500 000010\n000010 000990\n")
     computer.holds_hz = 500.0
     results = bench()
-    results.rounds[:] = [
-        (ours, cyclictest.measured("002500 000010\n000010 000990", 1000.0))
-        for ours, _ in results.rounds
-    ]
     assert "this is due to the computer itself" in "\n".join(report_lines(results))
 
 
@@ -204,10 +216,13 @@ def test_the_neighbour_works_beside_the_loop(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
-def test_no_profile_leads_to_its_hardware(name):
-    profile = load_profile(name)
-    rig = loops.rig_for(profile, 2000.0, 50.0).rig
-    assert (rig.devices.drive, rig.devices.sensor) == ("sim", "sim")
-    assert rig.simulation is not None
-    assert [rig.can, rig.cia402, rig.ati_can, rig.ati_serial] == [None] * 4
-    assert rig.rate_hz == 2000.0
+def test_no_profile_leads_to_its_hardware(computer, name):
+    Bench(
+        load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, tell=lambda *_: None
+    ).run()
+    assert computer.profiles[0].rig.rate_hz == 2000.0
+    for profile in computer.profiles:
+        rig = profile.rig
+        assert (rig.devices.drive, rig.devices.sensor) == ("sim", "sim")
+        assert rig.simulation is not None
+        assert [rig.can, rig.cia402, rig.ati_can, rig.ati_serial] == [None] * 4

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from rigd.runner import SessionResult
 from rigd.runner._foreground import _tell_stop
+from rigd.runner.session import SessionResult
 from rigd.runtime import StopRequest
 
 DURING = {

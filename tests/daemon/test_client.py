@@ -12,8 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from rigd.daemon import Client, DaemonGoneError, RefusedByDaemonError, await_end, stop_session
-from rigd.daemon import _client as client_module
+from rigd.daemon import client as client_module
+from rigd.daemon.client import (
+    Client,
+    DaemonGoneError,
+    RefusedByDaemonError,
+    await_end,
+    stop_session,
+)
 from rigd.runtime import STOP_SIGNAL
 
 CROWDED = {"reply": None, "ok": False, "error": "too many", "wrong_use": False, "crowded": True}

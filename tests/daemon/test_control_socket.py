@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigd.daemon import AddressError, UnknownGroupError, find, running, socket_path
-from rigd.daemon import _address as address
 from rigd.daemon import _server as server
-from rigd.runner import _signal_blocks
+from rigd.daemon import address
+from rigd.daemon.address import AddressError, UnknownGroupError, find, running, socket_path
+from rigd.runner import signal_blocks
 from rigd.runtime.addresses import answers
 
 LONG = {
@@ -388,7 +388,7 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
 
 
 def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
-    monkeypatch.setattr(_signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
+    monkeypatch.setattr(signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.tell_signals())

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.daemon import socket_path
+from rigd.daemon.address import socket_path
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
 from rigd.session import read_session

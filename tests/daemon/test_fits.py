@@ -9,7 +9,7 @@ from operated_daemons import parse_request
 
 from rigd.daemon._series import SeriesTeller, ServedSeries
 from rigd.engine.shared_state import Event, Phase
-from rigd.runner import SessionProgress, SessionResult
+from rigd.runner.session import SessionProgress, SessionResult
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.daemon import socket_path
+from rigd.daemon.address import socket_path
 from rigd.runtime.addresses import answers
 
 MOST_GROWTH_MB = 15

@@ -14,7 +14,8 @@ import pytest
 from processes import eventually
 from stop_scenarios import SITUATIONS, can_isolate, isolated
 
-from rigd.daemon import Client, socket_path
+from rigd.daemon.address import socket_path
+from rigd.daemon.client import Client
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.engine.processes import CONTROL
 from rigd.runtime import STOP_SIGNAL

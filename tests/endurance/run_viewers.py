@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench.measure import measurement
-from rigd.live import LiveAddress, Viewer
-from rigd.live._address import find
+from rigd.live import LiveAddress, Viewer, running
 from rigd.live._program import RerunProgram
 from rigd.session import read_session
 
@@ -156,7 +155,7 @@ def run(name: str, seconds: float) -> Outcome:
         try:
             while process.poll() is None:
                 time.sleep(_LOOK_S)
-                if (address := find(RIG)) is not None:
+                for address in [each for each in running() if each.rig == RIG]:
                     viewer.look(address, time.monotonic())
                     publisher_mb = max(publisher_mb, resident_mb(address.pid))
                     server_mb = max(server_mb, *map(resident_mb, children(address.pid)), 0.0)

@@ -9,7 +9,7 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine import make_watch
+from rigd.engine.cycle import make_watch
 from rigd.engine.messages import Finished, Tare
 from rigd.engine.shared_state import Word
 from rigd.engine.timing import VirtualClock

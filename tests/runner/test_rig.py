@@ -143,7 +143,7 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
             if recorder.state != "ended":
                 os.kill(recorder.pid, signal.SIGKILL)
 
-    from rigd.runner import SessionFailedError
+    from rigd.runner.session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, watcher=watcher, duration_s=100.0)

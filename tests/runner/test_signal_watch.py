@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.engine import Ring, shared_memory_fd
-from rigd.runner._status import SignalWatch
+from rigd.runner.status import SignalWatch
 from rigd.session import SAMPLE_SIZE, pack_sample_into
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine import make_watch
+from rigd.engine.cycle import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner.planning import RefusedError

@@ -135,7 +135,9 @@ class TopicStatus:
     """Status of one topic of the table."""
 
     name: str
+    """Name in the table of topics."""
     written: int
+    """Records written since the memory was laid out."""
     rate_hz: float | None
     """Since the last look; None where there was none."""
     expected_hz: float | None

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rigd.daemon._address import peer_of, running
+from rigd.daemon.address import peer_of, running
 from rigd.errors import FailureError, RigdError
 from rigd.live import LiveAddress
 from rigd.live import running as running_views
