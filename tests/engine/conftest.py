@@ -18,7 +18,6 @@ from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples
-from rigd.session._format import decode_controls
 
 
 @dataclass
@@ -187,10 +186,6 @@ class Session:
         while block := self.channels.samples.take(1000):
             blocks.append(decode_samples(block))
         return np.concatenate(blocks) if blocks else None
-
-    @property
-    def controls(self):
-        return decode_controls(self.channels.controls.take(100_000))
 
     @property
     def events(self):

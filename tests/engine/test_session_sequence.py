@@ -64,25 +64,6 @@ def test_the_tare_takes_the_offset_away(make_session):
     assert np.array_equal(rest["coupling_torque_nm"], rest["tz_nm"])
 
 
-def test_the_terms_of_the_controller_add_up(make_session):
-    session = make_session().run()
-    controls = session.controls
-    assert np.array_equal(controls["tick"], np.arange(0, 5000, 10))
-    terms = sum(
-        controls[name]
-        for name in (
-            "proportional_nm",
-            "integral_nm",
-            "derivative_nm",
-            "feedforward_nm",
-            "friction_nm",
-        )
-    )
-    command = session.samples["torque_command_nm"][::10]
-    assert np.allclose(terms, controls["unlimited_torque_nm"], atol=1e-12)
-    assert np.allclose(terms, command, atol=1e-12)
-
-
 def test_without_friction_and_noise_the_rig_is_the_computed_closed_loop(
     make_session, quiet_profile
 ):
