@@ -54,7 +54,7 @@ class Job(Protocol[Done_co]):
 
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
-    """A session to predict: see `rigd.runner.predict_session`."""
+    """A session to predict: see `rigd.runner.planning.predict_session`."""
 
     beside_sessions: ClassVar[bool] = True
 

@@ -242,7 +242,7 @@ def design_excitation(
     estimate
         Beam, damping and noise as they are known beforehand.
     rig
-        Closed loop and limits: `rigd.runner.LoopPreview`.
+        Closed loop and limits: `rigd.runner.planning.LoopPreview`.
     targets
         What is asked.
     duration_s

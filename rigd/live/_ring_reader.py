@@ -49,7 +49,7 @@ class LiveSession:
         By which viewers tell it from others; the same for a publisher that takes it over.
     begins
         How many records had been written to each ring before it, in the order of
-        :data:`rigd.engine.TOPICS`.
+        :data:`rigd.engine.channels.TOPICS`.
     folder
         Folder of its file, where the sessions before it are; None: it is not known.
     """

@@ -56,7 +56,7 @@ def result_line(session: Mapping[str, Any]) -> str:
     Parameters
     ----------
     session
-        As :meth:`rigd.runner.SessionResult.as_dict` gives it.
+        As :meth:`rigd.runner.session.SessionResult.as_dict` gives it.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
