@@ -23,7 +23,7 @@ from rigd.runtime import OWN_PYTHON
 _PATIENCE_S = 20.0
 _TRY = """
 import json, sys
-from rigd.engine import Precedence, obtain
+from rigd.engine.realtime import Precedence, obtain
 priority, below, cpu = map(int, sys.argv[1:])
 beside = Precedence(below, cpu)
 supervision = beside.take()

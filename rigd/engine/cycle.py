@@ -605,14 +605,14 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
 def remember_heat(profile: Profile, heat_nm2: float) -> None:
     """Store the heat of the motor for the next connection of this user.
 
+    Where it cannot be stored, the next connection takes the motor for cold.
+
     Parameters
     ----------
     profile
         Profile of the rig.
     heat_nm2
         Heat of the motor, as the limit monitor counts it.
-
-    Without a place for it, the next one takes the motor for cold.
     """
     document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
     with suppress(OSError, UnsafeFolderError):
