@@ -4,7 +4,7 @@ import numpy as np
 from timing import least_s
 
 from rigd.control import ClosedLoop, PidController, check_stability, close_loop, design_pid
-from rigd.engine import make_watch
+from rigd.engine.cycle import make_watch
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 

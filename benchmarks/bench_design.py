@@ -32,7 +32,7 @@ from rigd.excitation._piece_search import PieceSearch
 from rigd.excitation.experiment_design import next_piece
 from rigd.excitation.targets import Precision, Quantities, Target, parse_target
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]

@@ -15,12 +15,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench import Measurement, figures, measurement
 from rigd.bench import _loops as loops
-from rigd.engine import LIVE, Phase
+from rigd.bench.measure import Measurement, figures, measurement
+from rigd.engine.processes import LIVE
+from rigd.engine.shared_state import Phase
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
-from rigd.runner import Order
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest, use_one_thread
 from rigd.session import read_session
 

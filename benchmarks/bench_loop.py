@@ -14,9 +14,10 @@ import statistics
 import sys
 from pathlib import Path
 
-from rigd.bench import HELD, HIGHEST_HZ, Figures, Measurement, core_of, cores_beside, figures
+from rigd.bench import HIGHEST_HZ, core_of, cores_beside
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
+from rigd.bench.measure import HELD, Figures, Measurement, figures
 from rigd.checks.machine import settings_granted
 from rigd.profile import load_profile
 from rigd.runtime import use_one_thread

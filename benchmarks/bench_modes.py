@@ -34,7 +34,7 @@ from rigd.beam import transfer
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 POLE_RAD_S = 80.0
 

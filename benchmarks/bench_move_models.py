@@ -25,7 +25,7 @@ from bench_moves import left_nm
 from rigd.errors import UserError
 from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
-from rigd.runner import excitation_for
+from rigd.runner.planning import excitation_for
 from rigd.session import read_session
 from rigd.testing import write_profile
 

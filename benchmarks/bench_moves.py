@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from rigd.beam import LoadedBeam, clamped_free_eigenvalues, poles
 from rigd.excitation.moves import quintic
 from rigd.profile import Profile, load_profile
-from rigd.runner import excitation_for, plan_session
+from rigd.runner.planning import excitation_for, plan_session
 from rigd.session import read_session
 from rigd.testing import write_profile
 

@@ -15,7 +15,8 @@ from timing import least_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
-from rigd.engine import Cycle, TickScheduler, VirtualClock, make_observers, make_watch
+from rigd.engine.cycle import Cycle, make_observers, make_watch
+from rigd.engine.timing import TickScheduler, VirtualClock
 from rigd.profile import load_profile
 
 RIGD = Path(sys.executable).with_name("rigd")

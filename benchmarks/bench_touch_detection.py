@@ -19,7 +19,7 @@ from rigd.excitation import chirp
 from rigd.excitation.moves import slew, still_path
 from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 from rigd.sim import SimulatedRig
 from rigd.touch import DetectorSettings, Noise, TouchDetector, TouchModel, watched_beam
 

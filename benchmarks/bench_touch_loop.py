@@ -18,14 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench import Figures, Measurement, figures, measurement
 from rigd.bench import _loops as loops
-from rigd.bench._measure import UsageMeter
+from rigd.bench.measure import Figures, Measurement, UsageMeter, figures, measurement
 from rigd.checks.machine import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
-from rigd.runner import LoopPreview, Order, SessionProgress
 from rigd.runner._touch_search import touch_search
+from rigd.runner.planning import LoopPreview
+from rigd.runner.request import Order
+from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest, use_one_thread
 from rigd.session import read_session
 from rigd.session.layout import Status

@@ -33,7 +33,7 @@ from rigd.excitation import BeamEstimate, chirp
 from rigd.excitation.experiment_design import expected_precisions
 from rigd.excitation.targets import parse_target
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 Real = NDArray[np.float64]
 

@@ -27,7 +27,9 @@ import aiohttp
 import numpy as np
 from bench_live import cpu_s
 
-from rigd.daemon import Client, find, page_address
+from rigd.daemon import page_address
+from rigd.daemon.address import find
+from rigd.daemon.client import Client
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

@@ -30,7 +30,7 @@ from rigd.devices.canbus.port import SocketPort
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import Wrench, WrenchSensor
 from rigd.devices.running_simulator import SimulatorAddress, find_simulator
-from rigd.engine import collect_no_garbage, obtain
+from rigd.engine.realtime import collect_no_garbage, obtain
 from rigd.profile import load_profile
 
 BLOCKS, TICKS, SETTLING = 20, 250, 20

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rigd.daemon import Client, DaemonGoneError, RefusedByDaemonError
+from rigd.daemon.client import Client, DaemonGoneError, RefusedByDaemonError
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
-from rigd.runtime import read_process, read_processes
+from rigd.runtime.processes import read_process, read_processes
 from rigd.testing import write_profile
 
 RIGD = Path(sys.executable).with_name("rigd")

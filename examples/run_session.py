@@ -12,7 +12,8 @@ from pathlib import Path
 from rigd.errors import RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.runner import ProcessGroup, excitation_for, run_in_foreground
+from rigd.runner import ProcessGroup, run_in_foreground
+from rigd.runner.planning import excitation_for
 from rigd.runtime import StopRequest
 
 CHIRP = {

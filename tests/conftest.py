@@ -207,7 +207,7 @@ class Done:
 def rigd_here(tmp_path, monkeypatch):
     """Run `rigd` in this process, as far as it comes without any other."""
     from rigd.cli.app import app
-    from rigd.runtime._stop_signals import StopRequest
+    from rigd.runtime import StopRequest
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")

@@ -1,9 +1,4 @@
-from ._loops import LoopError as LoopError
-from ._measure import HELD as HELD
-from ._measure import Figures as Figures
-from ._measure import Measurement as Measurement
-from ._measure import figures as figures
-from ._measure import measurement as measurement
+from . import measure as measure
 from ._program import HIGHEST_HZ as HIGHEST_HZ
 from ._program import Bench as Bench
 from ._program import Results as Results

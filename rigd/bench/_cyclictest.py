@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigd.bench._measure import Measurement
-from rigd.engine import WAKE_UP_US
+from rigd.bench.measure import Measurement
+from rigd.engine.realtime import WAKE_UP_US
 from rigd.errors import FailureError
 
 NAME = "cyclictest"

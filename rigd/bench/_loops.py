@@ -12,14 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench._measure import Measurement, UsageMeter, measurement
+from rigd.bench.measure import Measurement, UsageMeter, measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import Selection
-from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
+from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.reference import put_reference
+from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner import Order, ProcessGroup, Rig, SessionProgress
+from rigd.runner import ProcessGroup, Rig
+from rigd.runner.request import Order
+from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.session.layout import decode_samples

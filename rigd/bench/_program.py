@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench._measure import HELD, Measurement, figures, pooled
+from rigd.bench.measure import HELD, Measurement, figures, pooled
 from rigd.checks.machine import settings_granted
-from rigd.engine import REFUSED
+from rigd.engine.realtime import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3

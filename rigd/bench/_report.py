@@ -7,9 +7,9 @@ from math import log10
 import numpy as np
 import numpy.typing as npt
 
-from rigd.bench._measure import HELD, STALL_US, Measurement, figures
 from rigd.bench._program import Results
-from rigd.engine import REFUSED
+from rigd.bench.measure import HELD, STALL_US, Measurement, figures
+from rigd.engine.realtime import REFUSED
 
 _NAME = 28
 

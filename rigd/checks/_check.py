@@ -11,7 +11,7 @@ from rigd.checks.rows import Row, Verdict, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile
-from rigd.runner import LoopPreview, excitation_for
+from rigd.runner.planning import LoopPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[Row]:

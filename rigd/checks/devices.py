@@ -20,7 +20,7 @@ from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import find_simulator
-from rigd.engine import RealClock
+from rigd.engine.timing import RealClock
 from rigd.profile import Profile
 from rigd.safety.probing_move import MEASURED
 

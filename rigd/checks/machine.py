@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.checks.rows import Row, Verdict, grade
-from rigd.engine import LOCKED, REFUSED, isolated_cores
+from rigd.engine.realtime import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime import OWN_PYTHON
 
@@ -23,7 +23,7 @@ from rigd.runtime import OWN_PYTHON
 _PATIENCE_S = 20.0
 _TRY = """
 import json, sys
-from rigd.engine import Precedence, obtain
+from rigd.engine.realtime import Precedence, obtain
 priority, below, cpu = map(int, sys.argv[1:])
 beside = Precedence(below, cpu)
 supervision = beside.take()

@@ -28,7 +28,7 @@ from rigd.units import suffix_of, unit_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rigd.daemon import Client
+    from rigd.daemon.client import Client
 
 
 _LOOK_S = 0.5
@@ -67,7 +67,7 @@ def serve(
     Example: rigd serve --profile antenna_can --output /data/sessions --web
     """
     from rigd.daemon import run_daemon
-    from rigd.runner import load_rig, make_folder
+    from rigd.runner.request import load_rig, make_folder
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
@@ -94,14 +94,14 @@ DaemonOf = Annotated[
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
     """Connect to the daemon of a profile."""
-    from rigd.daemon import Client
+    from rigd.daemon.client import Client
 
     with Client(_socket_of(profile)) as client:
         yield client
 
 
 def _socket_of(profile: str | None) -> "Path":
-    from rigd.daemon import find
+    from rigd.daemon.address import find
 
     return find(rig_name(profile))
 
@@ -110,7 +110,7 @@ def rig_name(profile: str | None) -> str | None:
     """Return the name by which the daemon of a profile is found."""
     if profile is None:
         return None
-    from rigd.daemon import running, socket_path
+    from rigd.daemon.address import running, socket_path
 
     # Reading a profile takes a while, and is of no use where its daemon is known by that name.
     if any(path.name == socket_path(profile).name for path in running()):
@@ -209,7 +209,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 def reset_by_daemon(profile: str | None) -> bool:
     """Have the daemon of a profile, or the only one there is, reset its rig; False if none is."""
-    from rigd.daemon import running, socket_path
+    from rigd.daemon.address import running, socket_path
 
     sockets = running()
     if profile is None:
@@ -237,7 +237,8 @@ def _watch(profile: str | None) -> None:
     from rich.live import Live
 
     from rigd.cli.status_view import status_table
-    from rigd.daemon import Client, find
+    from rigd.daemon.address import find
+    from rigd.daemon.client import Client
 
     name = rig_name(profile)
     with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:

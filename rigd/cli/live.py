@@ -110,7 +110,7 @@ def live(
 
 def _rig_name(profile: str) -> str:
     """Return the name of a profile's rig; a profile that cannot be used ends the command."""
-    from rigd.daemon import find_views
+    from rigd.daemon.client import find_views
 
     if find_views(profile):
         return profile
@@ -121,7 +121,7 @@ def _rig_name(profile: str) -> str:
 
 def _only_one(rig: str | None) -> "LiveAddress | None":
     """Return the live view of a rig, if there is one; several end the command."""
-    from rigd.daemon import find_views
+    from rigd.daemon.client import find_views
 
     views = find_views(rig)
     if len(views) > 1:
@@ -138,7 +138,7 @@ def _await(rig: str | None) -> "LiveAddress":
 
 
 def _how_to_start(profile: str | None) -> str:
-    from rigd.daemon import daemons
+    from rigd.daemon.client import daemons
 
     of_rig = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
@@ -186,7 +186,7 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
     int
         The viewer's exit code, once the window is closed.
     """
-    from rigd.daemon import find_views
+    from rigd.daemon.client import find_views
 
     there = True
     while (code := viewer.exit_code) is None:

@@ -41,7 +41,7 @@ from rigd.cli.start import SessionCommands, start_processes, start_sessions
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
-    from rigd.runner import SessionResult
+    from rigd.runner.session import SessionResult
 
 run_app = typer.Typer(
     name="run",
@@ -138,7 +138,8 @@ def run_sessions(
     notes = session_notes(operator, specimen, note, meta)
     fit = watch_fit or kind == "until"
     stop, group = start_processes(live=live, touch=kind == "touch", fit=fit)
-    from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
+    from rigd.runner import SeriesFailedError, run_in_foreground
+    from rigd.runner.planning import excitation_for
     from rigd.runtime import ignore
 
     try:
@@ -448,7 +449,7 @@ def until(
 
 
 def _write_json(results: "list[SessionResult]") -> None:
-    from rigd.runner import results_document
+    from rigd.runner.session import results_document
 
     try:
         typer.echo(json.dumps(results_document(results)))

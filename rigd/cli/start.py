@@ -34,7 +34,7 @@ from rigd.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rigd.daemon import Client
+    from rigd.daemon.client import Client
     from rigd.excitation import Value
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
@@ -69,7 +69,7 @@ def start_processes(
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine import FIT, TOUCH
+    from rigd.engine.processes import FIT, TOUCH
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
@@ -193,8 +193,9 @@ def _follow(
     client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, looks: bool
 ) -> dict[str, Any]:
     """Show the progress of a series to its end, and return what the daemon says of it."""
-    from rigd.engine import Phase
-    from rigd.runner import ProgressLine, QuickLook, result_line
+    from rigd.engine.shared_state import Phase
+    from rigd.runner import ProgressLine, result_line
+    from rigd.runner.quick_looks import QuickLook
 
     asked = False
     done = 0

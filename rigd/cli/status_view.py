@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rigd.daemon import page_address
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 
 _STYLES = {
     "idle": "dim",

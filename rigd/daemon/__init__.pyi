@@ -1,15 +1,5 @@
-from ._address import AddressError as AddressError
-from ._address import UnknownGroupError as UnknownGroupError
-from ._address import find as find
-from ._address import running as running
-from ._address import socket_path as socket_path
-from ._client import Client as Client
-from ._client import DaemonGoneError as DaemonGoneError
-from ._client import RefusedByDaemonError as RefusedByDaemonError
-from ._client import await_end as await_end
-from ._client import daemons as daemons
-from ._client import find_views as find_views
-from ._client import stop_session as stop_session
+from . import address as address
+from . import client as client
 from ._main import run_daemon as run_daemon
 from ._page import page_address as page_address
 from ._stop import StopReport as StopReport

@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from rigd.daemon._address import COMMON, bind, socket_path
 from rigd.daemon._log import NAME, Log
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import look_up_user
+from rigd.daemon.address import COMMON, bind, socket_path
 from rigd.devices import WhatMoves, reality, simulated_differently, what_moves
 from rigd.profile import Profile
 from rigd.runner import Rig

@@ -19,16 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import NAME
-from rigd.runtime import (
-    OWN_PYTHON,
-    SINGLE_THREADED,
-    announce,
-    file_name,
-    held_back,
-    read_address,
-    runtime_folder,
-    started_at,
-)
+from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back
+from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
 
 if TYPE_CHECKING:
     from rigd.profile import Profile

@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, cast
 
-from rigd.daemon._address import peer_of
 from rigd.daemon._log import NAME
 from rigd.daemon._protocol import (
     LONGEST_LINE,
@@ -33,6 +32,7 @@ from rigd.daemon._protocol import (
 )
 from rigd.daemon._service import Service
 from rigd.daemon._states import Document, Peer, look_up_user
+from rigd.daemon.address import peer_of
 
 MOST_CLIENTS = 32
 MOST_WATCHERS = 24

@@ -39,17 +39,11 @@ from rigd.daemon._states import (
 from rigd.devices import WhatMoves, what_moves
 from rigd.errors import UserError
 from rigd.profile import Profile
-from rigd.runner import (
-    ProbeFailedError,
-    QuickLook,
-    QuickLooks,
-    Rig,
-    RigError,
-    RigStatus,
-    Series,
-    SessionFailedError,
-    what_is_kept,
-)
+from rigd.runner import ProbeFailedError, Rig, RigError, Series
+from rigd.runner.quick_looks import QuickLook, QuickLooks
+from rigd.runner.request import what_is_kept
+from rigd.runner.session import SessionFailedError
+from rigd.runner.status import RigStatus
 
 LOOK_S = 0.2
 """Time between two checks of the rig."""

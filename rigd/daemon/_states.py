@@ -12,9 +12,11 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any
 
-from rigd.engine import PROCESSES, Phase
+from rigd.engine.processes import PROCESSES
+from rigd.engine.shared_state import Phase
 from rigd.live import LiveAddress
-from rigd.runner import ProcessStatus, RigStatus, SignalBlock
+from rigd.runner.signal_blocks import SignalBlock
+from rigd.runner.status import ProcessStatus, RigStatus
 
 _REMEMBERED = 50
 

@@ -20,21 +20,13 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.daemon._address import COMMON, SUFFIX, own_sockets, peer_at
-from rigd.daemon._client import UNKNOWN_STATE, await_end, stop_session
+from rigd.daemon.address import COMMON, SUFFIX, own_sockets, peer_at
+from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
-from rigd.runtime import (
-    STOP_SIGNAL,
-    RunningProcess,
-    file_name,
-    folder_fault,
-    held_rig,
-    holds_rig,
-    known_folders,
-    read_processes,
-    send_signal,
-)
+from rigd.runtime import STOP_SIGNAL, held_rig, holds_rig
+from rigd.runtime.addresses import file_name, folder_fault, known_folders
+from rigd.runtime.processes import RunningProcess, read_processes, send_signal
 
 _END_PATIENCE_S: Final = 10.0
 _CONTROL_AFTER_S: Final = 3.0

@@ -22,15 +22,9 @@ from rigd.daemon._protocol import CommandError, Start
 from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile, with_specimen
-from rigd.runner import (
-    NoRoomError,
-    Series,
-    excitation_for,
-    largest_amplitude,
-    plan_document,
-    predict_session,
-    with_tip_slope,
-)
+from rigd.runner import Series, with_tip_slope
+from rigd.runner.planning import excitation_for, largest_amplitude, plan_document, predict_session
+from rigd.runner.request import NoRoomError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
 
 _PATIENCE_S: Final = 50.0
@@ -60,7 +54,7 @@ class Job(Protocol[Done_co]):
 
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
-    """A session to predict: see `rigd.runner.predict_session`."""
+    """A session to predict: see `rigd.runner.planning.predict_session`."""
 
     beside_sessions: ClassVar[bool] = True
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigd.devices.contracts import DeviceError
-from rigd.runtime import announce as write_address
-from rigd.runtime import answers, listening_sockets, read_address, runtime_folder
+from rigd.runtime.addresses import announce as write_address
+from rigd.runtime.addresses import answers, read_address, runtime_folder
+from rigd.runtime.processes import listening_sockets
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters

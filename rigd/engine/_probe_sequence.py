@@ -6,15 +6,15 @@ controller is another one, and there is no record.
 
 from typing import TYPE_CHECKING, Any, cast
 
-from rigd.engine._cycle import Cycle, Standstill
-from rigd.engine._ipc import Parent
-from rigd.engine._messages import Ending
 from rigd.engine._probed_rig import probed_rig
 from rigd.engine._publish import Display
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
-from rigd.engine._shared_state import Phase, Word
-from rigd.engine._timing import Clock, TickScheduler
-from rigd.engine._topics import Channels
+from rigd.engine.channels import Channels
+from rigd.engine.cycle import Cycle, Standstill
+from rigd.engine.messages import Ending
+from rigd.engine.processes import Parent
+from rigd.engine.shared_state import Phase, Word
+from rigd.engine.timing import Clock, TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety.probe_estimate import estimate_probe

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from math import isfinite
 
 from rigd.devices.contracts import Devices, LineHealth
-from rigd.engine._cycle import Cycle
-from rigd.engine._ipc import Pulse
 from rigd.engine._ring import Ring
-from rigd.engine._shared_state import UNKNOWN, SharedState, Word
-from rigd.engine._timing import Clock, TickScheduler
-from rigd.engine._topics import CONTROL, Channels
+from rigd.engine.channels import CONTROL, Channels
+from rigd.engine.cycle import Cycle
+from rigd.engine.processes import Pulse
+from rigd.engine.shared_state import UNKNOWN, SharedState, Word
+from rigd.engine.timing import Clock, TickScheduler
 from rigd.session.layout import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 

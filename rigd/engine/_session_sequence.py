@@ -14,21 +14,15 @@ import numpy as np
 
 from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
-from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
-from rigd.engine._ipc import Parent
-from rigd.engine._messages import Ending
 from rigd.engine._publish import Display, SampleLog
-from rigd.engine._realtime import page_faults
-from rigd.engine._reference import PieceReader
-from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
-from rigd.engine._timing import (
-    SIGN_OF_LIFE_S,
-    SUSPENDED_S,
-    Clock,
-    SuspendWatch,
-    TickScheduler,
-)
-from rigd.engine._topics import Channels
+from rigd.engine.channels import Channels
+from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
+from rigd.engine.messages import Ending
+from rigd.engine.processes import Parent
+from rigd.engine.realtime import page_faults
+from rigd.engine.reference import PieceReader
+from rigd.engine.shared_state import Event, Level, Phase, Stop, Word, write_event
+from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.excitation.moves import quintic, still_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from rigd.engine._cycle import Cycle
-from rigd.engine._messages import TouchOrder
+from rigd.engine.cycle import Cycle
+from rigd.engine.messages import TouchOrder
 from rigd.excitation import after_touch
 from rigd.session.layout import Status
 from rigd.touch import TouchDetector

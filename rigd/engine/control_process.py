@@ -14,7 +14,10 @@ from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
-from rigd.engine._cycle import (
+from rigd.engine._publish import Display
+from rigd.engine._session_sequence import SessionEnd, SessionSequence
+from rigd.engine.channels import Channels, attach_channels
+from rigd.engine.cycle import (
     Cycle,
     Rest,
     Standstill,
@@ -24,8 +27,7 @@ from rigd.engine._cycle import (
     recalled_heat_nm2,
     remember_heat,
 )
-from rigd.engine._ipc import Parent
-from rigd.engine._messages import (
+from rigd.engine.messages import (
     Connected,
     ControlJob,
     Ended,
@@ -38,21 +40,14 @@ from rigd.engine._messages import (
     Tare,
     Zero,
 )
-from rigd.engine._publish import Display
-from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
-from rigd.engine._reference import PieceReader, map_reference
-from rigd.engine._session_sequence import SessionEnd, SessionSequence
-from rigd.engine._shared_state import Event, Phase, Word, write_event
-from rigd.engine._timing import (
-    SIGN_OF_LIFE_S,
-    Clock,
-    RealClock,
-    TickScheduler,
-    VirtualClock,
-)
-from rigd.engine._topics import Channels, attach_channels
+from rigd.engine.processes import Parent
+from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine.reference import PieceReader, map_reference
+from rigd.engine.shared_state import Event, Phase, Word, write_event
+from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.profile import Profile
-from rigd.runtime import StopRequest, name_this_process
+from rigd.runtime import StopRequest
+from rigd.runtime.processes import name_this_process
 from rigd.safety import LOOK_EVERY
 from rigd.session.layout import WRENCH_FIELDS
 

@@ -14,12 +14,7 @@ from math import ceil
 from pathlib import Path
 from types import MappingProxyType
 
-from rigd.engine._ipc import Parent
-from rigd.engine._messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
-from rigd.engine._realtime import Precedence
-from rigd.engine._reference import is_whole
-from rigd.engine._shared_state import Phase, SharedState, Word, read_events
-from rigd.engine._topics import (
+from rigd.engine.channels import (
     CONTROL,
     EVENT,
     SAMPLE,
@@ -29,6 +24,11 @@ from rigd.engine._topics import (
     Topic,
     attach_channels,
 )
+from rigd.engine.messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
+from rigd.engine.processes import Parent
+from rigd.engine.realtime import Precedence
+from rigd.engine.reference import is_whole
+from rigd.engine.shared_state import Phase, SharedState, Word, read_events
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
 from rigd.session.layout import SAMPLE_SIZE

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine._ipc import Parent
-from rigd.engine._messages import TouchJob, TouchReady, TouchTold
-from rigd.engine._realtime import keep_off_loop
 from rigd.engine._ring import Observer
-from rigd.engine._shared_state import Word
-from rigd.engine._topics import attach_channels
+from rigd.engine.channels import attach_channels
+from rigd.engine.messages import TouchJob, TouchReady, TouchTold
+from rigd.engine.processes import Parent
+from rigd.engine.realtime import keep_off_loop
+from rigd.engine.shared_state import Word
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.layout import Status, decode_samples
 from rigd.touch import GrowingEstimate, TouchEstimator, TouchRecord

@@ -243,7 +243,7 @@ def design_excitation(
     estimate
         Beam, damping and noise as they are known beforehand.
     rig
-        Closed loop and limits: `rigd.runner.LoopPreview`.
+        Closed loop and limits: `rigd.runner.planning.LoopPreview`.
     targets
         What is asked.
     duration_s
@@ -267,7 +267,7 @@ def design_excitation(
     >>> from rigd.excitation.experiment_design import design_excitation
     >>> from rigd.excitation.targets import parse_target
     >>> from rigd.profile import load_profile
-    >>> from rigd.runner import LoopPreview
+    >>> from rigd.runner.planning import LoopPreview
     >>> estimate = BeamEstimate(
     ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
     ...     damping=Damping(zeta=7e-5, gamma=0.02),

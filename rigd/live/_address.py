@@ -9,8 +9,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Self
 
-from rigd.runtime import address_files, file_name, read_address, runtime_folder, started_at
-from rigd.runtime import announce as write_address
+from rigd.runtime.addresses import (
+    address_files,
+    file_name,
+    read_address,
+    runtime_folder,
+    started_at,
+)
+from rigd.runtime.addresses import announce as write_address
 
 LOOPBACK: Final = "127.0.0.1"
 _PREFIX: Final = "live-"

@@ -5,17 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rigd.engine import (
-    EVENT,
-    SAMPLE,
-    TIMING,
-    TOPICS,
-    Channels,
-    ChannelSpecs,
-    Observer,
-    Ring,
-    read_events,
-)
+from rigd.engine import Observer, Ring
+from rigd.engine.channels import EVENT, SAMPLE, TIMING, TOPICS, Channels, ChannelSpecs
+from rigd.engine.shared_state import read_events
 from rigd.session.layout import decode_samples, decode_timings
 from rigd.view import LastResponse, Note, Scene, Subject
 
@@ -57,7 +49,7 @@ class LiveSession:
         By which viewers tell it from others; the same for a publisher that takes it over.
     begins
         How many records had been written to each ring before it, in the order of
-        :data:`rigd.engine.TOPICS`.
+        :data:`rigd.engine.channels.TOPICS`.
     folder
         Folder of its file, where the sessions before it are; None: it is not known.
     """

@@ -10,7 +10,7 @@ from rigd.live._address import LiveAddress, proxy_url
 from rigd.live._page import serve_page
 from rigd.live._program import RerunError, RerunProgram
 from rigd.live._server import GRPC_PORT, free_port
-from rigd.runtime import runtime_folder
+from rigd.runtime.addresses import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"
 """Limit beyond which the oldest data are dropped: a session of some hours has room."""

@@ -16,19 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rigd.engine import (
-    SAMPLE,
-    TOPICS,
-    Activity,
-    Channels,
-    Failed,
-    Parent,
-    Phase,
-    Pulse,
-    Word,
-    activity,
-    attach_channels,
-)
+from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
+from rigd.engine.messages import Failed
+from rigd.engine.processes import Parent, Pulse
+from rigd.engine.shared_state import Activity, Phase, Word, activity
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import (

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 from rigd.printable import counts_text, progress_bar
 from rigd.session.touches import touch_line
 
@@ -56,7 +56,7 @@ def result_line(session: Mapping[str, Any]) -> str:
     Parameters
     ----------
     session
-        As :meth:`rigd.runner.SessionResult.as_dict` gives it.
+        As :meth:`rigd.runner.session.SessionResult.as_dict` gives it.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""

@@ -11,18 +11,18 @@ import typer
 
 from rigd.checks import check_on_paper
 from rigd.devices import WhatMoves, simulated_differently, what_moves
-from rigd.engine import Event
+from rigd.engine.shared_state import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile, with_specimen
 from rigd.runner._console import ProgressLine, plan_lines, result_line
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._quick_looks import QuickLook, QuickLooks
-from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
-from rigd.runner._session import SessionFailedError, SessionProgress, SessionResult
 from rigd.runner._tip_slope import with_tip_slope
+from rigd.runner.quick_looks import QuickLook, QuickLooks
+from rigd.runner.request import load_rig, what_is_kept
+from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
 from rigd.runtime import RigLock, StopRequest
 
 _LOOK_PATIENCE_S: Final = 10.0

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from rigd.beam import undamped_frequencies_rad_s
-from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
+from rigd.engine.messages import Failed
+from rigd.engine.processes import LIVE, ChildError, Pulse
+from rigd.engine.shared_state import Event, Level, Word
 from rigd.live import LiveAddress, LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of, sweep_of
 

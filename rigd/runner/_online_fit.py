@@ -4,27 +4,23 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.engine import (
-    FIT,
-    ChildError,
-    Event,
+from rigd.engine.messages import (
     Failed,
     FileHeader,
     FitJob,
     FitReady,
     FitTold,
     PieceTold,
-    Pulse,
     RecordEnded,
     SearchEnded,
-    Stop,
-    Word,
 )
+from rigd.engine.processes import FIT, ChildError, Pulse
+from rigd.engine.shared_state import Event, Stop, Word
 from rigd.runner._precision_search import Stated, in_words, stated, targets_json
 from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
-    from rigd.engine import ReferenceSpec
+    from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
     from rigd.runner._process_group import ProcessGroup

@@ -14,13 +14,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.engine import FitTold, PieceTold, PieceWriter, SearchEnded
+from rigd.engine.messages import FitTold, PieceTold, SearchEnded
+from rigd.engine.reference import PieceWriter
 from rigd.errors import RigdError
 from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, Piece, PrecisionSearch
 from rigd.excitation.experiment_design import expected_precisions, next_piece
 from rigd.excitation.targets import Target
 from rigd.profile import Profile
-from rigd.runner._planning import LoopPreview
+from rigd.runner.planning import LoopPreview
 from rigd.session import Validity
 from rigd.units import with_half_width, with_share
 

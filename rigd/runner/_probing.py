@@ -18,9 +18,10 @@ from rigd.engine import probed_rig
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import load_rig
 from rigd.runner._rig import Rig
-from rigd.runtime import RigLock, StopRequest, runtime_folder
+from rigd.runner.request import load_rig
+from rigd.runtime import RigLock, StopRequest
+from rigd.runtime.addresses import runtime_folder
 from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
 from rigd.safety.probing_move import MEASURED, ProbeEnd, plan_probe
 

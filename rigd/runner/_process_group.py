@@ -11,19 +11,11 @@ from collections.abc import Callable, Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rigd.engine import (
-    CONTROL,
-    LIVE,
-    PROCESSES,
-    RECORDER,
-    Child,
-    ChildError,
-    Process,
-    shared_memory_fd,
-)
+from rigd.engine import shared_memory_fd
+from rigd.engine.processes import CONTROL, LIVE, PROCESSES, RECORDER, Child, ChildError, Process
 
 if TYPE_CHECKING:
-    from rigd.engine import Channels
+    from rigd.engine.channels import Channels
 
 _DESCRIPTORS = 6
 _PREPARING_S = 20.0
@@ -167,7 +159,7 @@ class ProcessGroup:
         OSError
             If there is not enough shared memory.
         """
-        from rigd.engine import HURRIED_BUFFERED_S, create_channels
+        from rigd.engine.channels import HURRIED_BUFFERED_S, create_channels
         from rigd.safety.limits import BUFFERED_S
 
         # Whoever watches samples, as a live view does and a fit, is slower than the virtual clock.

@@ -10,32 +10,18 @@ from typing import Any
 
 from rigd.devices import WhatMoves, describe_unknown_values
 from rigd.devices.contracts import DeviceError
-from rigd.engine import (
-    CONTROL,
-    LIVE,
-    ChildError,
-    Connected,
-    ControlJob,
-    Ended,
-    Measured,
-    Precedence,
-    Probe,
-    Pulse,
-    Refused,
-    SharedState,
-    Stop,
-    Tare,
-    Word,
-    Zero,
-)
+from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
+from rigd.engine.processes import CONTROL, LIVE, ChildError, Pulse
+from rigd.engine.realtime import Precedence
+from rigd.engine.shared_state import SharedState, Stop, Word
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order
-from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
-from rigd.runner._signal_blocks import SignalBlock, SignalReader
-from rigd.runner._status import RigStatus, StatusWatch
+from rigd.runner.request import Order
+from rigd.runner.session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner.signal_blocks import SignalBlock, SignalReader
+from rigd.runner.status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
@@ -184,7 +170,7 @@ class Rig:
         stop
             The operator's, which ends it.
         watcher, listens
-            See :class:`rigd.runner._session.Session`.
+            See :class:`rigd.runner.session.Session`.
 
         Raises
         ------

@@ -11,20 +11,15 @@ from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 from rigd.devices import session_seed
-from rigd.engine import Event
+from rigd.engine.shared_state import Event
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import (
-    RefusedError,
-    plan_document,
-    plan_session,
-    predicted_metadata,
-)
-from rigd.runner._quick_looks import QuickLooks
-from rigd.runner._request import Order, check_required, choose_path, make_room
 from rigd.runner._rig import Rig, RigError
-from rigd.runner._session import SessionProgress, SessionResult, always
 from rigd.runner._touch_search import touch_search
+from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
+from rigd.runner.quick_looks import QuickLooks
+from rigd.runner.request import Order, check_required, choose_path, make_room
+from rigd.runner.session import SessionProgress, SessionResult, always
 from rigd.runtime import StopRequest
 
 _LOOK_PATIENCE_S: Final = 8.0
@@ -67,7 +62,7 @@ class Series:
         Operator, specimen, note and added metadata; what is empty is left out. The beam of a
         specimen that has a file is in the profile already.
     force
-        See :func:`rigd.runner._planning.plan_session`.
+        See :func:`rigd.runner.planning.plan_session`.
     accept
         Names of rows of `rigd check` that may fail; those that do are recorded in the files.
     watch_fit
@@ -163,7 +158,7 @@ class Series:
         live
             Show each session in a live view.
         listens
-            See :class:`rigd.runner._session.Session`.
+            See :class:`rigd.runner.session.Session`.
         looks
             Takes a quick look at each session; the next one waits some seconds for it.
 

@@ -13,15 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rigd.devices.parameters import RigParameters
-from rigd.engine import (
-    TOUCH,
-    ChildError,
-    Event,
-    TouchJob,
-    TouchOrder,
-    TouchReady,
-    TouchTold,
-)
+from rigd.engine.messages import TouchJob, TouchOrder, TouchReady, TouchTold
+from rigd.engine.processes import TOUCH, ChildError
+from rigd.engine.shared_state import Event
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.runner._process_group import await_ready

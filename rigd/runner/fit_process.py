@@ -14,21 +14,13 @@ import subprocess
 import threading
 from typing import Any, BinaryIO, Final, Self, cast
 
-from rigd.engine import (
-    Channels,
-    Failed,
-    FileHeader,
-    FitJob,
-    FitReady,
-    FitTold,
-    Observer,
-    Parent,
-    PieceWriter,
-    RecordEnded,
-    Word,
-    attach_channels,
-    keep_off_loop,
-)
+from rigd.engine import Observer
+from rigd.engine.channels import Channels, attach_channels
+from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitTold, RecordEnded
+from rigd.engine.processes import Parent
+from rigd.engine.realtime import keep_off_loop
+from rigd.engine.reference import PieceWriter
+from rigd.engine.shared_state import Word
 from rigd.runner._precision_search import Search
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals

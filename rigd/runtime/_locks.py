@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from rigd.errors import FailureError
-from rigd.runtime._addresses import file_name, runtime_folder
+from rigd.runtime.addresses import file_name, runtime_folder
 
 _COMMON = Path("/run/lock")
 _LOCKS = Path("/proc/locks")

@@ -17,10 +17,10 @@ from typing import Any, Final
 from aiohttp import web
 
 from rigd.beam import Beam, Damping
-from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
+from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
 from rigd.profile import specimen_files
-from rigd.runner import QuickLook
+from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject, sweep_of

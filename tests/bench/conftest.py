@@ -1,9 +1,13 @@
-"""Measurements made up by the tests."""
+"""Measurements made up by the tests, and a programme whose loop and cyclictest stand in."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from rigd.bench._measure import Measurement
+from rigd.bench import Bench
+from rigd.bench.measure import Measurement
+from rigd.profile import load_profile
 
 
 @pytest.fixture
@@ -16,3 +20,76 @@ def measured():
         return Measurement(name, rate_hz, lateness_us, work_us, scheduled, missed, cpu, 0)
 
     return make
+
+
+GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
+
+
+CYCLICTEST = """#!/bin/sh
+echo "$@" >> "$0.asked"
+cat "$0.fails" >&2 && exit 1
+cat "$0.says"
+"""
+"""Says what the test has written beside it, or fails with what the test has written."""
+
+
+@pytest.fixture
+def cyclictest(tmp_path, monkeypatch):
+    """A program in the place of cyclictest, which measures 10 µs at each of 1000 wake-ups."""
+    program = tmp_path / "cyclictest"
+    program.write_text(CYCLICTEST)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    told = {name: program.with_suffix(f".{name}") for name in ("asked", "fails", "says")}
+    made = SimpleNamespace(program=program, **told)
+    made.says.write_text("000010 001000\n")
+    return made
+
+
+@pytest.fixture
+def computer(monkeypatch, measured, cyclictest):
+    """Stands in for the loop: holds rates up to one, and notes what it ran."""
+
+    class Computer:
+        holds_hz = 4000.0
+        unlucky = 0
+
+        def __init__(self):
+            self.granted = dict(GRANTED)
+            self.ran = []
+            self.profiles = []
+
+        def loop(self, name, profile, seconds, look, *, live=False):
+            rate_hz = profile.rig.rate_hz
+            self.ran.append((name, rate_hz, live))
+            self.profiles.append(profile)
+            look()
+            holds = rate_hz <= self.holds_hz
+            if holds and self.unlucky:
+                self.unlucky -= 1
+                holds = False
+            return measured(name, rate_hz=rate_hz, held=1.0 if holds else 0.9)
+
+    made = Computer()
+    monkeypatch.setattr("rigd.bench._program.loops.run_alone", made.loop)
+    monkeypatch.setattr("rigd.bench._program.loops.run_session", made.loop)
+    monkeypatch.setattr("rigd.bench._program.settings_granted", lambda _: made.granted)
+    return made
+
+
+@pytest.fixture
+def bench(computer):
+    told = []
+
+    def run(rate_hz=1000.0):
+        program = Bench(
+            load_profile("sim"),
+            rate_hz=rate_hz,
+            seconds=10.0,
+            spin_us=0.0,
+            tell=lambda what, left_s: told.append((what, left_s)),
+        )
+        return program.run()
+
+    run.told = told
+    return run

@@ -5,10 +5,10 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from rigd.bench._loops import LoopError
-from rigd.bench._program import Results
+from rigd.bench import Results
 from rigd.cli.app import app
-from rigd.runtime._locks import RigLock
+from rigd.errors import FailureError
+from rigd.runtime import RigLock
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def bench(monkeypatch, measured):
 
         def run(self):
             if self.fails:
-                raise LoopError(self.fails)
+                raise FailureError(self.fails)
             results = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3))
             results.rounds.append((measured(), None))
             results.sessions.append(measured())

@@ -2,7 +2,7 @@
 
 import mmap
 import os
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.bench._measure import UsageMeter, figures, measurement, pooled, usage_of, wake_ups_us
-from rigd.bench._report import counts_of, edges_us, histogram_lines
-from rigd.engine._shared_state import Phase
+from rigd.bench import Results, as_json, report_lines
+from rigd.bench.measure import (
+    Measurement,
+    UsageMeter,
+    figures,
+    measurement,
+    pooled,
+    usage_of,
+    wake_ups_us,
+)
+from rigd.engine.shared_state import Phase
 from rigd.session.layout import SAMPLE_DTYPE
 
 
@@ -66,29 +74,44 @@ def test_rounds_together_count_every_tick(measured):
     assert both.cpu_percent == 5.0
 
 
-@given(st.lists(st.floats(0.0, 1e7), max_size=50))
+def results_of(*measurements):
+    """Results with one round for each measurement, which is its cyclictest as well."""
+    rounds = [(one, replace(one, name="cyclictest")) for one in measurements]
+    first = measurements[0]
+    made = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3), rounds=rounds)
+    made.sessions.append(first)
+    made.search.append(first)
+    return made
+
+
+def loop_of(delays_us, name="loop"):
+    delays_us = np.array(delays_us, dtype=float)
+    return Measurement(name, 1000.0, delays_us, np.full(1, 20.0), delays_us.size, 0)
+
+
+@given(st.lists(st.floats(0.0, 1e7), min_size=1, max_size=50))
 def test_every_delay_is_in_one_bin(delays_us):
-    counts = counts_of(np.array(delays_us))
-    edges = [*edges_us(), np.inf]
-    assert len(counts) == len(edges_us())
-    for count, low, high in zip(counts, edges[:-1], edges[1:], strict=True):
+    document = as_json(results_of(loop_of(delays_us)))
+    histogram = document["rounds"][0]["loop"]["histogram_us"]
+    edges = [*map(float, histogram), np.inf]
+    assert edges[:4] == [0.0, 1.0, 2.0, 5.0]
+    for count, low, high in zip(histogram.values(), edges[:-1], edges[1:], strict=True):
         assert count == sum(low <= delay < high for delay in delays_us)
 
 
 def test_the_histogram_shows_what_is_rare_and_leaves_out_what_is_empty():
-    lines = histogram_lines(
-        [("ours", np.array([30.0] * 9999 + [700.0])), ("theirs", np.full(100, 12.0))]
-    )
-    assert "ours" in lines[0]
-    assert "theirs" in lines[0]
+    ours, theirs = loop_of([30.0] * 9999 + [700.0]), loop_of([12.0] * 100, "cyclictest")
+    results = results_of(ours)
+    results.rounds = [(ours, theirs)]
+    lines = list(report_lines(results))
+    begins = lines.index("Wake-up latency:") + 1
+    lines = lines[begins : lines.index("", begins)]
+    assert "loop alone" in lines[0]
+    assert "cyclictest" in lines[0]
     assert lines[1].split()[0] == "10–20"
     assert lines[-1].split()[0] == "500–1000"
     assert "█" in lines[-1]
     assert len(lines) == 1 + 6
-
-
-def test_nothing_makes_no_histogram():
-    assert histogram_lines([("none", np.empty(0))]) == []
 
 
 def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
@@ -118,7 +141,7 @@ def test_usage_is_taken_between_looks_at_a_running_record():
 
 
 def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
-    monkeypatch.setattr("rigd.bench._measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
+    monkeypatch.setattr("rigd.bench.measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
     meter = UsageMeter(1)
     meter.look(Phase.RUNNING)
     assert meter.cpu_percent is None

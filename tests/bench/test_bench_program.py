@@ -6,77 +6,16 @@ from itertools import pairwise
 
 import pytest
 
-from rigd.bench import Bench, as_json, report_lines
-from rigd.bench import _cyclictest as cyclictest
-from rigd.bench import _loops as loops
-from rigd.bench._program import cores_beside
-from rigd.engine._realtime import REFUSED
+from rigd.bench import Bench, as_json, cores_beside, report_lines
+from rigd.engine.realtime import REFUSED
 from rigd.profile import load_profile
-
-GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
-
-
-@pytest.fixture
-def computer(monkeypatch, measured):
-    """Stands in for the loop and cyclictest: holds rates up to one, and notes what it ran."""
-
-    class Computer:
-        holds_hz = 4000.0
-        peer_late_us = 10.0
-        peer_missing = False
-        unlucky = 0
-
-        def __init__(self):
-            self.granted = dict(GRANTED)
-            self.ran = []
-
-        def loop(self, name, profile, seconds, look, *, live=False):
-            rate_hz = profile.rig.rate_hz
-            self.ran.append((name, rate_hz, live))
-            look()
-            holds = rate_hz <= self.holds_hz
-            if holds and self.unlucky:
-                self.unlucky -= 1
-                holds = False
-            return measured(name, rate_hz=rate_hz, held=1.0 if holds else 0.9)
-
-        def peer(self, rate_hz, seconds, *, cpu, priority):
-            self.ran.append((cyclictest.NAME, rate_hz, priority))
-            if self.peer_missing:
-                raise cyclictest.CyclictestError("it is gone")
-            return measured("cyclictest", late_us=(self.peer_late_us,), works=False)
-
-    made = Computer()
-    monkeypatch.setattr("rigd.bench._program.loops.run_alone", made.loop)
-    monkeypatch.setattr("rigd.bench._program.loops.run_session", made.loop)
-    monkeypatch.setattr("rigd.bench._program.cyclictest.run", made.peer)
-    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: True)
-    monkeypatch.setattr("rigd.bench._program.settings_granted", lambda _: made.granted)
-    return made
-
-
-@pytest.fixture
-def bench(computer):
-    told = []
-
-    def run(rate_hz=1000.0):
-        program = Bench(
-            load_profile("sim"),
-            rate_hz=rate_hz,
-            seconds=10.0,
-            spin_us=0.0,
-            tell=lambda what, left_s: told.append((what, left_s)),
-        )
-        return program.run()
-
-    run.told = told
-    return run
 
 
 def test_loop_and_cyclictest_take_turns(bench, computer):
     results = bench()
-    names = [name for name, *_ in computer.ran[:6]]
-    assert names == ["loop alone", "cyclictest"] * 3
+    told = [what for what, _ in bench.told[:6]]
+    assert told == ["loop alone", "cyclictest"] * 3
+    assert [name for name, *_ in computer.ran[:3]] == ["loop alone"] * 3
     assert len(results.rounds) == 3
     assert results.ratios() == (3.0, 3.0)
     assert results.alone.scheduled == 3000
@@ -146,9 +85,10 @@ def test_the_time_left_only_shrinks(bench, monkeypatch):
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, installed):
-    computer.peer_missing = True
-    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: installed)
+def test_without_cyclictest_the_rest_is_measured(bench, cyclictest, monkeypatch, installed):
+    cyclictest.fails.write_text("it is gone\n")
+    if not installed:
+        monkeypatch.setenv("PATH", "/nowhere")
     results = bench()
     assert results.peer is None
     assert results.ratios() is None
@@ -157,21 +97,19 @@ def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, i
     assert as_json(results)["ratio_to_cyclictest"] is None
 
 
-def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer):
+def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer, cyclictest):
     computer.granted["scheduling"] = f"{REFUSED}not permitted"
     results = bench()
-    assert (cyclictest.NAME, 1000.0, 0) in computer.ran
+    asked = cyclictest.asked.read_text().splitlines()
+    assert len(asked) == 3
+    assert all({"--priority=0", "--interval=1000"} <= set(line.split()) for line in asked)
     assert "Not granted: scheduling" in "\n".join(report_lines(results))
 
 
-def test_what_the_computer_itself_misses_is_told(bench, computer):
-    computer.peer_late_us = 2500.0
+def test_what_the_computer_itself_misses_is_told(bench, computer, cyclictest):
+    cyclictest.says.write_text("002500 000010\n000010 000990\n")
     computer.holds_hz = 500.0
     results = bench()
-    results.rounds[:] = [
-        (ours, cyclictest.measured("002500 000010\n000010 000990", 1000.0))
-        for ours, _ in results.rounds
-    ]
     assert "this is due to the computer itself" in "\n".join(report_lines(results))
 
 
@@ -181,7 +119,7 @@ def test_the_document_is_plain_json(bench):
     assert document["ratio_to_cyclictest"] == {"p50": 3.0, "p99": 3.0}
     assert document["sessions"][0]["lateness_us"]["p99"] == 30.0
     assert document["rounds"][0]["cyclictest"]["work_us"] is None
-    assert document["realtime"] == GRANTED
+    assert document["realtime"]["scheduling"] == "SCHED_FIFO 80"
 
 
 def test_the_table_has_a_row_for_each(bench):
@@ -205,10 +143,13 @@ def test_the_neighbour_works_beside_the_loop(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
-def test_no_profile_leads_to_its_hardware(name):
-    profile = load_profile(name)
-    rig = loops.rig_for(profile, 2000.0, 50.0).rig
-    assert (rig.devices.drive, rig.devices.sensor) == ("sim", "sim")
-    assert rig.simulation is not None
-    assert [rig.can, rig.cia402, rig.ati_can, rig.ati_serial] == [None] * 4
-    assert rig.rate_hz == 2000.0
+def test_no_profile_leads_to_its_hardware(computer, name):
+    Bench(
+        load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, tell=lambda *_: None
+    ).run()
+    assert computer.profiles[0].rig.rate_hz == 2000.0
+    for profile in computer.profiles:
+        rig = profile.rig
+        assert (rig.devices.drive, rig.devices.sensor) == ("sim", "sim")
+        assert rig.simulation is not None
+        assert [rig.can, rig.cia402, rig.ati_can, rig.ati_serial] == [None] * 4

@@ -1,11 +1,7 @@
 """What cyclictest prints, as figures; and what becomes of one that cannot be run."""
 
-import subprocess
-
 import numpy as np
 import pytest
-
-from rigd.bench import _cyclictest as cyclictest
 
 OUTPUT = """\
 # /dev/cpu_dma_latency set to 2us
@@ -27,8 +23,14 @@ OUTPUT = """\
 """
 
 
-def test_every_wake_up_of_the_histogram_counts():
-    found = cyclictest.measured(OUTPUT, 1000.0)
+def measured(bench, cyclictest, output, rate_hz=1000.0):
+    """The measurement of the first round, of a cyclictest with this output."""
+    cyclictest.says.write_text(output)
+    return bench(rate_hz).rounds[0][1]
+
+
+def test_every_wake_up_of_the_histogram_counts(bench, cyclictest):
+    found = measured(bench, cyclictest, OUTPUT)
     delays_us, counts = np.unique(found.lateness_us, return_counts=True)
     assert dict(zip(delays_us, counts, strict=True)) == {
         17.0: 300,
@@ -40,64 +42,41 @@ def test_every_wake_up_of_the_histogram_counts():
     assert found.work_us.size == 0
 
 
-def test_whole_periods_of_delay_are_ticks_that_a_loop_would_have_missed():
-    found = cyclictest.measured(OUTPUT, 1000.0)
+def test_whole_periods_of_delay_are_ticks_that_a_loop_would_have_missed(bench, cyclictest):
+    found = measured(bench, cyclictest, OUTPUT)
     assert found.missed == 2 * 2 + 61
     assert found.scheduled == 504 + found.missed
-    assert cyclictest.measured(OUTPUT, 2000.0).missed == 1 + 2 * 4 + 122
+    assert measured(bench, cyclictest, OUTPUT, 2000.0).missed == 1 + 2 * 4 + 122
 
 
 @pytest.mark.parametrize("output", ["", "# Histogram\n", "FATAL: no\n"])
-def test_output_without_a_histogram_is_an_error(output):
-    with pytest.raises(cyclictest.CyclictestError, match="no histogram"):
-        cyclictest.measured(output, 1000.0)
+def test_output_without_a_histogram_is_an_error(bench, cyclictest, output):
+    cyclictest.says.write_text(output)
+    results = bench()
+    assert results.peer is None
+    assert "no histogram" in results.no_peer
 
 
-@pytest.fixture
-def stand_in(tmp_path, monkeypatch):
-    """A program of that name that does what the test says."""
-
-    def make(script):
-        file = tmp_path / "cyclictest"
-        file.write_text(f"#!/bin/sh\n{script}\n")
-        file.chmod(0o755)
-        monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-        return tmp_path
-
-    return make
-
-
-def test_it_runs_as_the_loop_does(stand_in):
-    folder = stand_in('echo "$@" > "$(dirname "$0")/asked"; echo "000005 000010"')
-    found = cyclictest.run(2000.0, 3.0, cpu=1, priority=80)
+def test_it_runs_as_the_loop_does(bench, cyclictest):
+    found = measured(bench, cyclictest, "000005 000010\n", 2000.0)
     assert found.scheduled == 10
-    asked = (folder / "asked").read_text().split()
-    assert {"--affinity=1", "--priority=80", "--policy=fifo", "--interval=500"} <= set(asked)
-    assert "--loops=6000" in asked
+    asked = cyclictest.asked.read_text().split()
+    assert {"--affinity=0", "--priority=80", "--policy=fifo", "--interval=500"} <= set(asked)
+    assert "--loops=20000" in asked
 
 
-def test_without_a_priority_it_is_an_ordinary_process(stand_in):
-    folder = stand_in('echo "$@" > "$(dirname "$0")/asked"; echo "000005 000010"')
-    cyclictest.run(1000.0, 1.0, cpu=0, priority=0)
-    assert "--policy=other" in (folder / "asked").read_text().split()
+def test_without_a_priority_it_is_an_ordinary_process(bench, computer, cyclictest):
+    del computer.granted["scheduling"]
+    bench()
+    assert {"--policy=other", "--priority=0"} <= set(cyclictest.asked.read_text().split())
 
 
-def test_what_it_complains_of_is_told(stand_in):
-    stand_in("echo first >&2; echo 'FATAL: not permitted' >&2; exit 1")
-    with pytest.raises(cyclictest.CyclictestError, match=r"^FATAL: not permitted$"):
-        cyclictest.run(1000.0, 1.0, cpu=0, priority=80)
+def test_what_it_complains_of_is_told(bench, cyclictest):
+    cyclictest.fails.write_text("first\nFATAL: not permitted\n")
+    assert bench().no_peer == "FATAL: not permitted"
 
 
-def test_one_that_hangs_is_given_up(stand_in, monkeypatch):
-    stand_in("exec sleep 60")
-    monkeypatch.setattr("rigd.bench._cyclictest._MARGIN_S", -0.9)
-    with pytest.raises(cyclictest.CyclictestError) as told:
-        cyclictest.run(1000.0, 1.0, cpu=0, priority=80)
-    assert isinstance(told.value.__cause__, subprocess.TimeoutExpired)
-
-
-def test_whether_it_is_installed_is_seen(stand_in, monkeypatch):
-    stand_in("exit 0")
-    assert cyclictest.installed()
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert not cyclictest.installed()
+def test_one_that_hangs_is_given_up(bench, cyclictest, monkeypatch):
+    cyclictest.program.write_text("#!/bin/sh\nexec sleep 60\n")
+    monkeypatch.setattr("rigd.bench._cyclictest._MARGIN_S", -9.9)  # the measurement takes 10 s
+    assert "timed out" in bench().no_peer

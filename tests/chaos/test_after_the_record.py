@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine._messages import FileHeader
-from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import Phase, Word
-from rigd.engine._topics import DESCRIPTORS, create_channels
+from rigd.engine import shared_memory_fd
+from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.messages import FileHeader
 from rigd.engine.recorder import Recorder
+from rigd.engine.shared_state import Phase, Word
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import Rig
+from rigd.runner.request import Order
+from rigd.runtime import StopRequest
 from rigd.session import SessionWriter, read_session
 from rigd.session.layout import pack_sample_into
 

@@ -16,7 +16,8 @@ from rigd.devices.contracts import DeviceError
 from rigd.errors import UserError
 from rigd.excitation import KINDS, hold
 from rigd.profile import ProfileError, load_profile
-from rigd.runner import Rig, RigError, Series, excitation_for
+from rigd.runner import Rig, RigError, Series
+from rigd.runner.planning import excitation_for
 from rigd.testing import write_profile
 
 FACTORS = {

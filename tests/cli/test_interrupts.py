@@ -5,12 +5,12 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from rigd.runner._foreground import _tell_stop
-from rigd.runner._session import SessionResult
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import ProcessGroup
+from rigd.runtime import StopRequest
 
 DURING = {
     # What defines a dataclass or a named tuple is an `exec` of text.
@@ -137,17 +137,24 @@ def test_so_does_identify(stopped_early):
     assert done.stderr.count("Stopped: no record. Stopped by the operator") == 1
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "said"),
-    [
-        (["complete"], "Stopped: no record after 1 of 3 sessions."),
-        (["complete", "stopped"], ""),  # that one has told
-        (["complete"] * 3, ""),
-    ],
-)
-def test_a_stop_between_two_sessions_is_told(capsys, outcomes, said):
-    results = [SessionResult(None, each, "", 1, 1, 0, 0, 0, fault=False) for each in outcomes]
-    _tell_stop(results, 3)
-    told = capsys.readouterr().err
-    assert told.startswith(said)
-    assert bool(told) == bool(said)
+class StopAfterOne(StopRequest):
+    """A stop that comes as soon as the file of a session is there."""
+
+    requested = property(
+        lambda _: any(Path("sessions").glob("*.mcap")), lambda *_: None, doc="Whether it came."
+    )
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_a_stop_between_two_sessions_is_told(rigd_here, monkeypatch, repeat):
+    monkeypatch.setattr(
+        "rigd.cli.run.start_processes", lambda **_: (StopAfterOne(), ProcessGroup(live=False))
+    )
+    brief = ("--duration", "0.3", "--rest", "0", "--ring-down", "0", "--fast", "--no-look")
+    done = rigd_here("run", "hold", *brief, "--repeat", str(repeat), "--json")
+    assert [each["outcome"] for each in json.loads(done.stdout)["sessions"]] == ["complete"]
+    if repeat == 1:
+        assert "Stopped" not in done.stderr
+    else:
+        assert done.returncode == 130
+        assert "Stopped: no record after 1 of 3 sessions." in done.stderr

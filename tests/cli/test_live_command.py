@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from processes import eventually
 
-from rigd.cli.live import _follow
-from rigd.live._address import LiveAddress, announce
+from rigd.live import LiveAddress
+from rigd.live._address import announce
 
 VIEWER = """#!/bin/sh
 echo "$@" > "$SEEN.arguments"
@@ -143,6 +143,10 @@ class Window:
     def __init__(self, looks: int) -> None:
         self._looks = looks
         self.connected = []
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
 
     @property
     def exit_code(self):
@@ -154,15 +158,18 @@ class Window:
         return len(self.connected) != 2  # once it is too busy
 
 
-def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkeypatch, capsys):
+def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(rigd_here, view, monkeypatch):
     second, third = replace(view, server=2), replace(view, server=3, grpc_port=1234)
-    there = iter([[view], [view], [second], [], [], [third], [third], [third]])
-    monkeypatch.setattr("rigd.daemon.find_views", lambda rig: next(there))
+    there = iter([[view], [view], [view], [second], [], [], [third], [third], [third]])
+    monkeypatch.setattr("rigd.daemon.client.find_views", lambda rig: next(there))
     monkeypatch.setattr("time.sleep", lambda _: None)
+    monkeypatch.setattr("rigd.cli.live.has_screen", lambda: True)
     window = Window(looks=8)
-    assert _follow(window, view) == 0
+    monkeypatch.setattr("rigd.live.Viewer", lambda *_: window)
+    done = rigd_here("live")
+    assert (done.returncode, window.closed) == (0, True)
     assert window.connected == [2, 3, 3]
-    said = capsys.readouterr().err
+    said = done.stderr
     assert said.count("has ended; the window stays open and shows the next one") == 1
     assert said.count("The live view of sim has restarted.") == 2
 
@@ -191,7 +198,7 @@ def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read
 
 
 def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
-    monkeypatch.setattr("rigd.daemon.daemons", lambda: {"sim": True})
+    monkeypatch.setattr("rigd.daemon.client.daemons", lambda: {"sim": True})
     done = rigd_here("live")
     assert done.returncode == 1
     assert "The daemon of the rig sim has no live view at the moment" in done.stderr

@@ -62,7 +62,12 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 240))
     reference = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
     assert np.abs(reference[1000:121_000] - chirp).max() < 1e-12
-    assert read_controls(path).size == 13_600
+    controls = read_controls(path)
+    assert np.array_equal(controls["tick"], np.arange(0, 136_000, 10))
+    terms = ("proportional", "integral", "derivative", "feedforward", "friction")
+    torque_nm = sum(controls[f"{term}_nm"] for term in terms)
+    assert np.allclose(torque_nm, controls["unlimited_torque_nm"], atol=1e-12)
+    assert np.allclose(torque_nm, samples["torque_command_nm"][::10], atol=1e-12)
     assert record.attachments["profile.toml"].decode().startswith("# The simulated rig")
     assert not list(path.parent.glob("*.part"))
 

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -12,12 +13,18 @@ import pytest
 import typer
 
 from rigd.cli import start
-from rigd.daemon._address import peer_of, socket_path
+from rigd.daemon.address import socket_path
 
 DONE = {
     "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,
     "recorded": 1200, "missed": 0, "late": 0, "lost": 0, "stale_angles": 0, "stale_wrenches": 0,
 }  # fmt: skip
+
+
+def process_at(link):
+    """Number of the process at the other end of a socket."""
+    size = struct.calcsize("3i")
+    return struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))[0]
 
 
 class Client:
@@ -159,7 +166,7 @@ def interrupting_daemon(runtime_folder):
                     command = json.loads(line)["command"]
                     heard.append(command)
                     if command == "start":
-                        os.kill(peer_of(link)[0], signal.SIGINT)
+                        os.kill(process_at(link), signal.SIGINT)
                         continue
                     told = {"daemon": {"what_moves": "No hardware."}, "stopping": False}
                     file.write(json.dumps({"reply": command, "ok": True, **told}) + "\n")

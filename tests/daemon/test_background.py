@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from operated_daemons import CommandError
 from processes import eventually
 
 from rigd.daemon import background
-from rigd.daemon._protocol import CommandError
-from rigd.runner import excitation_for, plan_session
+from rigd.runner.planning import excitation_for, plan_session
 
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
 LITTLE_MEMORY = """

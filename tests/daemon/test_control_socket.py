@@ -9,18 +9,17 @@ import os
 import resource
 import socket
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rigd.daemon import _address as address
 from rigd.daemon import _server as server
-from rigd.daemon._address import AddressError, UnknownGroupError, bind, find, running, socket_path
-from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
-from rigd.daemon._states import Peer, State
-from rigd.runner import _signal_blocks
-from rigd.runtime import answers
+from rigd.daemon import address
+from rigd.daemon.address import AddressError, UnknownGroupError, find, running, socket_path
+from rigd.runner import signal_blocks
+from rigd.runtime.addresses import answers
 
 LONG = {
     "command": "start",
@@ -64,7 +63,7 @@ class Served:
     def __init__(self, operated, path):
         self.operated = operated
         self.path = path
-        self.server = Server(bind(path, None))
+        self.server = server.Server(address.bind(path, None))
         operated.service._publish = self.server.publish
         self.links = []
 
@@ -74,7 +73,7 @@ class Served:
         return link
 
     async def until(self, state):
-        while self.operated.state is not state:
+        while self.operated.state != state:
             await asyncio.sleep(0.002)
 
     def run(self, scenario):
@@ -180,7 +179,7 @@ def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
             ["complete"] * len(status["series"]["sessions"])
         )
         assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
-        await served.until(State.READY)
+        await served.until("ready")
 
     served.run(scenario)
     assert served.operated.world.wrong == []
@@ -202,13 +201,13 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
         before = descriptors()
         told = most = 0
         for _ in range(20):
-            links = [socket.socket(socket.AF_UNIX) for _ in range(MOST_SILENT + 10)]
+            links = [socket.socket(socket.AF_UNIX) for _ in range(server.MOST_SILENT + 10)]
             for link in links:
                 link.setblocking(False)
                 await join_queue(link, served.path)
             await asyncio.sleep(0.01)
-            assert len(served.server._clients) <= MOST_CLIENTS
-            assert len(served.server._silent) <= MOST_SILENT
+            assert len(served.server._clients) <= server.MOST_CLIENTS
+            assert len(served.server._silent) <= server.MOST_SILENT
             # Some are on their way out, and a session has its files.
             most = max(most, descriptors() - len(links))
             for link in links:
@@ -216,10 +215,10 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
                     told += b"too many clients" in link.recv(1000)
                 link.close()
         assert told > 0
-        assert most <= before + MOST_SILENT + MOST_CLIENTS
+        assert most <= before + server.MOST_SILENT + server.MOST_CLIENTS
         assert (await operator.ask({"command": "status"}))["state"] == "running"
         assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
-        await served.until(State.READY)
+        await served.until("ready")
         assert served.operated.service.controller is not None
 
     served.run(scenario)
@@ -238,7 +237,7 @@ def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
         assert (refused["ok"], refused["crowded"]) == (False, True)
         told = await (await served.connect()).ask({"command": "stop", "id": 7})
         assert (told["stopping"], told["id"]) == (True, 7)
-        await served.until(State.READY)
+        await served.until("ready")
 
     served.run(scenario)
 
@@ -250,7 +249,7 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
     def introduced(link):
         silent = introduce(link)
         if crowd:
-            silent.peer = Peer(silent.peer.number, 1, silent.peer.uid)
+            silent.peer = replace(silent.peer, pid=1)
         return silent
 
     introduce = served.server._introduced
@@ -261,12 +260,12 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
         await slow.send(b'{"command":')
         while not served.server._silent:
             await asyncio.sleep(0.001)
-        for _ in range(3 * MOST_SILENT):
+        for _ in range(3 * server.MOST_SILENT):
             crowd.append(socket.socket(socket.AF_UNIX))
             crowd[-1].setblocking(False)
             await join_queue(crowd[-1], served.path)
         await asyncio.sleep(0.05)
-        assert len(served.server._silent) == MOST_SILENT
+        assert len(served.server._silent) == server.MOST_SILENT
         assert b"too many clients" in crowd[0].recv(1000)
         assert (await slow.ask(b'"status"}\n'))["state"] == "ready"
         for link in crowd:
@@ -277,9 +276,9 @@ def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
 
 def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
     async def scenario(served):
-        watchers = [await served.connect() for _ in range(MOST_CLIENTS)]
+        watchers = [await served.connect() for _ in range(server.MOST_CLIENTS)]
         replies = [await watcher.ask({"command": "watch"}) for watcher in watchers]
-        assert sum(reply["ok"] for reply in replies) == MOST_WATCHERS
+        assert sum(reply["ok"] for reply in replies) == server.MOST_WATCHERS
         assert (await (await served.connect()).ask({"command": "status"}))["ok"]
 
     served.run(scenario)
@@ -319,16 +318,16 @@ def mode(path):
 def test_the_socket_is_the_user_s_own(runtime_folder):
     path = socket_path("my rig/2")
     assert path.parent == runtime_folder / "rigd"
-    listener = bind(path, None)
+    listener = address.bind(path, None)
     assert mode(path) == 0o600
     assert mode(path.parent) == 0o700
     assert not answers(path)  # not before it listens
     listener.listen(5)
     assert answers(path)
     with pytest.raises(AddressError, match="Another daemon"):
-        bind(path, None)
+        address.bind(path, None)
     listener.close()
-    with bind(path, None):  # what a dead daemon left
+    with address.bind(path, None):  # what a dead daemon left
         assert not answers(path)
 
 
@@ -337,36 +336,39 @@ def test_a_group_may_use_it_if_asked_for(runtime_folder):
     common = runtime_folder / "common"
     path = socket_path("sim", common)
     with pytest.raises(AddressError, match=f"install -d -o .* -g {group} .*{common}"):
-        bind(path, group)
+        address.bind(path, group)
     assert not common.exists()  # it is the administrator's to make
     common.mkdir(mode=0o700)
     with pytest.raises(AddressError, match=f"closed to the group {group}"):
-        bind(path, group)
+        address.bind(path, group)
     common.chmod(0o710)
     common.chmod(0o2770)
     with pytest.raises(AddressError, match=f"{common} is writable by its group"):
-        bind(path, group)
+        address.bind(path, group)
     common.chmod(0o710)
-    with bind(path, group):
+    with address.bind(path, group):
         assert mode(path) == 0o660
         assert path.stat().st_gid == os.getgid()
     with pytest.raises(UnknownGroupError, match="no such group"):
-        bind(path, "nobody-has-this-group")
+        address.bind(path, "nobody-has-this-group")
 
 
 def test_a_folder_that_there_cannot_be_is_refused_with_the_remedy(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
-        bind(tmp_path / "file" / "sim.daemon", None)
+        address.bind(tmp_path / "file" / "sim.daemon", None)
     with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
-        bind(tmp_path / ("x" * 120) / "sim.daemon", None)
+        address.bind(tmp_path / ("x" * 120) / "sim.daemon", None)
 
 
 def test_daemons_are_found(runtime_folder, monkeypatch):
     monkeypatch.setattr(address, "COMMON", runtime_folder / "common")
     with pytest.raises(AddressError, match="rigd serve"):
         find(None)
-    with bind(socket_path("one"), None) as one, bind(socket_path("two"), None) as two:
+    with (
+        address.bind(socket_path("one"), None) as one,
+        address.bind(socket_path("two"), None) as two,
+    ):
         one.listen(5)
         assert find(None) == socket_path("one")  # the other one is dead
         two.listen(5)
@@ -386,7 +388,7 @@ def test_daemons_are_found(runtime_folder, monkeypatch):
 
 
 def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
-    monkeypatch.setattr(_signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
+    monkeypatch.setattr(signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
         telling = asyncio.create_task(served.operated.service.tell_signals())

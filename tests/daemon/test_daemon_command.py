@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.daemon._address import socket_path
-from rigd.daemon._client import STOP_SIGNAL
-from rigd.runtime import answers
+from rigd.daemon.address import socket_path
+from rigd.runtime import STOP_SIGNAL
+from rigd.runtime.addresses import answers
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

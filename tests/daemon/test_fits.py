@@ -5,26 +5,11 @@ from pathlib import Path
 
 import pytest
 from online_fits import online_fit
+from operated_daemons import parse_request
 
-from rigd.daemon._protocol import parse_request
 from rigd.daemon._series import SeriesTeller, ServedSeries
-from rigd.daemon._states import fit_document
-from rigd.engine import Event, Phase
-from rigd.runner import SessionProgress, SessionResult
-
-
-def test_what_clients_are_told_of_a_fit_is_bounded():
-    fit = online_fit()
-    told = fit_document(fit)
-    assert told["modes"] == fit["modes"]
-    assert told["search"] == fit["search"]
-    assert not told.keys() & {"plant", "covariance", "noise"}
-    huge = fit | {
-        "modes": 100 * fit["modes"], "findings": 100 * ["x" * 10_000],
-        "search": fit["search"] | {"pieces": 100 * [{"name": "x" * 100}], "reason": "x" * 10_000},
-    }  # fmt: skip
-    assert len(json.dumps(fit_document(huge))) < 24_000
-    assert fit_document({}) == {}
+from rigd.engine.shared_state import Event, Phase
+from rigd.runner.session import SessionProgress, SessionResult
 
 
 @pytest.fixture
@@ -45,6 +30,27 @@ def result(**members):
     return SessionResult(**told | members)
 
 
+def shown(told, fit):
+    """What clients are told of a fit, as it stands in the status."""
+    series, teller, _ = told
+    teller.update(SessionProgress(Phase.RUNNING, 9, 0, 0, (fit,)), [])
+    return series.as_document()["fit"]
+
+
+def test_what_clients_are_told_of_a_fit_is_bounded(told):
+    fit = online_fit()
+    document = shown(told, fit)
+    assert document["modes"] == fit["modes"]
+    assert document["search"] == fit["search"]
+    assert not document.keys() & {"plant", "covariance", "noise"}
+    huge = fit | {
+        "modes": 100 * fit["modes"], "findings": 100 * ["x" * 10_000],
+        "search": fit["search"] | {"pieces": 100 * [{"name": "x" * 100}], "reason": "x" * 10_000},
+    }  # fmt: skip
+    assert len(json.dumps(shown(told, huge))) < 24_000
+    assert shown(told, {}) == {}
+
+
 def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     series, teller, events = told
     assert series.as_document()["fit"] is None
@@ -55,7 +61,9 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     assert events[0]["notable"]
     assert [event["duration_s"] for event in events[1:]] == [6.0, 8.0]
     assert events[1]["session"] == 1
-    assert series.as_document()["fit"] == fit_document(fits[-1])
+    shown = series.as_document()["fit"]
+    assert {"event": "fit", "session": 1, **shown} == events[-1]
+    assert (shown["modes"], shown["text"]) == (fits[-1]["modes"], fits[-1]["text"])
     # The result has nothing that was for the moment only, and says how a search ended.
     final = online_fit(9.0, search=False) | {"search": {"reason": "Reached.", "pieces": []}}
     del final["text"]

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.daemon._address import socket_path
-from rigd.runtime import answers
+from rigd.daemon.address import socket_path
+from rigd.runtime.addresses import answers
 
 MOST_GROWTH_MB = 15
 LONGEST = 65_536

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from rigd.daemon._address import socket_path
+from rigd.daemon.address import socket_path
 from rigd.profile import load_profile
 
 PLAN = {

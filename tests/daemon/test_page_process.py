@@ -11,16 +11,15 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from operated_daemons import shown_status
 from processes import eventually
 
-from rigd.cli.status_view import _rows
 from rigd.daemon import _page, page_address
-from rigd.daemon._page import PageProcess
 from rigd.profile import load_profile
 
 STATUS = {
     "state": "ready", "doing": "", "since_utc_ns": 0, "reason": "", "zero_lost": False,
-    "controller": None, "series": None, "progress": None, "rig": None,
+    "controller": None, "series": None, "progress": None, "rig": None, "history": [],
 }  # fmt: skip
 
 
@@ -32,7 +31,7 @@ def serve(runtime_folder, tmp_path, monkeypatch):
     def serve(port=None):
         told = []
         socket = runtime_folder / "no.daemon"
-        started.append(PageProcess(load_profile("sim"), tmp_path, socket, port, told.append))
+        started.append(_page.PageProcess(load_profile("sim"), tmp_path, socket, port, told.append))
         started[-1].told = told
         return started[-1]
 
@@ -63,7 +62,7 @@ def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_f
     told = STATUS | {
         "daemon": {"profile": "sim", "moving": "m", "pid": 1, "output": "o", "web": url}
     }
-    assert dict(_rows(told))["page"].plain == address
+    assert shown_status(told)["page"].strip() == address
     pid = page._process.pid
     command = Path(f"/proc/{pid}/cmdline").read_bytes() + Path(f"/proc/{pid}/environ").read_bytes()
     assert token.encode() not in command
@@ -104,7 +103,7 @@ def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
     lasted_s = iter([1.0, 1.0, 1.0, 1.0, 60.0, 1.0, 3600.0])
     monkeypatch.setattr(_page, "time", clock)
     monkeypatch.setattr(_page, "_PAUSE_S", 0.0)
-    monkeypatch.setattr(PageProcess, "_run", run)
+    monkeypatch.setattr(_page.PageProcess, "_run", run)
     page = serve()
     page._thread.join(30.0)
     assert not page._thread.is_alive()

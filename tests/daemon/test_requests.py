@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from operated_daemons import RequestError, Start, parse_request
 
-from rigd.daemon._protocol import RequestError, Start, parse_request
-from rigd.excitation import ExcitationError
-from rigd.excitation._named import KINDS, make_excitation
+from rigd.excitation import KINDS, ExcitationError, make_excitation
 
 START = {"command": "start", "excitation": "chirp"}
 

@@ -14,11 +14,13 @@ import pytest
 from processes import eventually
 from stop_scenarios import SITUATIONS, can_isolate, isolated
 
-from rigd.daemon import Client
-from rigd.daemon import _stop as stop_module
-from rigd.daemon._address import socket_path
-from rigd.engine import CONTROL, IDLE_NAME, SESSION_NAME, supervisor_of_control
-from rigd.runtime import STOP_SIGNAL, answers, read_process, read_processes
+from rigd.daemon.address import socket_path
+from rigd.daemon.client import Client
+from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
+from rigd.engine.processes import CONTROL
+from rigd.runtime import STOP_SIGNAL
+from rigd.runtime.addresses import answers
+from rigd.runtime.processes import read_process, read_processes
 
 
 def control_of(pid):
@@ -124,12 +126,11 @@ def test_a_folder_that_others_can_write_to_is_no_proof(stop_here, runtime_folder
     assert "Whether another session runs is not known" in err
 
 
-def test_without_a_process_table_it_is_not_sure(stop_here, monkeypatch):
+def test_without_a_process_table_it_is_not_sure(stop_here):
     def no_table():
         raise FileNotFoundError(2, "no such table")
 
-    monkeypatch.setattr(stop_module, "read_processes", no_table)
-    code, out, err = stop_here()
+    code, out, err = stop_here(table=no_table)
     assert (code, out) == (1, "")
     assert "The process table cannot be read (no such table)" in err
 
@@ -177,14 +178,9 @@ OTHER = os.getuid() + 1
         ),
     ],
 )
-def test_only_what_runs_sessions_gets_a_signal(
-    stop_here, bystander, monkeypatch, command, changes, expected
-):
+def test_only_what_runs_sessions_gets_a_signal(stop_here, bystander, command, changes, expected):
     process, row = bystander
-    monkeypatch.setattr(
-        stop_module, "read_processes", lambda: [replace(row, command=command, **changes)]
-    )
-    stop_here("--no-wait")
+    stop_here("--no-wait", table=lambda: [replace(row, command=command, **changes)])
     if expected is None:
         process.send_signal(signal.SIGTERM)
         assert process.stdout.readline() == f"{int(signal.SIGTERM)}\n"
@@ -192,17 +188,14 @@ def test_only_what_runs_sessions_gets_a_signal(
         assert process.stdout.readline() == f"{int(expected)}\n"
 
 
-def test_a_process_that_a_forged_command_line_names_gets_no_signal(
-    stop_here, bystander, monkeypatch
-):
+def test_a_process_that_a_forged_command_line_names_gets_no_signal(stop_here, bystander):
     process, row = bystander
     forged = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
     try:
         assert forged.stdout.readline() == "listens\n"
         command = (*FORGED, str(process.pid))
         other = replace(read_process(forged.pid), command=command, name=IDLE_NAME)
-        monkeypatch.setattr(stop_module, "read_processes", lambda: [row, other])
-        stop_here("--no-wait")
+        stop_here("--no-wait", table=lambda: [row, other])
         process.send_signal(signal.SIGTERM)
         assert process.stdout.readline() == f"{int(signal.SIGTERM)}\n"
     finally:

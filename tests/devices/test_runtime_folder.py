@@ -6,7 +6,8 @@ import tempfile
 
 import pytest
 
-from rigd.runtime import HeldFile, UnsafeFolderError, folder_fault, known_folders, runtime_folder
+from rigd.runtime import HeldFile
+from rigd.runtime.addresses import UnsafeFolderError, folder_fault, known_folders, runtime_folder
 
 
 @pytest.fixture

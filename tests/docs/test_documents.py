@@ -13,7 +13,7 @@ from analysis.cli.app import app as analyze_app
 from rigd.cli import run
 from rigd.cli.app import app as rigd_app
 from rigd.profile import load_profile
-from rigd.runner import excitation_for, predict_session
+from rigd.runner.planning import excitation_for, predict_session
 
 PROJECT = Path(__file__).parents[2]
 DOCUMENTS = sorted(

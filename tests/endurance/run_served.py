@@ -26,7 +26,7 @@ from run_campaign import Look, growth_table
 from run_starved import judge
 from run_viewers import Reading, children
 
-from rigd.live._address import find
+from rigd.live import running
 
 RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"
@@ -132,8 +132,8 @@ def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
         client = subprocess.Popen([RIGD, "start", *chirps], stdout=stdout, stderr=stderr)
         while client.poll() is None:
             time.sleep(_LOOK_S)
-            if (address := find(RIG)) is not None:
-                reading.look(address, time.monotonic())
+            if views := [each for each in running() if each.rig == RIG]:
+                reading.look(views[0], time.monotonic())
                 if page is None:
                     named = subprocess.run(
                         [RIGD, "live", "--web"], capture_output=True, text=True, check=True

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from run_viewers import Reading
 
-from rigd.live._address import find
+from rigd.live import running
 from rigd.safety.limits import OVERLOADED
 from rigd.session import read_session
 
@@ -136,8 +136,9 @@ def run(seconds: float, folder: Path, *, live: bool) -> Outcome:
         try:
             while process.poll() is None and time.monotonic() < deadline:
                 time.sleep(_LOOK_S)
-                if live and (address := find(RIG)) is not None:
-                    viewer.look(address, time.monotonic())
+                views = [each for each in running() if each.rig == RIG] if live else []
+                if views:
+                    viewer.look(views[0], time.monotonic())
         finally:
             viewer.close()
             if process.poll() is None:

@@ -19,10 +19,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench._measure import measurement
-from rigd.live._address import LiveAddress, find
+from rigd.bench.measure import measurement
+from rigd.live import LiveAddress, Viewer, running
 from rigd.live._program import RerunProgram
-from rigd.live._viewer import Viewer
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -156,7 +155,7 @@ def run(name: str, seconds: float) -> Outcome:
         try:
             while process.poll() is None:
                 time.sleep(_LOOK_S)
-                if (address := find(RIG)) is not None:
+                for address in [each for each in running() if each.rig == RIG]:
                     viewer.look(address, time.monotonic())
                     publisher_mb = max(publisher_mb, resident_mb(address.pid))
                     server_mb = max(server_mb, *map(resident_mb, children(address.pid)), 0.0)

@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine._ipc import CONTROL
+from rigd.engine.processes import CONTROL
 from rigd.excitation import hold
-from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import ProcessGroup, Rig
+from rigd.runner.request import Order
+from rigd.runtime import StopRequest
 
 COARSE_KB = 4096
 

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.devices._registry import open_devices
+from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine._messages import Finished, SessionJob
-from rigd.engine._reference import put_reference
-from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import Phase, Word, read_events
-from rigd.engine._timing import VirtualClock
-from rigd.engine._topics import DESCRIPTORS, create_channels
+from rigd.engine import shared_memory_fd
+from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.control_process import attend
+from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.reference import put_reference
+from rigd.engine.shared_state import Phase, Word, read_events
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
-from rigd.runtime._stop_signals import StopRequest
-from rigd.session.layout import decode_controls, decode_samples
+from rigd.runtime import StopRequest
+from rigd.session.layout import decode_samples
 
 
 @dataclass
@@ -186,10 +186,6 @@ class Session:
         while block := self.channels.samples.take(1000):
             blocks.append(decode_samples(block))
         return np.concatenate(blocks) if blocks else None
-
-    @property
-    def controls(self):
-        return decode_controls(self.channels.controls.take(100_000))
 
     @property
     def events(self):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.control.damper import DamperSettings
-from rigd.engine._messages import Ending, Finished, Ready
+from rigd.engine.messages import Ending, Finished, Ready
 from rigd.excitation import chirp, step
-from rigd.runner import plan_session
+from rigd.runner.planning import plan_session
 
 RATE_HZ = 1000.0
 

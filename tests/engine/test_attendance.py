@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine._messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
-from rigd.engine._shared_state import Phase, Word
-from rigd.engine._timing import SuspendWatch, VirtualClock
+from rigd.engine.messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
+from rigd.engine.shared_state import Phase, Word
+from rigd.engine.timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session.layout import Status
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from rigd.devices.contracts import LineHealth
+from rigd.engine import shared_memory_fd
 from rigd.engine._publish import Display
-from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import SharedState, Word
+from rigd.engine.shared_state import SharedState, Word
 
 CYCLE = SimpleNamespace(angle_rad=0.1, coupling_torque_nm=float("nan"), torque_command_nm=-0.2)
 

@@ -9,10 +9,10 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine._cycle import make_watch
-from rigd.engine._messages import Finished, Tare
-from rigd.engine._shared_state import Word
-from rigd.engine._timing import VirtualClock
+from rigd.engine.cycle import make_watch
+from rigd.engine.messages import Finished, Tare
+from rigd.engine.shared_state import Word
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety.limits import INTERLOCKS, Action

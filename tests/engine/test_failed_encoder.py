@@ -13,9 +13,8 @@ from rigd.control import close_loop
 from rigd.control.damper import design_damper
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine._messages import Ending
-from rigd.excitation import chirp, hold, multisine, step
-from rigd.excitation._signals import Excitation
+from rigd.engine.messages import Ending
+from rigd.excitation import Excitation, chirp, hold, multisine, step
 from rigd.excitation.moves import quintic
 from rigd.profile import load_profile
 from rigd.sim import Stuck

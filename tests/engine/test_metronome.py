@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine._timing import SUSPENDED_S, RealClock, SuspendWatch, TickScheduler, VirtualClock
+from rigd.engine.timing import SUSPENDED_S, RealClock, SuspendWatch, TickScheduler, VirtualClock
 
 
 class LateClock:

@@ -6,9 +6,9 @@ from math import exp
 
 import pytest
 
-from rigd.engine import _cycle as watch
-from rigd.engine._cycle import make_watch, recalled_heat_nm2, remember_heat
-from rigd.engine._messages import Finished
+from rigd.engine import cycle
+from rigd.engine.cycle import make_watch, recalled_heat_nm2, remember_heat
+from rigd.engine.messages import Finished
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 
@@ -19,11 +19,17 @@ def profile(runtime_folder):
 
 
 @pytest.fixture
+def heat_file(runtime_folder):
+    """The file of the motor's heat, or None where there is none."""
+    return lambda: next(runtime_folder.rglob("heat-*.json"), None)
+
+
+@pytest.fixture
 def at(monkeypatch):
     """Set the time since the computer was started, s."""
 
     def move(now_s):
-        monkeypatch.setattr(watch.time, "clock_gettime", lambda _: now_s)
+        monkeypatch.setattr(cycle.time, "clock_gettime", lambda _: now_s)
 
     move(1000.0)
     yield move
@@ -51,9 +57,9 @@ def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile,
     "text", ["", "{", "[]", "null", '{"heat_nm2": "x", "boot_s": 1}', '{"heat_nm2": 1}',
              '{"heat_nm2": NaN, "boot_s": 1}', '{"heat_nm2": 1, "boot_s": NaN}'],
 )  # fmt: skip
-def test_a_file_that_says_nothing_is_a_cold_motor(profile, text):
+def test_a_file_that_says_nothing_is_a_cold_motor(profile, heat_file, text):
     remember_heat(profile, 1.0)
-    watch._heat_file(profile).write_text(text)
+    heat_file().write_text(text)
     assert recalled_heat_nm2(profile) == 0.0
 
 
@@ -65,7 +71,7 @@ def test_without_a_folder_a_motor_is_cold(profile, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("simulated", [False, True])
-def test_connections_in_a_row_add_up_on_hardware_alone(make_session, runtime_folder, simulated):
+def test_connections_in_a_row_add_up_on_hardware_alone(make_session, heat_file, simulated):
     """Sessions of torque, each on a connection of its own: as with `rigd run` again and again."""
     heat = []
     for _ in range(2):
@@ -83,8 +89,8 @@ def test_connections_in_a_row_add_up_on_hardware_alone(make_session, runtime_fol
         session.obey(session.order(sweep))
         assert session.parent.said(Finished)[0].outcome == "complete"
         if not simulated:
-            heat.append(json.loads(watch._heat_file(session.profile).read_text())["heat_nm2"])
+            heat.append(json.loads(heat_file().read_text())["heat_nm2"])
     if simulated:
-        assert not watch._heat_file(session.profile).exists()
+        assert heat_file() is None
     else:
         assert heat[1] > 1.2 * heat[0] > 0.0

@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from rigd.engine._ipc import Child, ChildError
-from rigd.engine._messages import Ended, MessageReader, Ready, SessionJob, encode
-from rigd.engine._reference import map_reference, put_reference
-from rigd.engine._ring import shared_memory_fd
+from rigd.engine import shared_memory_fd
+from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
+from rigd.engine.processes import Child, ChildError
+from rigd.engine.reference import map_reference, put_reference
 from rigd.profile import load_profile
 from rigd.session.limits import MAX_SAMPLES
 
@@ -81,7 +81,9 @@ def test_what_is_no_message_is_told_with_the_name_of_the_process():
 
 
 def test_what_a_library_prints_does_not_stand_among_the_messages():
-    says = "from rigd.engine import Ended, Parent; import os; parent = Parent(); " + (
+    says = (
+        "import os; from rigd.engine.messages import Ended; "
+        "from rigd.engine.processes import Parent; parent = Parent(); "
         "print('of a library', flush=True); os.write(1, b'and so on'); parent.send(Ended(''))"
     )
     child = subprocess.Popen(

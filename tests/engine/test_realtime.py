@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.engine._realtime import (
+from rigd.engine.realtime import (
     NICE,
     WAKE_UP_US,
-    _lock_memory,
     cores_of,
     isolated_cores,
+    lock_memory,
     page_faults,
 )
 from rigd.profile import load_profile
@@ -23,7 +23,7 @@ from rigd.profile import load_profile
 CODE = """
 import json, os, resource, sys
 from pathlib import Path
-from rigd.engine._realtime import obtain
+from rigd.engine.realtime import obtain
 {before}
 obtained = obtain(priority={priority}, cpu={cpu}, root=Path({root!r}))
 print(json.dumps([obtained, sorted(os.sched_getaffinity(0)), os.sched_getscheduler(0)]))
@@ -100,10 +100,10 @@ class Libc:
 )
 def test_memory_under_a_limit_is_not_locked_for_the_future(monkeypatch, limit, flags, report):
     # Otherwise an allocation beyond the limit would fail in mid-session.
-    monkeypatch.setattr("rigd.engine._realtime.resource.getrlimit", lambda _: (limit, limit))
-    monkeypatch.setattr("rigd.engine._realtime.os.geteuid", lambda: 1000)
+    monkeypatch.setattr("rigd.engine.realtime.resource.getrlimit", lambda _: (limit, limit))
+    monkeypatch.setattr("rigd.engine.realtime.os.geteuid", lambda: 1000)
     libc = Libc()
-    assert report in _lock_memory(libc)
+    assert report in lock_memory(libc)
     assert libc.flags == flags
 
 
@@ -159,8 +159,8 @@ def test_touching_new_memory_is_counted():
 PRECEDENCE = """
 import json, os, resource, sys, threading
 from pathlib import Path
-from rigd.engine._ipc import Child
-from rigd.engine._realtime import Precedence
+from rigd.engine.processes import Child
+from rigd.engine.realtime import Precedence
 {before}
 
 def state(thread=0):

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.devices.contracts import LineHealth
-from rigd.engine._messages import SessionJob
-from rigd.engine._reference import (
+from rigd.engine import shared_memory_fd
+from rigd.engine.messages import SessionJob
+from rigd.engine.reference import (
     PieceReader,
     PieceWriter,
     ReferenceSpec,
@@ -19,8 +20,7 @@ from rigd.engine._reference import (
     map_reference,
     put_reference,
 )
-from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import SharedState, Stop, Word
+from rigd.engine.shared_state import SharedState, Stop, Word
 
 UNIT_RAD = 1e-7
 """Unit of the angles here: pieces begin and end at rest."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine._ring import Observer, Ring, shared_memory_fd
+from rigd.engine import Observer, Ring, shared_memory_fd
 
 RECORD = struct.Struct("<Q")
 

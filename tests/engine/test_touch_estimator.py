@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rigd.engine._messages import TouchJob
+from rigd.engine.messages import TouchJob
 from rigd.engine.touch_estimator import TouchFollower
 from rigd.session.layout import SAMPLE_DTYPE, Status
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine._messages import TouchOrder
 from rigd.engine._touch_watch import TouchWatch
+from rigd.engine.messages import TouchOrder
 from rigd.excitation import Approach, Pass, after_touch
 from rigd.excitation.moves import braking_path, quintic
 from rigd.session.layout import Status

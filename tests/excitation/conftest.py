@@ -3,7 +3,7 @@ import json
 import pytest
 
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
+from rigd.runner.planning import LoopPreview
 
 MODES = [
     {"frequency_hz": 2.57, "damping_ratio": 0.0091},

@@ -11,7 +11,8 @@ from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
-from rigd.runner import LoopPreview, excitation_for, plan_session, with_tip_slope
+from rigd.runner import with_tip_slope
+from rigd.runner.planning import LoopPreview, excitation_for, plan_session
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from operated_daemons import RequestError, parse_request
 
-from rigd.daemon._protocol import RequestError, parse_request
 from rigd.excitation import ExcitationError
 from rigd.excitation._narrow_sweeps import FoundMode, read_modes
 from rigd.session import read_session

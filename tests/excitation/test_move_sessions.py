@@ -11,10 +11,10 @@ from rigd.excitation import KINDS, ExcitationError, move
 from rigd.excitation.moves import modal_state
 from rigd.identified_beam import MOVE, IdentifiedBeamError
 from rigd.profile import load_profile
-from rigd.runner import (
+from rigd.runner import Series
+from rigd.runner.planning import (
     LoopPreview,
     RefusedError,
-    Series,
     excitation_for,
     plan_document,
     plan_session,

@@ -18,7 +18,7 @@ from rigd.identification.experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.runner import plan_session
+from rigd.runner.planning import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 

@@ -12,7 +12,7 @@ from cases import further
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine import Cycle, make_observers, make_watch
+from rigd.engine.cycle import Cycle, make_observers, make_watch
 from rigd.identification import cautious, tuned
 from rigd.identification.estimate import Timing, Window, estimate_motor
 from rigd.identification.experiments import (

@@ -14,10 +14,10 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine._messages import Failed, MessageReader, encode
-from rigd.engine._ring import Ring, shared_memory_fd
-from rigd.engine._shared_state import Event, SharedState, Word, write_event
-from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
+from rigd.engine import Ring, shared_memory_fd
+from rigd.engine.channels import DESCRIPTORS, TOPICS, Channels
+from rigd.engine.messages import Failed, MessageReader, encode
+from rigd.engine.shared_state import Event, SharedState, Word, write_event
 from rigd.live._address import LiveAddress
 from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
 from rigd.session.layout import pack_sample_into, pack_timing_into

@@ -14,7 +14,7 @@ from processes import eventually
 
 from rigd.live._address import LiveAddress, announce, find, running, withdraw
 from rigd.live._server import free_port
-from rigd.runtime._addresses import runtime_folder
+from rigd.runtime.addresses import runtime_folder
 
 
 @pytest.fixture

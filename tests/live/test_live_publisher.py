@@ -15,8 +15,8 @@ import pytest
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
-from rigd.engine._messages import Failed, MessageReader
-from rigd.engine._shared_state import Word
+from rigd.engine.messages import Failed, MessageReader
+from rigd.engine.shared_state import Word
 from rigd.live._address import LiveAddress, find
 from rigd.live._ring_reader import LiveFit, LiveJob
 

@@ -10,8 +10,9 @@ from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
-from rigd.engine import Phase, Stop, Word, create_channels, shared_memory_fd
-from rigd.engine._topics import DESCRIPTORS
+from rigd.engine import shared_memory_fd
+from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.shared_state import Phase, Stop, Word
 from rigd.live._ring_reader import LiveSession
 from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
 from rigd.view import (

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine import Connected
+from rigd.engine.messages import Connected
 from rigd.profile import load_profile
-from rigd.runner import Order
-from rigd.runner._request import file_header
+from rigd.runner.request import Order, file_header
 
 SHIPPED = ("sim", "antenna_can", "antenna_serial")
 

@@ -8,7 +8,7 @@ import pytest
 from rigd.control import check_stability, close_loop
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runner import plan_session
+from rigd.runner.planning import plan_session
 
 HW_PROFILES = Path(__file__).parents[2] / "hw_profiles"
 

@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from rigd.cli.app import app
-from rigd.runner import what_is_kept
+from rigd.runner.request import what_is_kept
 from rigd.session import (
     SessionError,
     SessionWriter,

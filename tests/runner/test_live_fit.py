@@ -7,7 +7,7 @@ from shipped_profile import load_shipped
 
 from rigd.excitation import make_excitation
 from rigd.runner._live_view import subject_of
-from rigd.runner._request import Order
+from rigd.runner.request import Order
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from rigd.engine import ChildError, FitTold, SearchEnded, Stop, Word
+from rigd.engine.messages import FitTold, SearchEnded
+from rigd.engine.processes import ChildError
+from rigd.engine.shared_state import Stop, Word
 from rigd.excitation.targets import parse_target
 from rigd.runner._online_fit import OnlineFit
 

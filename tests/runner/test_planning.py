@@ -8,9 +8,8 @@ from cases import further
 
 from rigd.control import ControlDesignError, PidController, close_loop, design_pid
 from rigd.excitation import chirp, from_csv, hold, multisine, step
-from rigd.runner import with_tip_slope
-from rigd.runner._console import plan_lines
-from rigd.runner._planning import (
+from rigd.runner import plan_lines, planning, with_tip_slope
+from rigd.runner.planning import (
     RefusedError,
     excitation_for,
     largest_amplitude,
@@ -170,13 +169,11 @@ def test_the_sensor_s_range_bounds_the_coupling_torque(profile, projection):
 
 
 def test_a_prediction_that_is_no_number_is_refused(profile, monkeypatch):
-    import rigd.runner._planning
-
     broken = replace(
         predict(close_loop(profile.loop_model()), chirp(rate_hz=1000.0, duration_s=1.0)),
         peak_angle_rad=float("nan"),
     )
-    monkeypatch.setattr(rigd.runner._planning, "predict", lambda loop, excitation: broken)
+    monkeypatch.setattr(planning, "predict", lambda loop, excitation: broken)
     with pytest.raises(RefusedError, match="nan rad"):
         plan_session(profile, chirp(rate_hz=1000.0, duration_s=1.0), force=True)
 

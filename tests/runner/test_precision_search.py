@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 
 from rigd.beam import modes
-from rigd.engine import (
-    FitTold,
-    PieceTold,
-    PieceWriter,
-    SearchEnded,
-    SharedState,
-    Word,
-    put_reference,
-    shared_memory_fd,
-)
+from rigd.engine import shared_memory_fd
+from rigd.engine.messages import FitTold, PieceTold, SearchEnded
+from rigd.engine.reference import PieceWriter, put_reference
+from rigd.engine.shared_state import SharedState, Word
 from rigd.excitation import ExcitationError, Forecast, Piece, until
 from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
-from rigd.runner import LoopPreview
 from rigd.runner._precision_search import Search, in_words, stated, targets_json
+from rigd.runner.planning import LoopPreview
 
 NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
 RATE_HZ = 1000

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from processes import children, eventually, state_of
 
-from rigd.runner import _quick_looks as quick_looks
-from rigd.runner._quick_looks import QuickLook, QuickLooks
-from rigd.runner._session import SessionResult
+from rigd.runner import quick_looks
+from rigd.runner.quick_looks import QuickLook, QuickLooks
+from rigd.runner.session import SessionResult
 from rigd.runtime import processor_use
 from rigd.session.quick_look import look_path
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine import Connected
+from rigd.engine.messages import Connected
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._request import Order, file_header, software_commit
+from rigd.runner.request import Order, file_header, software_commit
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import pytest
 from processes import children
 from shipped_profile import load_shipped
 
-from rigd.engine._shared_state import Phase
+from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig, RigError
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runner import Rig, RigError
+from rigd.runner.request import Order
+from rigd.runtime import StopRequest
 from rigd.session import read_session
 
 
@@ -143,7 +143,7 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
             if recorder.state != "ended":
                 os.kill(recorder.pid, signal.SIGKILL)
 
-    from rigd.runner._session import SessionFailedError
+    from rigd.runner.session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, watcher=watcher, duration_s=100.0)

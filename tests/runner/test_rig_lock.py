@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from rigd.runtime._locks import RigBusyError, RigLock
+from rigd.runtime import RigBusyError, RigLock
 
 
 def test_whoever_comes_second_is_told_who_is_there(runtime_folder):

@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._console import ProgressLine, plan_lines, result_line
-from rigd.runner._planning import RefusedError
-from rigd.runner._request import NoRoomError
-from rigd.runner._series import Series, _await_look
-from rigd.runner._session import SessionResult
+from rigd.runner import ProgressLine, Series, plan_lines, result_line
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import NoRoomError
+from rigd.runner.session import SessionResult
 from rigd.runtime import StopRequest
 from rigd.testing import write_profile
 
@@ -170,11 +169,20 @@ def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_serie
     ends = [each[-1] for each in watcher.told if each[0] == "ended"]
     assert ends == [("look_follows", True), ("look_follows", True), UNSEEN]
 
-    stop = StopRequest()
-    stop.request()
-    watcher.told.clear()
-    _await_look(looks, Watched(), stop)
-    assert watcher.told == []
+
+def test_a_stop_ends_the_wait_for_a_quick_look(make_series):
+    watcher, stop = Watcher(), StopRequest()
+
+    class Stopped(Rig):
+        def watch(self):
+            watcher.told.append("watch")
+            stop.request()
+
+    looks = Looks(watcher.told)
+    result = replace(WELL, path=Path("a-01.mcap"))
+    make_series(repeat=3).run(Stopped(result), stop, watcher, live=False, looks=looks)
+    told = [each if isinstance(each, str) else each[0] for each in watcher.told]
+    assert told == ["begins", "held", "let go", "ended", "look", "watch"]
 
 
 def test_no_quick_look_at_a_move_is_begun_and_none_announced(tmp_path):

@@ -7,10 +7,10 @@ from unittest.mock import MagicMock
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Closed, Connected, Finished
+from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
-from rigd.runner._request import Order
-from rigd.runner._session import Session, SessionFailedError, always
+from rigd.runner.request import Order
+from rigd.runner.session import Session, SessionFailedError, always
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -79,7 +79,7 @@ def test_the_disk_may_stall_at_the_end_as_long_as_in_the_record(close, monkeypat
 
         return polled
 
-    monkeypatch.setattr("rigd.runner._session.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("rigd.runner.session.time.monotonic", lambda: now_s)
     complete = Finished("complete", "", fault=False, counts=COUNTS)
     if whole:
         assert close(complete, "", slow=poll).outcome == "complete"

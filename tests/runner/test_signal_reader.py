@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine import Phase, Word, shared_memory_fd
-from rigd.engine._ring import Ring
-from rigd.runner import _signal_blocks
-from rigd.runner._signal_blocks import SignalReader
+from rigd.engine import Ring, shared_memory_fd
+from rigd.engine.shared_state import Phase, Word
+from rigd.runner import signal_blocks
+from rigd.runner.signal_blocks import SignalReader
 from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 1000.0
@@ -26,7 +26,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    monkeypatch.setattr(_signal_blocks, "time", clock := Clock())
+    monkeypatch.setattr(signal_blocks, "time", clock := Clock())
     return clock
 
 

@@ -5,8 +5,8 @@ import os
 import numpy as np
 import pytest
 
-from rigd.engine._ring import Ring, shared_memory_fd
-from rigd.runner._status import SignalWatch
+from rigd.engine import Ring, shared_memory_fd
+from rigd.runner.status import SignalWatch
 from rigd.session.layout import SAMPLE_SIZE, pack_sample_into
 
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
+from rigd.errors import UserError
 from rigd.excitation import chirp, from_csv, multisine, step
 from rigd.identification.experiments import speeds_session
-from rigd.runner import (
+from rigd.runner import with_tip_slope
+from rigd.runner.planning import (
     excitation_for,
     largest_amplitude,
     plan_document,
     predict_session,
-    with_tip_slope,
+    predicted_metadata,
 )
-from rigd.runner._planning import predicted_metadata
-from rigd.runner._tip_slope import TipSlopeError
 
 MAKE = {
     "chirp": lambda rad: chirp(rate_hz=1000.0, amplitude_rad=rad, duration_s=20.0),
@@ -121,7 +121,7 @@ def test_the_file_has_the_slope_that_was_predicted(profile):
 
 @pytest.mark.parametrize("tip_slope_rad", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_limit_that_is_none_is_refused(profile, tip_slope_rad):
-    with pytest.raises(TipSlopeError, match="--tip-slope"):
+    with pytest.raises(UserError, match="--tip-slope"):
         with_tip_slope(profile, tip_slope_rad)
 
 

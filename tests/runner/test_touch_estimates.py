@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.engine import TouchReady, TouchTold
+from rigd.engine.messages import TouchReady, TouchTold
 from rigd.runner._touch_search import TouchEstimates
 from rigd.session.touches import touch_line, touches_of
 

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from rigd.devices._registry import WhatMoves, what_moves
+from rigd.devices import WhatMoves, what_moves
 from rigd.devices.running_simulator import unreachable_simulators
-from rigd.runner._planning import RefusedError
-from rigd.runner._request import load_rig
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import load_rig
 
 
 @pytest.fixture

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine import make_watch
+from rigd.engine.cycle import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner import RefusedError, Series
+from rigd.runner import Series
+from rigd.runner.planning import RefusedError
 from rigd.safety import LOOK_EVERY
 
 PROFILE = load_profile("antenna_can")

@@ -10,7 +10,8 @@ import zlib
 import pytest
 from web_daemon import TOKEN, rig_with_page
 
-from rigd.daemon import Client, find
+from rigd.daemon.address import find
+from rigd.daemon.client import Client
 from rigd.web import _access
 
 START = json.dumps({"command": "start", "excitation": "chirp"}).encode()

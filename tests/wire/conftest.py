@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine import Event, Phase
+from rigd.engine.shared_state import Event, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runner import Order, Rig, SessionProgress, SessionResult
+from rigd.runner import Rig
+from rigd.runner.request import Order
+from rigd.runner.session import SessionProgress, SessionResult
 from rigd.runtime import StopRequest
 from rigd.sim.wire import inject
 

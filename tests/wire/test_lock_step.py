@@ -8,7 +8,8 @@ import pytest
 
 from rigd.devices.parameters import Selection
 from rigd.excitation import hold
-from rigd.runner import Order, Rig
+from rigd.runner import Rig
+from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire import inject

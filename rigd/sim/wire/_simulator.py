@@ -31,7 +31,7 @@ from rigd.devices.running_simulator import (
     find_simulator,
     forget,
 )
-from rigd.runtime import runtime_folder
+from rigd.runtime.addresses import runtime_folder
 from rigd.sim import SimulatedRig
 from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog, Fault, FaultError, WrongUseError, parse_fault

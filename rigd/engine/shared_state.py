@@ -9,8 +9,8 @@ Events
     not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
     event into the file, the supervisor shows it to the operator.
 
-What is published, and the memory that holds all of it, is in `_topics`. This module imports nothing
-heavy, for the processes of a rig are started before anything else.
+What is published, and the memory that holds all of it, is in `channels`. This module imports
+nothing heavy, for the processes of a rig are started before anything else.
 """
 
 import contextlib
@@ -214,7 +214,15 @@ class Event:
 
 
 def write_event(ring: Ring, event: Event) -> None:
-    """Append an event; where the ring is full it is dropped rather than waited for."""
+    """Append an event; it is dropped if the ring is full.
+
+    Parameters
+    ----------
+    ring
+        Ring of events.
+    event
+        Event; its text is cut to the size of a record.
+    """
     offset = ring.slot()
     if offset < 0:
         return
@@ -246,7 +254,8 @@ def activity(board: SharedState) -> Activity:
 
     Examples
     --------
-    >>> from rigd.engine import Phase, SharedState, Word, activity, shared_memory_fd
+    >>> from rigd.engine import shared_memory_fd
+    >>> from rigd.engine.shared_state import Phase, SharedState, Word, activity
     >>> board = SharedState.create(shared_memory_fd())
     >>> board[Word.PHASE] = Phase.TARING
     >>> activity(board)

@@ -8,7 +8,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import Channels, Observer, Phase, Ring, Word
+from rigd.engine import Observer, Ring
+from rigd.engine.channels import Channels
+from rigd.engine.shared_state import Phase, Word
 from rigd.profile import Profile
 from rigd.runner._live_view import gauge_limits
 from rigd.session.layout import decode_samples

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from rigd.control import PidController
 from rigd.devices.contracts import DeviceError, Devices, GaugeSensor, Wrench
-from rigd.engine._timing import TickScheduler
+from rigd.engine.timing import TickScheduler
 from rigd.profile import Profile
-from rigd.runtime import UnsafeFolderError, runtime_folder
+from rigd.runtime.addresses import UnsafeFolderError, runtime_folder
 from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, ScaleWatch, SensorWatch
 from rigd.safety.limits import BY_NAME, Violation
 from rigd.session.layout import WRENCH_FIELDS, Status
@@ -598,7 +598,14 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
 def remember_heat(profile: Profile, heat_nm2: float) -> None:
     """Store the heat of the motor for the next connection of this user.
 
-    Without a place for it, the next one takes the motor for cold.
+    Where it cannot be stored, the next connection takes the motor for cold.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    heat_nm2
+        Heat of the motor, as the limit monitor counts it.
     """
     document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
     with suppress(OSError, UnsafeFolderError):

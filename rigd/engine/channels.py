@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
-from rigd.engine._shared_state import EVENT_SIZE, SharedState, Stop, Word
+from rigd.engine.shared_state import EVENT_SIZE, SharedState, Stop, Word
 from rigd.safety.limits import BUFFERED_S
 from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
@@ -37,7 +37,15 @@ class Topic:
     """The live publisher looks at them, as far as it can keep up."""
 
     def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
-        """Return how many records its ring holds."""
+        """Return how many records its ring holds.
+
+        Parameters
+        ----------
+        rate_hz
+            Ticks a second.
+        buffered_s
+            Time that the ring holds.
+        """
         return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rigd.printable import printable
-from rigd.runner._session import SessionResult
+from rigd.runner.session import SessionResult
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
 from rigd.session.quick_look import look_path, read_look
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rigd.runtime._addresses import started_at
+from rigd.runtime.addresses import started_at
 
 _PROC: Final = Path("/proc")
 _SOCKETS: Final = Path("/proc/net/unix")

@@ -5,7 +5,7 @@ up its word in the `SharedState` several times a second. A dead process is notic
 one by its heartbeat; the table says what happens then.
 
 A child is ``python -m MODULE``. Its standard input brings its job and then messages; the end of it
-means that the supervisor is gone. Its standard output brings its answers (`_messages`).
+means that the supervisor is gone. Its standard output brings its answers (`messages`).
 """
 
 import contextlib
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigd.engine._control_names import CONTROL_MODULE
-from rigd.engine._messages import MessageReader, encode, is_ready
-from rigd.engine._shared_state import Word
+from rigd.engine.messages import MessageReader, encode, is_ready
+from rigd.engine.shared_state import Word
 from rigd.errors import FailureError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, held_back, signal_when_orphaned
 

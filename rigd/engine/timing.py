@@ -144,7 +144,7 @@ class TickScheduler:
 
     Examples
     --------
-    >>> from rigd.engine import TickScheduler, VirtualClock
+    >>> from rigd.engine.timing import TickScheduler, VirtualClock
     >>> metronome = TickScheduler(VirtualClock(), rate_hz=1000)
     >>> metronome.restart()
     >>> [metronome.wait() for _ in range(3)], metronome.t_ns

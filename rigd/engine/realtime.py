@@ -61,7 +61,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
     """
     libc = ctypes.CDLL(None, use_errno=True)
     wanted: dict[str, Callable[[], str]] = {
-        "memory": lambda: _lock_memory(libc),
+        "memory": lambda: lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
         "cpu": lambda: _pin(cpu, root),
@@ -228,7 +228,8 @@ def _attempt(setting: Callable[[], str]) -> str:
         return f"{REFUSED}{error}"
 
 
-def _lock_memory(libc: ctypes.CDLL) -> str:
+def lock_memory(libc: ctypes.CDLL) -> str:
+    """Lock the memory of this process through `libc`, and return what was locked."""
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
         _call(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
     from rigd.control.damper import DamperSettings
     from rigd.devices import WhatMoves
-    from rigd.engine._reference import ReferenceSpec
-    from rigd.engine._topics import ChannelSpecs
+    from rigd.engine.channels import ChannelSpecs
+    from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import Approach, PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
     from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
@@ -427,7 +427,17 @@ class MessageReader:
 
 
 def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
+    """Wait until a descriptor can be used, and return whether it can.
+
+    Parameters
+    ----------
+    fd
+        Descriptor; unlike `select`, `poll` takes numbers beyond 1023.
+    event
+        ``select.POLLIN`` or ``select.POLLOUT``.
+    timeout_s
+        Longest wait; None: for ever.
+    """
     waiting = select.poll()
     waiting.register(fd, event)
     return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))

@@ -17,16 +17,9 @@ from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import Clearance, check_on_paper
 from rigd.control import ClosedLoop, ControlDesignError, LoopResponse, stable_loop
 from rigd.control.damper import design_damper
-from rigd.engine import Ending
+from rigd.engine.messages import Ending
 from rigd.errors import UserError
-from rigd.excitation import (
-    KINDS,
-    BeamEstimate,
-    Excitation,
-    MovePlant,
-    Value,
-    make_excitation,
-)
+from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, Value, make_excitation
 from rigd.identified_beam import Use, read_identified_beam
 from rigd.profile import Profile
 from rigd.runner._move_plant import (
@@ -70,10 +63,15 @@ class Prediction:
     """
 
     peak_angle_rad: float
+    """Angle from the rig's zero."""
     peak_velocity_rad_s: float
+    """Speed of the output shaft."""
     peak_torque_nm: float
+    """Torque command at the output shaft."""
     peak_tracking_error_rad: float
+    """Reference minus angle."""
     peak_coupling_torque_nm: float
+    """Torque between hub and antenna."""
     tip: TipMotion | None = None
     """Motion of the beam's free end in a vacuum; None without a beam, or where it is irrelevant."""
 
@@ -502,6 +500,13 @@ def _scan_in_words(excitation: Excitation) -> str:
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     """Predict the peaks of a session.
+
+    Parameters
+    ----------
+    loop
+        Linear closed loop of the rig.
+    excitation
+        Excitation of the session.
 
     Raises
     ------

@@ -13,38 +13,30 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
-from rigd.engine import (
-    CONTROL,
-    RECORDER,
-    REFUSED,
+from rigd.engine import Observer
+from rigd.engine.messages import (
     Armed,
-    ChildError,
     Close,
     Closed,
     Connected,
     Ended,
-    Event,
     Failed,
     Finished,
-    Observer,
     Opened,
-    Phase,
-    Pulse,
     Ready,
     RecorderJob,
     SessionJob,
-    Stop,
-    Word,
-    is_whole,
-    put_reference,
-    read_events,
 )
+from rigd.engine.processes import CONTROL, RECORDER, ChildError, Pulse
+from rigd.engine.realtime import REFUSED
+from rigd.engine.reference import is_whole, put_reference
+from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import OnlineFit
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._request import Order, another_path, file_header, part_of
 from rigd.runner._touch_search import TouchEstimates
+from rigd.runner.request import Order, another_path, file_header, part_of
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02

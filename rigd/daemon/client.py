@@ -13,11 +13,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rigd.daemon._address import peer_of, running
+from rigd.daemon.address import peer_of, running
 from rigd.errors import FailureError, RigdError
 from rigd.live import LiveAddress
 from rigd.live import running as running_views
-from rigd.runtime import STOP_SIGNAL, read_process, read_processes, send_signal
+from rigd.runtime import STOP_SIGNAL
+from rigd.runtime.processes import read_process, read_processes, send_signal
 
 Document = dict[str, Any]
 

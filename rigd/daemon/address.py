@@ -10,14 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from rigd.errors import FailureError, UserError
-from rigd.runtime import (
-    address_files,
-    answers,
-    file_name,
-    folder_fault,
-    listening_sockets,
-    runtime_folder,
-)
+from rigd.runtime.addresses import address_files, answers, file_name, folder_fault, runtime_folder
+from rigd.runtime.processes import listening_sockets
 
 COMMON = Path("/run/rigd")
 """Folder of daemons that a group may use: a user's own runtime folder is closed to others."""

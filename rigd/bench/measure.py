@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import Phase
+from rigd.engine.shared_state import Phase
 
 HELD = 0.999
 """Share of its ticks that a computer has to run in their periods to hold a rate."""
@@ -21,7 +21,9 @@ class Usage:
     """Processor time and page faults since a process began."""
 
     cpu_s: float
+    """Processor time, s."""
     page_faults: int
+    """Page faults, those that wait for a disk included."""
 
 
 def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
@@ -29,6 +31,13 @@ def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
 
     The scheduler's own account counts nanoseconds; the usual one looks who runs at each of its
     ticks, which a loop in step with them can miss altogether.
+
+    Parameters
+    ----------
+    pid
+        Number of the process.
+    proc
+        Process table of the kernel.
 
     Raises
     ------
@@ -140,7 +149,7 @@ def figures(values_us: npt.NDArray[np.float64]) -> Figures:
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.bench import figures
+    >>> from rigd.bench.measure import figures
     >>> found = figures(np.arange(101.0))
     >>> found.p50, found.p99, found.largest
     (50.0, 99.0, 100.0)
@@ -204,7 +213,15 @@ def measurement(
 
 
 def pooled(name: str, parts: list[Measurement]) -> Measurement:
-    """Return several measurements of the same as one."""
+    """Return several measurements of the same as one.
+
+    Parameters
+    ----------
+    name
+        Name of the measurement.
+    parts
+        Measurements at one rate, at least one.
+    """
     costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
     faults = [part.page_faults for part in parts if part.page_faults is not None]
     return Measurement(

@@ -29,12 +29,12 @@ from rigd.devices import (
 )
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.running_simulator import unreachable_simulators
-from rigd.engine import Connected, Ending, FileHeader
+from rigd.engine.messages import Connected, Ending, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
-from rigd.runner._planning import RefusedError
 from rigd.runner._touch_search import TouchSearch
+from rigd.runner.planning import RefusedError
 from rigd.safety.limits import Limits
 from rigd.session import PART_SUFFIX
 from rigd.session.user_metadata import META_PREFIX, NOTES

@@ -11,18 +11,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine import (
-    PROCESSES,
-    SUPERVISOR,
-    TOPICS,
-    Activity,
-    Observer,
-    Phase,
-    Pulse,
-    Ring,
-    Word,
-    activity,
-)
+from rigd.engine import Observer, Ring
+from rigd.engine.channels import TOPICS
+from rigd.engine.processes import PROCESSES, SUPERVISOR, Pulse
+from rigd.engine.shared_state import Activity, Phase, Word, activity
 from rigd.live import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
@@ -143,7 +135,9 @@ class TopicStatus:
     """Status of one topic of the table."""
 
     name: str
+    """Name in the table of topics."""
     written: int
+    """Records written since the memory was laid out."""
     rate_hz: float | None
     """Since the last look; None where there was none."""
     expected_hz: float | None

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rigd.engine._ring import reserve
-from rigd.engine._shared_state import SharedState, Word
+from rigd.engine.shared_state import SharedState, Word
 
 if TYPE_CHECKING:
     import numpy as np
