@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns import campaign
-from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns import RecordEstimate, SessionResult, WelchFit, campaign
 from analysis.campaigns._experiment import Experiment
-from analysis.campaigns._session import SessionResult
 from analysis.identify import ModeEstimate, Plant
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper._route import Indices, Peak
+from analysis.paper import Indices, Peak
 from rigd.beam import Beam, Damping
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 

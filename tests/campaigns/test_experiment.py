@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from analysis.campaigns import SessionFailure, SessionTask, analyse_session
 from analysis.campaigns._campaign import _of_one_experiment
 from analysis.campaigns._experiment import most_common, stated_specimens, told_apart
-from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 
 
 @pytest.fixture

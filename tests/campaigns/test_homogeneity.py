@@ -7,12 +7,12 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from analysis.campaigns import Homogeneity, campaign
 from analysis.campaigns import _sentences as specimen_sentences
-from analysis.campaigns import campaign
 from analysis.campaigns._campaign import campaign_result
 from analysis.campaigns._experiment import stated_specimens
-from analysis.campaigns._homogeneity import Homogeneity, groups, homogeneity
-from analysis.report._campaign_document import campaign_document
+from analysis.campaigns._homogeneity import groups, homogeneity
+from analysis.report import campaign_document
 from analysis.report._campaign_figures import pooled_figure
 from analysis.report._campaign_report import campaign_page, campaign_text
 from analysis.report._campaign_tables import all_tables

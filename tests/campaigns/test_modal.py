@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cauchy_residues import modal_constants
 
+from analysis.campaigns import Homogeneity
 from analysis.campaigns import _geometry_sentences as sentences
-from analysis.campaigns._homogeneity import Homogeneity
 from analysis.campaigns._modal import opposite_sweeps, pooled_modal
 from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict

@@ -7,14 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns._statistics import (
-    best_models,
-    mean_deviations,
-    nominal_models,
-    parameter_statistics,
-)
+from analysis.campaigns import best_models
+from analysis.campaigns._statistics import mean_deviations, nominal_models, parameter_statistics
 from analysis.models import STRUCTURES, FrequencyResponseModel
-from analysis.paper._route import Peak, resonant_peaks
+from analysis.paper import Peak, resonant_peaks
 from analysis.report._paper_tables import papers_table3, papers_table4, papers_wmse
 from rigd.beam import transfer
 

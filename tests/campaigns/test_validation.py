@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns._validation import LostTrial, left_out_errors, validate
+from analysis.campaigns import CampaignError, LostTrial, campaign
+from analysis.campaigns._validation import left_out_errors, validate
 from analysis.cli.campaign import campaign_command
 from analysis.cli.sessions import Outputs
 from analysis.identify import BAND_HZ
-from analysis.report._campaign_document import campaign_document
+from analysis.report import campaign_document
 from analysis.report._campaign_figures import validation_figure
 from analysis.report._campaign_report import campaign_page, campaign_text
 

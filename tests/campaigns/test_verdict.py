@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from analysis.campaigns import Heterogeneity, Homogeneity
 from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity
 from analysis.campaigns._orders import freest_estimate, pooled_order
 from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict, common_findings

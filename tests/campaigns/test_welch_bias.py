@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from analysis.campaigns import Homogeneity
 from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._homogeneity import Homogeneity
 from analysis.campaigns._pooling import pooled_estimates
 from analysis.campaigns._verdict import campaign_verdict
 from analysis.campaigns._welch_bias import welch_biases

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from analysis.campaigns import campaign
+from analysis.campaigns import SessionFailure, SessionTask, analyse_session, campaign
 from analysis.campaigns._campaign import _of_one_experiment
-from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
-from analysis.report._campaign_report import campaign_page, campaign_text, write_campaign
+from analysis.report import write_campaign
+from analysis.report._campaign_report import campaign_page, campaign_text
 
 
 @pytest.fixture(scope="module")

@@ -14,14 +14,13 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine._messages import Failed, MessageReader, encode
-from rigd.engine._ring import Ring, shared_memory_fd
-from rigd.engine._shared_state import Event, SharedState, Word, write_event
-from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
-from rigd.live._address import LiveAddress
-from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
-from rigd.session._format import pack_sample_into, pack_timing_into
-from rigd.view._session_info import Subject
+from rigd.engine import TOPICS, Channels, Event, Failed, Ring, SharedState, Word, shared_memory_fd
+from rigd.engine._messages import MessageReader, encode
+from rigd.engine._shared_state import write_event
+from rigd.engine._topics import DESCRIPTORS
+from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.session import pack_sample_into, pack_timing_into
+from rigd.view import Subject
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.live._address import LiveAddress, announce, find, running, withdraw
+from rigd.live import LiveAddress, running
+from rigd.live._address import announce, find, withdraw
 from rigd.live._server import free_port
-from rigd.runtime._addresses import runtime_folder
+from rigd.runtime import runtime_folder
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ from functools import partial
 
 import pytest
 
-from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import UNKNOWN, Word
-from rigd.engine._topics import DESCRIPTORS, create_channels
+from rigd.engine import Word, create_channels, shared_memory_fd
+from rigd.engine._shared_state import UNKNOWN
+from rigd.engine._topics import DESCRIPTORS
 from rigd.live.publisher import LOOK_S, Backlog, Vitals
 
 

@@ -15,10 +15,10 @@ import pytest
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
-from rigd.engine._messages import Failed, MessageReader
-from rigd.engine._shared_state import Word
-from rigd.live._address import LiveAddress, find
-from rigd.live._ring_reader import LiveFit, LiveJob
+from rigd.engine import Failed, Word
+from rigd.engine._messages import MessageReader
+from rigd.live import LiveAddress, LiveFit, LiveJob
+from rigd.live._address import find
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"

@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from rigd.engine._shared_state import Word
-from rigd.excitation._named import make_excitation
+from rigd.engine import Word
+from rigd.excitation import make_excitation
 from rigd.live._address import find
 from rigd.profile import load_profile
+from rigd.runner import Order, Rig, SessionFailedError
 from rigd.runner import _live_view as live_view
-from rigd.runner._request import Order
-from rigd.runner._rig import Rig
-from rigd.runner._session import SessionFailedError
-from rigd.runtime._stop_signals import StopRequest
+from rigd.runtime import StopRequest
 from rigd.session import read_session
 
 

@@ -12,7 +12,7 @@ from processes import eventually
 from rigd.beam import Beam
 from rigd.engine import Phase, Stop, Word, create_channels, shared_memory_fd
 from rigd.engine._topics import DESCRIPTORS
-from rigd.live._ring_reader import LiveSession
+from rigd.live import LiveSession
 from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
 from rigd.view import (
     FINISHING,

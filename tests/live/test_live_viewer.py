@@ -8,8 +8,7 @@ import pytest
 from graphics import viewer_ended
 from processes import eventually, sockets
 
-from rigd.live._address import LiveAddress
-from rigd.live._viewer import Viewer
+from rigd.live import LiveAddress, Viewer
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from analysis.identify import (
     of_fit,
 )
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
 from analysis.report._record_report import _write_page
 from analysis.results import RecordResult, WholeRecord

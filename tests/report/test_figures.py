@@ -10,11 +10,10 @@ from matplotlib.text import Text
 from PIL import Image
 
 from analysis.models import WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
+from analysis.report import OutputExistsError, frf_figure
 from analysis.report import _style as style
-from analysis.report._folder import OutputExistsError
-from analysis.report._frf_figure import frf_figure
 from analysis.report._record_figures import plain_logarithmic
 from analysis.report._signal_figures import best_model, torque_figure
 from analysis.report._signal_figures import paper_signals_figure as signals_figure

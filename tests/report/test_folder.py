@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.report._folder import (
-    LIST,
+from analysis.report import (
     OutputError,
     OutputExistsError,
     check_new_file,
@@ -13,6 +12,7 @@ from analysis.report._folder import (
     report_folders,
     write_new,
 )
+from analysis.report._folder import LIST
 
 
 def test_default_folders_are_beside_the_files_and_new(tmp_path):

@@ -11,8 +11,7 @@ import zstandard
 from cases import further
 
 from analysis.record import RecordError, load_record
-from rigd.session import SessionError
-from rigd.session._schema import SAMPLE_SCHEMA, schema_data
+from rigd.session import SAMPLE_SCHEMA, SessionError, schema_data
 
 MAGIC = b"\x89MCAP0\r\n"
 MEGABYTES = 1000

@@ -14,12 +14,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from analysis.identify import of_fit
-from analysis.identify._headline import Simpler
+from analysis.identify import Simpler, of_fit
+from analysis.report import FIGURES, OutputExistsError, illustrations
 from analysis.report import _style as style
 from analysis.report._document import record_entries
-from analysis.report._folder import OutputExistsError
-from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_report import _write_page, record_page, report_tables
 from analysis.report._style import Picture
 from analysis.report._text import damping_sentences

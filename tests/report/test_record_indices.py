@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.paper._route import fit_indices
-from analysis.report._document import document, indices_of_record_fit, whole_record_indices
+from analysis.paper import fit_indices
+from analysis.report import document
+from analysis.report._document import indices_of_record_fit, whole_record_indices
 from rigd.beam import transfer
 
 

@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import with_scales
-from analysis.report._document import (
-    document,
-    finite,
-    record_entries,
-    response_fit_percent,
-)
+from analysis.report import document
+from analysis.report._document import finite, record_entries, response_fit_percent
 from analysis.report._fit_tables import structures_table
 from analysis.report._record_tables import modes_table, parameters_table
 from analysis.report._scales import scale_notes

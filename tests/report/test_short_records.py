@@ -6,12 +6,11 @@ from dataclasses import replace
 import pytest
 
 from analysis.models import WelchSettings
+from analysis.paper import analyse
 from analysis.paper._estimate import estimate_warnings
-from analysis.paper._route import analyse
 from analysis.record import RecordError, load_record
 from analysis.report import _style as style
-from analysis.report._document import document_text
-from analysis.report._folder import write_new
+from analysis.report import document_text, write_new
 
 ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega", "--figures", "png")
 

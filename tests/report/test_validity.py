@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.report._document import document, document_text
-from analysis.report._text import as_text, result_text, summary_table, tables_text
+from analysis.report import document, document_text, result_text, summary_table
+from analysis.report._text import as_text, tables_text
 from analysis.results import RecordResult
 from rigd.beam import SMALL_SLOPE_RAD, linear_model_error
 from rigd.session import Validity

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping
-from rigd.session._format import SAMPLE_DTYPE
-from rigd.view._plots import TIMELINE
-from rigd.view._session_info import Subject
+from rigd.session import SAMPLE_DTYPE
+from rigd.view import TIMELINE, Subject
 
 
 @pytest.fixture(autouse=True)

@@ -4,21 +4,23 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.view._banner import (
+from rigd.view import (
+    GREEN,
+    GREY,
+    ORANGE,
     RUNNING,
-    STATE,
     SUPERVISOR_LOST,
-    VALUES,
-    banner,
+    Gauge,
+    Health,
+    Note,
+    Scene,
     ended,
-    gauge_color,
-    gauge_text,
     preparing,
+    sweep_of,
 )
-from rigd.view._gauges import Gauge
-from rigd.view._plots import GREEN, GREY, ORANGE, RED
-from rigd.view._scene import Scene
-from rigd.view._session_info import RECENT_EVENTS, Health, Note, sweep_of
+from rigd.view._banner import STATE, VALUES, banner, gauge_color, gauge_text
+from rigd.view._plots import RED
+from rigd.view._session_info import RECENT_EVENTS
 
 FAULT = ended("fault", "The disk is full.")
 

@@ -9,10 +9,10 @@ from online_fits import online_fit
 
 from rigd.session import read_session
 from rigd.session._format import TIMING_DTYPE
+from rigd.view import Scene, draw_session
 from rigd.view._fits import TABLE, fit_record, fit_source, fit_table
 from rigd.view._layout import FIT_TAB, TABS, blueprint
-from rigd.view._recorded import draw_session, subject_of_session
-from rigd.view._scene import Scene
+from rigd.view._recorded import subject_of_session
 
 
 def curves(fit, modes=3):

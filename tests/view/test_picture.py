@@ -10,15 +10,13 @@ import pytest
 from cases import further
 
 from analysis.models import PAPER_BAND_HZ, WelchSettings
-from analysis.paper._estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session._format import TIMING_DTYPE
-from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
-from rigd.view._recorded import draw_session
-from rigd.view._scene import Scene
-from rigd.view._session_info import Health, Note, Subject
+from rigd.view import Health, Note, Scene, Subject, SweepResponse, draw_session
+from rigd.view._frequency_charts import MAGNITUDE
 
 RIGD = Path(sys.executable).parent / "rigd"
 

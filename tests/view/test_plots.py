@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rigd.session._format import TIMING_DTYPE
-from rigd.view._plots import HEALTH, READINGS, SIGNALS, send_columns
-from rigd.view._session_info import Health, health_record
+from rigd.view import Health, send_columns
+from rigd.view._plots import HEALTH, READINGS, SIGNALS
+from rigd.view._session_info import health_record
 
 SOURCES = (SIGNALS, READINGS, HEALTH)
 PLOTS = [plot for source in SOURCES for plot in source.plots]

@@ -1,6 +1,7 @@
 """The state of a session at one look."""
 
-from rigd.view._session_info import Health, summary
+from rigd.view import Health
+from rigd.view._session_info import summary
 
 WELL = Health(
     missed_ticks=0, late_ticks=0, lost_ticks=0, recorder_lag_ticks=17, disk_free_mb=51_234.0,
