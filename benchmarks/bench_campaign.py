@@ -25,7 +25,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.campaigns import SessionTask, analyse_session, campaign, process_pool
+from analysis.campaigns import SessionTask, analyse_session, campaign
+from analysis.campaigns.workers import process_pool
 from analysis.identify import BAND_HZ
 from analysis.models import (
     STRUCTURES,

@@ -1,3 +1,6 @@
+from . import pooling as pooling
+from . import sentences as sentences
+from . import workers as workers
 from ._campaign import CampaignResult as CampaignResult
 from ._campaign import campaign as campaign
 from ._estimates import RecordEstimate as RecordEstimate
@@ -13,18 +16,6 @@ from ._homogeneity import Homogeneity as Homogeneity
 from ._modal import ModeInSweeps as ModeInSweeps
 from ._modal import OppositeSweeps as OppositeSweeps
 from ._modal import PooledModal as PooledModal
-from ._pooling import PooledEstimate as PooledEstimate
-from ._pooling import PooledMode as PooledMode
-from ._pooling import PooledParameter as PooledParameter
-from ._sentences import MIXTURE_MARK as MIXTURE_MARK
-from ._sentences import MIXTURE_NOTE as MIXTURE_NOTE
-from ._sentences import label as label
-from ._sentences import lost_trials as lost_trials
-from ._sentences import percent as percent
-from ._sentences import probability as probability
-from ._sentences import specimens as specimens
-from ._sentences import title as title
-from ._sentences import with_unit as with_unit
 from ._session import SessionFailure as SessionFailure
 from ._session import SessionResult as SessionResult
 from ._session import SessionTask as SessionTask
@@ -40,4 +31,3 @@ from ._validation import by_model as by_model
 from ._verdict import CampaignVerdict as CampaignVerdict
 from ._welch_bias import ParameterBias as ParameterBias
 from ._welch_bias import WelchBias as WelchBias
-from ._workers import process_pool as process_pool

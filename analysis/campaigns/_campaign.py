@@ -17,7 +17,6 @@ from analysis.campaigns._experiment import (
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
 from analysis.campaigns._orders import freest_estimate
-from analysis.campaigns._pooling import PooledEstimate, PooledMode, pooled_estimates
 from analysis.campaigns._session import (
     SessionFailure,
     SessionResult,
@@ -35,7 +34,8 @@ from analysis.campaigns._statistics import (
 from analysis.campaigns._validation import FEWEST, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
-from analysis.campaigns._workers import Lost, available_cores, dask_cluster, process_pool
+from analysis.campaigns.pooling import PooledEstimate, PooledMode, pooled_estimates
+from analysis.campaigns.workers import Lost, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import worst
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
-    from analysis.campaigns._workers import Workers
+    from analysis.campaigns.workers import Workers
     from analysis.identify import Setting
     from rigd.session import Validity
 

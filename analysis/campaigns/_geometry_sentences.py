@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns._pooling import PooledSize
-from analysis.campaigns._sentences import LOSSES, in_single_sessions, probability
+from analysis.campaigns.pooling import PooledSize
+from analysis.campaigns.sentences import LOSSES, in_single_sessions, probability
 from analysis.identify import EXACT_CONDITION, tolerant_sizes
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import TolerantEstimate
 
 _BASES: Final = {

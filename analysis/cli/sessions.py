@@ -124,7 +124,8 @@ def session_command(
     OutputExistsError, OutputError
         Something cannot be written.
     """
-    from analysis.report import document, document_text, report_folders, write_new
+    from analysis.report import document, document_text
+    from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
     found, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
@@ -177,7 +178,7 @@ def _analyse_all(
     from analysis.identify import MeasurementError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
-    from analysis.report import OutputError
+    from analysis.report.folder import OutputError
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
@@ -241,7 +242,8 @@ def _analyse_file(
     *,
     overwrite: bool,
 ) -> RecordResult:
-    from analysis.report import new_folder, write_report
+    from analysis.report import write_report
+    from analysis.report.folder import new_folder
     from analysis.results import record_result
 
     result = record_result(

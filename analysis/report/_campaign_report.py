@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns import lost_trials, specimens
+from analysis.campaigns.sentences import lost_trials, specimens
 from analysis.identify import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
-from analysis.report._folder import write_new
 from analysis.report._paper_tables import paper_tables, welch_text
-from analysis.report._table import csv_text
 from analysis.report._text import as_text, spaced
+from analysis.report.folder import write_new
+from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.session import EVENT_TOPIC, SAMPLE_SCHEMA, SAMPLE_TOPIC
-from rigd.view import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
+from rigd.view.plots import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

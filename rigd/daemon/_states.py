@@ -13,7 +13,7 @@ from math import isfinite
 from typing import Any
 
 from rigd.engine import PROCESSES, Phase
-from rigd.live import LiveAddress
+from rigd.live.address import LiveAddress
 from rigd.runner import ProcessStatus, RigStatus, SignalBlock
 
 _REMEMBERED = 50

@@ -1,5 +1,4 @@
-from ._address import LiveAddress as LiveAddress
-from ._address import running as running
+from . import address as address
 from ._program import RerunError as RerunError
 from ._ring_reader import LiveEnd as LiveEnd
 from ._ring_reader import LiveFit as LiveFit

@@ -17,7 +17,8 @@ from rigd.engine import (
     read_events,
 )
 from rigd.session import decode_samples, decode_timings
-from rigd.view import LastResponse, Note, Scene, Subject
+from rigd.view import Note, Scene, Subject
+from rigd.view.frequency_charts import LastResponse
 
 if TYPE_CHECKING:
     from rigd.view import Drawing

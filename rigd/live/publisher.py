@@ -42,7 +42,8 @@ from rigd.live._ring_reader import (
 from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import last_look, look_path, read_look, touch_line
-from rigd.view import (
+from rigd.view import Health, Note, outcome_note
+from rigd.view.banner import (
     FINISHING,
     RETURNING,
     RUNNING,
@@ -51,15 +52,12 @@ from rigd.view import (
     SUPERVISOR_LOST_TORQUE_OFF,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    Health,
-    LastResponse,
-    Note,
     State,
     ended,
-    outcome_note,
     preparing,
-    settle_sdk,
 )
+from rigd.view.frequency_charts import LastResponse
+from rigd.view.rrd_file import settle_sdk
 
 if TYPE_CHECKING:
     from rigd.live._ring_reader import LiveJob

@@ -23,7 +23,7 @@ from rigd.engine import (
     Word,
     activity,
 )
-from rigd.live import LiveAddress
+from rigd.live.address import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session import decode_samples
 

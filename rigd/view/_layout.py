@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.view import _antenna as antenna
-from rigd.view import _banner
-from rigd.view import _plots as plots
+from rigd.view import banner, plots
 from rigd.view._fits import TABLE as FIT_TABLE
 from rigd.view._fits import fit_source
-from rigd.view._frequency_charts import (
+from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view.frequency_charts import (
     COHERENCE,
     MAGNITUDE,
     OVERVIEW_MAGNITUDE,
@@ -32,9 +32,8 @@ from rigd.view._frequency_charts import (
     SIZES,
     SPECTROGRAM,
 )
-from rigd.view._frequency_charts import SIZE as SPECTROGRAM_SIZE
-from rigd.view._plots import TIMELINE, Plot, Source, Values, send_columns
-from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
+from rigd.view.plots import TIMELINE, Plot, Source, Values, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -178,7 +177,7 @@ def blueprint(
 def _overview() -> "rrb.Container":
     import rerun.blueprint as rrb
 
-    state, values = _banner.views()
+    state, values = banner.views()
     return rrb.Vertical(
         rrb.Horizontal(state, values, column_shares=[6, 7]),
         rrb.Horizontal(

@@ -17,8 +17,8 @@ from analysis.record import load_record
 from analysis.report import campaign_document, campaign_tables, write_campaign
 from analysis.report._campaign_report import campaign_text
 from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
-from analysis.report._table import json_rows
 from analysis.report._text import as_text
+from analysis.report.table import json_rows
 from analysis.results import whole_record
 from rigd.beam import modes
 

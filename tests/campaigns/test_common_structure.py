@@ -7,7 +7,7 @@ import pytest
 
 from analysis.campaigns._homogeneity import homogeneity
 from analysis.campaigns._orders import common_structure
-from analysis.campaigns._pooling import pooled_estimates
+from analysis.campaigns.pooling import pooled_estimates
 
 FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
 FREQUENCY_HZ = 44.8132

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import Homogeneity, campaign
-from analysis.campaigns import _sentences as specimen_sentences
+from analysis.campaigns import sentences as specimen_sentences
 from analysis.campaigns._campaign import campaign_result
 from analysis.campaigns._experiment import stated_specimens
 from analysis.campaigns._homogeneity import groups, homogeneity
@@ -16,7 +16,7 @@ from analysis.report import campaign_document
 from analysis.report._campaign_figures import pooled_figure
 from analysis.report._campaign_report import campaign_page, campaign_text
 from analysis.report._campaign_tables import all_tables
-from analysis.report._table import json_rows
+from analysis.report.table import json_rows
 from rigd.beam import undamped_frequencies_rad_s
 
 STIFFER = 1.03

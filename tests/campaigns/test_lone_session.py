@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import pytest
 
-from analysis.campaigns._pooling import pooled_bic
 from analysis.campaigns._statistics import ranked_structures
+from analysis.campaigns.pooling import pooled_bic
 
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50",

@@ -11,8 +11,8 @@ from cauchy_residues import modal_constants
 from analysis.campaigns import Homogeneity
 from analysis.campaigns import _geometry_sentences as sentences
 from analysis.campaigns._modal import opposite_sweeps, pooled_modal
-from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict
+from analysis.campaigns.pooling import pooled
 from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant, uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 

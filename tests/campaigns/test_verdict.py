@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.campaigns import Heterogeneity, Homogeneity
-from analysis.campaigns import _sentences as sentences
+from analysis.campaigns import Heterogeneity, Homogeneity, sentences
 from analysis.campaigns._orders import freest_estimate, pooled_order
-from analysis.campaigns._pooling import pooled
 from analysis.campaigns._verdict import campaign_verdict, common_findings
+from analysis.campaigns.pooling import pooled
 from analysis.identify import Finding
 from analysis.statistics import student_t_quantile
 

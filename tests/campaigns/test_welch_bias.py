@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.campaigns import Homogeneity
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._pooling import pooled_estimates
+from analysis.campaigns import Homogeneity, sentences
 from analysis.campaigns._verdict import campaign_verdict
 from analysis.campaigns._welch_bias import welch_biases
+from analysis.campaigns.pooling import pooled_estimates
 from analysis.paper import Indices
 
 RECORD_STD = 0.001

@@ -5,8 +5,8 @@ import time
 import pytest
 from cases import further
 
-from analysis.campaigns import CampaignError, process_pool
-from analysis.campaigns._workers import Lost
+from analysis.campaigns import CampaignError
+from analysis.campaigns.workers import Lost, process_pool
 
 
 def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):

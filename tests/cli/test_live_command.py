@@ -7,7 +7,7 @@ import pytest
 from processes import eventually
 
 from rigd.cli.live import _follow
-from rigd.live._address import LiveAddress, announce
+from rigd.live.address import LiveAddress, announce
 
 VIEWER = """#!/bin/sh
 echo "$@" > "$SEEN.arguments"

@@ -31,9 +31,9 @@ from rigd.session._format import (
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
-from rigd.view._plots import AGES, GREEN, GREY, HEALTH, LOOP, ORANGE, SKY_BLUE
 from rigd.view._recorded import nominal_damping, subject_of_session
+from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view.plots import AGES, GREEN, GREY, HEALTH, LOOP, ORANGE, SKY_BLUE
 
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")

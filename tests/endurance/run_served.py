@@ -26,7 +26,7 @@ from run_campaign import Look, growth_table
 from run_starved import judge
 from run_viewers import Reading, children
 
-from rigd.live._address import find
+from rigd.live.address import find
 
 RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from run_viewers import Reading
 
-from rigd.live._address import find
+from rigd.live.address import find
 from rigd.safety._limits import OVERLOADED
 from rigd.session import read_session
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench._measure import measurement
-from rigd.live._address import LiveAddress, find
 from rigd.live._program import RerunProgram
 from rigd.live._viewer import Viewer
+from rigd.live.address import LiveAddress, find
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

@@ -18,7 +18,8 @@ from rigd.engine import TOPICS, Channels, Event, Failed, Ring, SharedState, Word
 from rigd.engine._messages import MessageReader, encode
 from rigd.engine._shared_state import write_event
 from rigd.engine._topics import DESCRIPTORS
-from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.live import LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.live.address import LiveAddress
 from rigd.session import pack_sample_into, pack_timing_into
 from rigd.view import Subject
 

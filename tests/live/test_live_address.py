@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.live import LiveAddress, running
-from rigd.live._address import announce, find, withdraw
 from rigd.live._server import free_port
+from rigd.live.address import LiveAddress, announce, find, running, withdraw
 from rigd.runtime import runtime_folder
 
 

@@ -17,8 +17,8 @@ from processes import eventually, has_ended, listeners, sockets
 
 from rigd.engine import Failed, Word
 from rigd.engine._messages import MessageReader
-from rigd.live import LiveAddress, LiveFit, LiveJob
-from rigd.live._address import find
+from rigd.live import LiveFit, LiveJob
+from rigd.live.address import LiveAddress, find
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"

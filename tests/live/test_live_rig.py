@@ -13,7 +13,7 @@ from processes import eventually
 
 from rigd.engine import Word
 from rigd.excitation import make_excitation
-from rigd.live._address import find
+from rigd.live.address import find
 from rigd.profile import load_profile
 from rigd.runner import Order, Rig, SessionFailedError
 from rigd.runner import _live_view as live_view

@@ -14,17 +14,17 @@ from rigd.engine import Phase, Stop, Word, create_channels, shared_memory_fd
 from rigd.engine._topics import DESCRIPTORS
 from rigd.live import LiveSession
 from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
-from rigd.view import (
+from rigd.view import Subject
+from rigd.view.banner import (
     FINISHING,
     RETURNING,
     RUNNING,
     STOPPING,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    LastResponse,
-    Subject,
     preparing,
 )
+from rigd.view.frequency_charts import LastResponse
 
 
 @pytest.fixture

@@ -20,10 +20,10 @@ import pytest
 from graphics import viewer_said
 from processes import eventually
 
-from rigd.view import GREEN, GREY, ORANGE, SKY_BLUE
-from rigd.view import _plots as plots
+from rigd.view import plots
 from rigd.view._antenna import TITLE as ANTENNA
 from rigd.view._layout import TABS
+from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
 PICTURES = os.environ.get("RIGD_PICTURES")
 # A ring-down that is longer than a busy computer needs for looking at everything.

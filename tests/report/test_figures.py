@@ -12,11 +12,12 @@ from PIL import Image
 from analysis.models import WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report import OutputExistsError, frf_figure
 from analysis.report import _style as style
+from analysis.report import frf_figure
 from analysis.report._record_figures import plain_logarithmic
 from analysis.report._signal_figures import best_model, torque_figure
 from analysis.report._signal_figures import paper_signals_figure as signals_figure
+from analysis.report.folder import OutputExistsError
 
 
 def pixels(figure, path):

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from analysis.report import (
+from analysis.report.folder import (
+    LIST,
     OutputError,
     OutputExistsError,
     check_new_file,
@@ -12,7 +13,6 @@ from analysis.report import (
     report_folders,
     write_new,
 )
-from analysis.report._folder import LIST
 
 
 def test_default_folders_are_beside_the_files_and_new(tmp_path):

@@ -34,7 +34,7 @@ def imported(names):
 )
 def test_text_json_figures_and_rrd_need_no_pages(names):
     modules = imported(names)
-    assert modules.intersection(("analysis.report._table", "analysis.report._style"))
+    assert modules.intersection(("analysis.report.table", "analysis.report._style"))
     assert not modules.intersection(PAGES)
 
 

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.mathtext import MathTextParser
 
 from analysis.report._record_report import report_tables
-from analysis.report._table import Cell, Column, Table, latex_table, latex_text, with_validity
+from analysis.report.table import Cell, Column, Table, latex_table, latex_text, with_validity
 
 
 @pytest.mark.parametrize(

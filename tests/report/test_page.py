@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from analysis.identify import Simpler, of_fit
-from analysis.report import FIGURES, OutputExistsError, illustrations
+from analysis.report import FIGURES, illustrations
 from analysis.report import _style as style
 from analysis.report._document import record_entries
 from analysis.report._record_report import _write_page, record_page, report_tables
 from analysis.report._style import Picture
 from analysis.report._text import damping_sentences
 from analysis.report._uniformity import UNIFORMITY
+from analysis.report.folder import OutputExistsError
 from analysis.results import finite
 
 WITHOUT_TEST = [name for name in FIGURES if name != UNIFORMITY]

@@ -14,11 +14,11 @@ from analysis.identify import of_fit
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report import document, illustrations, record_text
-from analysis.report._bands import excited_band_hz, supported_band_hz
 from analysis.report._record_report import record_page, report_tables
 from analysis.report._style import Picture
-from analysis.report._table import MARK, Cell, csv_text, unreported
 from analysis.report._text import damping_sentences, tables_text
+from analysis.report.bands import excited_band_hz, supported_band_hz
+from analysis.report.table import MARK, Cell, csv_text, unreported
 
 ALPHA = frozenset({"alpha"})
 PICTURES = (Picture("one", "A figure.", b""), Picture("two", "Another one.", b""))

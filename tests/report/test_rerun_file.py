@@ -14,13 +14,14 @@ from analysis.identify import ResponseGrid
 from analysis.models import WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report import OutputError, write_rerun_file
 from analysis.report import _rerun_file as fit_charts
+from analysis.report import write_rerun_file
 from analysis.report._record_figures import measured_response
+from analysis.report.folder import OutputError
 from analysis.results import RecordResult
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
-from rigd.view import new_rrd_file
+from rigd.view.rrd_file import new_rrd_file
 
 BAND = (0.5875, 50.0)
 

@@ -10,7 +10,8 @@ from analysis.paper import analyse
 from analysis.paper._estimate import estimate_warnings
 from analysis.record import RecordError, load_record
 from analysis.report import _style as style
-from analysis.report import document_text, write_new
+from analysis.report import document_text
+from analysis.report.folder import write_new
 
 ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega", "--figures", "png")
 

@@ -7,10 +7,19 @@ from rich.console import Console
 from analysis.models import WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report import summary_table, terminal_table
-from analysis.report._table import WORDS, Cell, Column, Table, csv_text, estimate, json_rows
+from analysis.report import summary_table
 from analysis.report._text import as_text
 from analysis.report._text import tables_text as text_of_result
+from analysis.report.table import (
+    WORDS,
+    Cell,
+    Column,
+    Table,
+    csv_text,
+    estimate,
+    json_rows,
+    terminal_table,
+)
 from analysis.results import RecordResult
 from rigd.beam import modes
 

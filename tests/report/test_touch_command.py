@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from analysis.cli.app import app
 from analysis.report import _style as style
-from analysis.report import touches_document, touches_table, write_touch_report
-from analysis.report._table import csv_text
 from analysis.report._touch_figures import touch_illustrations
+from analysis.report.table import csv_text
+from analysis.report.touch_report import touches_document, touches_table, write_touch_report
 
 
 @pytest.fixture

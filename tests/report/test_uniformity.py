@@ -10,12 +10,12 @@ import pytest
 from analysis.identify import CONSTANTS, Measurement, ModalModel, select
 from analysis.report import FIGURES, ShownModel, document, illustrations, record_text, result_text
 from analysis.report import _style as style
-from analysis.report._bands import loss_estimate, modal_response_band
 from analysis.report._equation import definitions, equations, mathml
 from analysis.report._record_report import record_page, report_tables, uniformity_tables
 from analysis.report._style import Picture
 from analysis.report._text import as_text
 from analysis.report._uniformity import uniformity_figure, uniformity_table
+from analysis.report.bands import loss_estimate, modal_response_band
 from analysis.results import RecordResult, WholeRecord
 
 pytestmark = pytest.mark.fit

@@ -7,7 +7,8 @@ import pytest
 
 from rigd.beam import Beam, Damping
 from rigd.session import SAMPLE_DTYPE
-from rigd.view import TIMELINE, Subject
+from rigd.view import Subject
+from rigd.view.plots import TIMELINE
 
 
 @pytest.fixture(autouse=True)

@@ -4,23 +4,20 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.view import (
-    GREEN,
-    GREY,
-    ORANGE,
-    RUNNING,
-    SUPERVISOR_LOST,
-    Gauge,
-    Health,
-    Note,
-    Scene,
-    ended,
-    preparing,
-    sweep_of,
-)
-from rigd.view._banner import STATE, VALUES, banner, gauge_color, gauge_text
-from rigd.view._plots import RED
+from rigd.view import Gauge, Health, Note, Scene, sweep_of
 from rigd.view._session_info import RECENT_EVENTS
+from rigd.view.banner import (
+    RUNNING,
+    STATE,
+    SUPERVISOR_LOST,
+    VALUES,
+    banner,
+    ended,
+    gauge_color,
+    gauge_text,
+    preparing,
+)
+from rigd.view.plots import GREEN, GREY, ORANGE, RED
 
 FAULT = ended("fault", "The disk is full.")
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from rigd.view import TIMELINE
-from rigd.view import _plots as plots
-from rigd.view._banner import SIZE as VALUES_SIZE
-from rigd.view._banner import VALUES
-from rigd.view._frequency_charts import SIZES
+from rigd.view import plots
 from rigd.view._layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
+from rigd.view.banner import SIZE as VALUES_SIZE
+from rigd.view.banner import VALUES
+from rigd.view.frequency_charts import SIZES
+from rigd.view.plots import TIMELINE
 
 
 def leaves(part):

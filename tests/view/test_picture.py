@@ -15,8 +15,8 @@ from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session._format import TIMING_DTYPE
-from rigd.view import Health, Note, Scene, Subject, SweepResponse, draw_session
-from rigd.view._frequency_charts import MAGNITUDE
+from rigd.view import Health, Note, Scene, Subject, draw_session
+from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
 
 RIGD = Path(sys.executable).parent / "rigd"
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rigd.session._format import TIMING_DTYPE
-from rigd.view import Health, send_columns
-from rigd.view._plots import HEALTH, READINGS, SIGNALS
+from rigd.view import Health
 from rigd.view._session_info import health_record
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, send_columns
 
 SOURCES = (SIGNALS, READINGS, HEALTH)
 PLOTS = [plot for source in SOURCES for plot in source.plots]

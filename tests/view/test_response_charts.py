@@ -7,14 +7,18 @@ import pytest
 
 from rigd.beam import transfer
 from rigd.spectral import FrequencyResponse, RunningEstimate
-from rigd.view import FIRST_HZ, GREY, LAST_HZ, magnitude_db, phase_deg
-from rigd.view._frequency_charts import (
+from rigd.view.frequency_charts import (
     COHERENCE,
+    FIRST_HZ,
+    LAST_HZ,
     MAGNITUDE,
     OVERVIEW_MAGNITUDE,
     PHASE,
     ResponseCharts,
+    magnitude_db,
+    phase_deg,
 )
+from rigd.view.plots import GREY
 
 GRID = np.arange(9601) / 160.0
 
