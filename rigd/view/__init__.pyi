@@ -9,7 +9,6 @@ from ._layout import chart_page as chart_page
 from ._layout import chart_view as chart_view
 from ._recorded import draw_session as draw_session
 from ._recorded import nominal_damping as nominal_damping
-from ._recorded import recorded_blueprint as recorded_blueprint
 from ._scene import Drawing as Drawing
 from ._scene import Scene as Scene
 from ._session_info import Health as Health

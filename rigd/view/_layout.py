@@ -131,18 +131,15 @@ def fit_views(source: Source) -> tuple[TimeView, ...]:
 
 
 def blueprint(
-    active_tab: str = TABS[0],
     *,
     absent: Collection[str] = (),
     fit_modes: int | None = None,
     fit_asked: bool = False,
 ) -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample, with one of its tabs in front.
+    """Return the layout, which follows the newest sample, with its first tab in front.
 
     Parameters
     ----------
-    active_tab
-        The tab in front.
     absent
         Components of plots that are left out, for nothing of theirs comes.
     fit_modes
@@ -167,7 +164,7 @@ def blueprint(
     for tab, name in zip(contents, names, strict=True):
         tab.name = name
     return rrb.Blueprint(
-        rrb.Tabs(*contents, active_tab=names.index(active_tab)),
+        rrb.Tabs(*contents, active_tab=0),
         rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
