@@ -31,15 +31,9 @@ from rigd.engine import (
 )
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
-from rigd.live._ring_reader import (
-    Intake,
-    LiveEnd,
-    LiveFit,
-    LiveSession,
-    LiveShown,
-    LiveTouches,
-)
+from rigd.live._ring_reader import Intake
 from rigd.live._server import Outlet
+from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import last_look, look_path, read_look, touch_line
 from rigd.view import Health, Note, outcome_note
@@ -60,7 +54,7 @@ from rigd.view.frequency_charts import LastResponse
 from rigd.view.rrd_file import settle_sdk
 
 if TYPE_CHECKING:
-    from rigd.live._ring_reader import LiveJob
+    from rigd.live.messages import LiveJob
     from rigd.view import Drawing
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
-from rigd.live import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.live.address import LiveAddress
+from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
