@@ -36,7 +36,7 @@ from analysis.models import (
     weights,
 )
 from analysis.paper import fit_many
-from analysis.report import write_campaign
+from analysis.report.campaign_report import write_campaign
 
 SESSIONS = 20
 JOBS = 2

@@ -80,7 +80,8 @@ def campaign_command(
         Something cannot be written.
     """
     from analysis.campaigns import campaign
-    from analysis.report import campaign_document, campaign_tables, document_text
+    from analysis.report import campaign_document, document_text
+    from analysis.report.campaign_report import campaign_tables
     from analysis.report.folder import report_folders, write_new
 
     first = files[0] if outputs.report is not None else files[0].with_name(_NAME)
@@ -116,7 +117,7 @@ def _analysed(
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from analysis.campaigns import LoneSessionError
-    from analysis.report import write_campaign
+    from analysis.report.campaign_report import write_campaign
     from analysis.report.folder import new_folder
     from rigd.printable import progress_bar
 

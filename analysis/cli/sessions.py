@@ -224,7 +224,7 @@ def _told(file: Path, error: Exception) -> str:
 
 def _steps(routes: Routes, rerun: Path | None) -> int:
     from analysis.report import FIGURES as OF_RECORD
-    from analysis.report import figures_of_paper
+    from analysis.report.record_report import figures_of_paper
 
     figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
     pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
@@ -242,8 +242,8 @@ def _analyse_file(
     *,
     overwrite: bool,
 ) -> RecordResult:
-    from analysis.report import write_report
     from analysis.report.folder import new_folder
+    from analysis.report.record_report import write_report
     from analysis.results import record_result
 
     result = record_result(

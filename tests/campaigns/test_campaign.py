@@ -14,10 +14,10 @@ from analysis.campaigns._validation import forecasts, left_out_errors
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
-from analysis.report import campaign_document, campaign_tables, write_campaign
-from analysis.report._campaign_report import campaign_text
+from analysis.report import campaign_document
 from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
 from analysis.report._text import as_text
+from analysis.report.campaign_report import campaign_tables, campaign_text, write_campaign
 from analysis.report.table import json_rows
 from analysis.results import whole_record
 from rigd.beam import modes

@@ -14,8 +14,8 @@ from analysis.campaigns._experiment import stated_specimens
 from analysis.campaigns._homogeneity import groups, homogeneity
 from analysis.report import campaign_document
 from analysis.report._campaign_figures import pooled_figure
-from analysis.report._campaign_report import campaign_page, campaign_text
 from analysis.report._campaign_tables import all_tables
+from analysis.report.campaign_report import campaign_page, campaign_text
 from analysis.report.table import json_rows
 from rigd.beam import undamped_frequencies_rad_s
 

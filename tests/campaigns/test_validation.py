@@ -15,7 +15,7 @@ from analysis.cli.sessions import Outputs
 from analysis.identify import BAND_HZ
 from analysis.report import campaign_document
 from analysis.report._campaign_figures import validation_figure
-from analysis.report._campaign_report import campaign_page, campaign_text
+from analysis.report.campaign_report import campaign_page, campaign_text
 
 
 def ends_at_one(path, tried, band_hz):
@@ -82,7 +82,7 @@ def test_terminal_page_and_files_account_for_it(shaken):
 
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
-    monkeypatch.setattr("analysis.report.write_campaign", lambda *_, **__: None)
+    monkeypatch.setattr("analysis.report.campaign_report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
     outputs = Outputs(report=tmp_path / "new")
     code = campaign_command(paths, shaken.settings, outputs, structures=("III",))

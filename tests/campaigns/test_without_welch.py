@@ -11,8 +11,7 @@ import pytest
 from analysis.campaigns import SessionFailure, SessionTask, analyse_session, campaign
 from analysis.campaigns._campaign import _of_one_experiment
 from analysis.models import WelchSettings
-from analysis.report import write_campaign
-from analysis.report._campaign_report import campaign_page, campaign_text
+from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
 
 @pytest.fixture(scope="module")

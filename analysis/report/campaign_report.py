@@ -95,7 +95,15 @@ def campaign_tables(
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
-    """Return the same as plain text, with the files that were left out."""
+    """Return the tables as plain text, with the files that were left out.
+
+    Parameters
+    ----------
+    campaign : CampaignResult
+        The results.
+    with_paper : bool
+        Whether the paper's numbers are shown with them.
+    """
     left_out = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
     return as_text(Group(campaign_tables(campaign, with_paper=with_paper), *left_out))
 
