@@ -13,7 +13,5 @@ from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
 from ._shown_model import ShownModel as ShownModel
-from ._text import analysis_tables as analysis_tables
-from ._text import record_text as record_text
 from ._text import result_text as result_text
 from ._text import summary_table as summary_table
