@@ -189,8 +189,9 @@ def _model(told: Headline, record: Record, shown_hz: Sequence[float]) -> dict[st
     """
     import numpy as np
 
-    from analysis.report import ShownModel, dense_grid
-    from rigd.view import response_thinning
+    from analysis.report import ShownModel
+    from analysis.report.bands import dense_grid
+    from rigd.view.frequency_charts import response_thinning
 
     if not told.explained or told.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
@@ -215,7 +216,7 @@ def _response(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], li
     from analysis.models import LARGEST_SHARE_OF_RATE
     from analysis.suited import against_welch
     from rigd.spectral import SpectralError, segmentation_of
-    from rigd.view import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
+    from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
 
     last_hz = min(LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
@@ -375,7 +376,7 @@ def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str
 
 def _text(document: Mapping[str, Any]) -> Iterator[str]:
     """Say it in a few lines for a terminal."""
-    from rigd.view import LOW_COHERENCE
+    from rigd.view.frequency_charts import LOW_COHERENCE
 
     specimen = f" ({document['specimen']})" if document["specimen"] else ""
     # What it leaves out: scale of the torque, length and density of the beam.

@@ -25,7 +25,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.campaigns import SessionTask, analyse_session, campaign, process_pool
+from analysis.campaigns import SessionTask, analyse_session, campaign
+from analysis.campaigns.workers import process_pool
 from analysis.identify import BAND_HZ
 from analysis.models import (
     STRUCTURES,
@@ -35,7 +36,7 @@ from analysis.models import (
     weights,
 )
 from analysis.paper import fit_many
-from analysis.report import write_campaign
+from analysis.report.campaign_report import write_campaign
 
 SESSIONS = 20
 JOBS = 2

@@ -73,7 +73,8 @@ from analysis.exchange import write_session
 from analysis.identify import BAND_HZ, Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
-from analysis.report import document, loss_factors
+from analysis.report import document
+from analysis.report.bands import loss_factors
 from analysis.results import RecordResult, WholeRecord
 
 if TYPE_CHECKING:

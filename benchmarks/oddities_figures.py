@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from analysis.identify import ResponseGrid
 from analysis.report import _style as style
-from analysis.report import loss_factors
+from analysis.report.bands import loss_factors
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,6 @@ from analysis.campaigns._experiment import (
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
 from analysis.campaigns._orders import freest_estimate
-from analysis.campaigns._pooling import PooledEstimate, PooledMode, pooled_estimates
 from analysis.campaigns._session import (
     SessionFailure,
     SessionResult,
@@ -35,7 +35,8 @@ from analysis.campaigns._statistics import (
 from analysis.campaigns._validation import FEWEST, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
-from analysis.campaigns._workers import Lost, available_cores, dask_cluster, process_pool
+from analysis.campaigns.pooling import PooledEstimate, PooledMode, pooled_estimates
+from analysis.campaigns.workers import Lost, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import worst
 
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
-    from analysis.campaigns._workers import Workers
+    from analysis.campaigns.workers import Workers
     from analysis.identify import Setting
     from rigd.session import Validity
 
@@ -135,6 +136,7 @@ def campaign(
     jobs: int | None = None,
     dask: str | None = None,
     uniformity: float | None = None,
+    workers: Workers | None = None,
     on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
 ) -> CampaignResult:
     """Analyse a campaign of sessions of one specimen on one rig.
@@ -163,6 +165,8 @@ def campaign(
     uniformity : float, optional
         Relative standard deviation of each mode's frequency from that of a uniform beam, in place
         of what the files state.
+    workers : Workers, optional
+        Workers that are ready already, in place of `jobs` and `dask`; they are left open.
     on_progress : callable, optional
         Called with the steps done, their number and a file's name.
 
@@ -189,13 +193,15 @@ def campaign(
         done += 1
         on_progress(done, total, name)
 
-    made: AbstractContextManager[Workers] = (
-        process_pool(min(jobs or available_cores(), len(paths)))
-        if dask is None
-        else dask_cluster(dask)
-    )
-    with made as workers:
-        results = workers.run(
+    made: AbstractContextManager[Workers]
+    if workers is not None:
+        made = nullcontext(workers)
+    elif dask is not None:
+        made = dask_cluster(dask)
+    else:
+        made = process_pool(min(jobs or available_cores(), len(paths)))
+    with made as ready:
+        results = ready.run(
             analyse_session, [(path, task) for path in paths], lambda i: step(paths[i].name)
         )
         sessions, failures = _of_one_experiment(
@@ -215,7 +221,7 @@ def campaign(
         if len(sessions) >= FEWEST:
             total = len(paths) + len(sessions)
             names = [session.path.name for session in sessions]
-            validation, lost = validate(workers, sessions, band_hz, lambda i: step(names[i]))
+            validation, lost = validate(ready, sessions, band_hz, lambda i: step(names[i]))
     return campaign_result(sessions, failures, validation, lost)
 
 

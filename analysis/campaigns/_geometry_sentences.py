@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns._sentences import in_single_sessions, probability
+from analysis.campaigns.sentences import in_single_sessions, probability
 from analysis.identify import EXACT_CONDITION, LOSSES, slope_of_loss
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import TolerantEstimate
 
 _BASES: Final = {

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._campaign import CampaignResult
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._statistics import RankedStructure
+    from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"

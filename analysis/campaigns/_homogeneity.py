@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._orders import common_structure, freest_estimate
-from analysis.campaigns._pooling import random_effects
+from analysis.campaigns.pooling import random_effects
 from analysis.identify import LOGARITHMIC
 from analysis.statistics import chi_square_p_value
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate
 
 Values = tuple[tuple[str, float, float], ...]
 """File, estimate and its standard deviation, session by session."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._pooling import PooledMode, random_effects
+from analysis.campaigns.pooling import PooledMode, random_effects
 from analysis.identify import (
     CONSTANTS,
     ModalEstimate,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns._pooling import RandomEffects
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import RandomEffects
 
 _FEWEST: Final = 2
 _NEARLY_ALL: Final = 0.9

@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns._pooling import by_structure
+from analysis.campaigns.pooling import by_structure
 from analysis.identify import STRONG, WIDEST_SHARE, tolerant_status, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._pooling import PooledEstimate, PooledParameter
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate, PooledParameter
     from analysis.identify import Order, TolerantEstimate, Verdict
 
 

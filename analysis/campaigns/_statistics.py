@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._pooling import by_structure, determines_damping, pooled_bic
+from analysis.campaigns.pooling import by_structure, determines_damping, pooled_bic
 from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
 from analysis.paper import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.campaigns._estimates import WelchFit
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate
     from analysis.models import Parameter
     from analysis.paper import Indices, Peak
     from rigd.beam import Beam, Damping

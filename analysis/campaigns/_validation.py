@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import CampaignError, task_errors
-from analysis.campaigns._pooling import pooled_estimates
 from analysis.campaigns._statistics import mean_damping
-from analysis.campaigns._workers import Lost
+from analysis.campaigns.pooling import pooled_estimates
+from analysis.campaigns.workers import Lost
 from analysis.identify import Measurement, Plant
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.campaigns._session import SessionResult
-    from analysis.campaigns._workers import Workers
+    from analysis.campaigns.workers import Workers
 
 FEWEST: Final = 3
 """Sessions from which each can be predicted from the others: two are the fewest to be pooled."""

@@ -9,8 +9,8 @@ from statistics import median_low
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns import _geometry_sentences as geometry
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns import _sentences as specimen_sentences
+from analysis.campaigns import sentences
+from analysis.campaigns import sentences as specimen_sentences
 from analysis.campaigns._modal import OppositeSweeps, opposite_sweeps
 from analysis.campaigns._orders import (
     PooledOrder,
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._modal import PooledModal
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import WelchBias
+    from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import Finding, Verdict
 
 

@@ -19,8 +19,8 @@ from analysis.statistics import student_t_quantile
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._session import SessionResult
+    from analysis.campaigns.pooling import PooledEstimate
 
 LARGEST_MISFIT: Final = 1.5
 """Residual, in units of the noise, above which a structure does not describe the records."""

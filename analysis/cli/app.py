@@ -272,7 +272,7 @@ def analyze(
     Estimates the frequency response from motor angle to coupling torque, fits the fractional
     damping models to it, and prints and draws the results.
     """
-    from analysis.report import OutputError, OutputExistsError, check_new_file
+    from analysis.report.folder import OutputError, OutputExistsError, check_new_file
 
     try:
         files = session_files(files)

@@ -80,13 +80,9 @@ def campaign_command(
         Something cannot be written.
     """
     from analysis.campaigns import campaign
-    from analysis.report import (
-        campaign_document,
-        campaign_tables,
-        document_text,
-        report_folders,
-        write_new,
-    )
+    from analysis.report import campaign_document, document_text
+    from analysis.report.campaign_report import campaign_tables
+    from analysis.report.folder import report_folders, write_new
 
     first = files[0] if outputs.report is not None else files[0].with_name(_NAME)
     (folder,) = report_folders([first], outputs.report, overwrite=outputs.overwrite)
@@ -121,7 +117,8 @@ def _analysed(
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from analysis.campaigns import LoneSessionError
-    from analysis.report import new_folder, write_campaign
+    from analysis.report.campaign_report import write_campaign
+    from analysis.report.folder import new_folder
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:

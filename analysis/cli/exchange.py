@@ -403,7 +403,7 @@ def _explained(run: Callable[[], None]) -> int:
     from analysis.linear_model import LinearModelError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
-    from analysis.report import OutputError, OutputExistsError
+    from analysis.report.folder import OutputError, OutputExistsError
     from rigd.identified_beam import IdentifiedBeamError
     from rigd.session import SessionError, SessionExistsError
 

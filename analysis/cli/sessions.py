@@ -124,7 +124,8 @@ def session_command(
     OutputExistsError, OutputError
         Something cannot be written.
     """
-    from analysis.report import document, document_text, report_folders, write_new
+    from analysis.report import document, document_text
+    from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
     found, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
@@ -177,7 +178,7 @@ def _analyse_all(
     from analysis.identify import MeasurementError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
-    from analysis.report import OutputError
+    from analysis.report.folder import OutputError
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
@@ -223,7 +224,7 @@ def _told(file: Path, error: Exception) -> str:
 
 def _steps(routes: Routes, rerun: Path | None) -> int:
     from analysis.report import FIGURES as OF_RECORD
-    from analysis.report import figures_of_paper
+    from analysis.report.record_report import figures_of_paper
 
     figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
     pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
@@ -241,7 +242,8 @@ def _analyse_file(
     *,
     overwrite: bool,
 ) -> RecordResult:
-    from analysis.report import new_folder, write_report
+    from analysis.report.folder import new_folder
+    from analysis.report.record_report import write_report
     from analysis.results import record_result
 
     result = record_result(

@@ -51,7 +51,12 @@ def touch_command(
     Takes the touches that were detected during a session; in a session without any it looks for
     them in the record.
     """
-    from analysis.report import OutputError, OutputExistsError, check_new_file, report_folders
+    from analysis.report.folder import (
+        OutputError,
+        OutputExistsError,
+        check_new_file,
+        report_folders,
+    )
     from rigd.identified_beam import IdentifiedBeamError
 
     outputs = Outputs(report, json)
@@ -75,14 +80,13 @@ def touch_command(
 
 
 def _analyse(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int:
-    from analysis.report import (
-        document_text,
-        new_folder,
+    from analysis.report import document_text
+    from analysis.report.folder import new_folder, write_new
+    from analysis.report.table import terminal_table
+    from analysis.report.touch_report import (
         session_lines,
-        terminal_table,
         touches_document,
         touches_table,
-        write_new,
         write_touch_report,
     )
 

@@ -10,7 +10,7 @@ import rigd
 from analysis.exchange._model_files import MODEL_FORMATS
 from analysis.exchange._source import TargetError
 from analysis.exchange._table import frf_table, record_table
-from analysis.report import OutputError, check_new_file
+from analysis.report.folder import OutputError, check_new_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
@@ -48,7 +48,7 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Table
         If the ending is unknown, or `binary` is not for it.
     ExchangeError
         If the record does not fit the format, or a library is missing.
-    analysis.report._folder.OutputExistsError, analysis.report._folder.OutputError
+    analysis.report.folder.OutputExistsError, analysis.report.folder.OutputError
         If the file exists or cannot be written.
     rigd.session.SessionError
         If the session cannot be read.
@@ -122,7 +122,7 @@ def export_model(
     ------
     TargetError
         If the ending is unknown.
-    analysis.report._folder.OutputExistsError, analysis.report._folder.OutputError
+    analysis.report.folder.OutputExistsError, analysis.report.folder.OutputError
         If the file exists or cannot be written.
     analysis.linear_model.LinearModelError, rigd.identified_beam.IdentifiedBeamError
         If there is no such model, or it cannot be realised.

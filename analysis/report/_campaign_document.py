@@ -9,7 +9,7 @@ from analysis.campaigns import headlines
 from analysis.models import STRUCTURES
 from analysis.report._campaign_tables import all_tables
 from analysis.report._document import versions
-from analysis.report._table import json_rows
+from analysis.report.table import json_rows
 from analysis.results import finite
 
 if TYPE_CHECKING:

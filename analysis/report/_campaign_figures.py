@@ -6,22 +6,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.campaigns import (
-    MIXTURE_MARK,
-    best_models,
-    by_model,
-    label,
-    probability,
-    title,
-    with_unit,
-)
+from analysis.campaigns import best_models, by_model
+from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, title, with_unit
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_text
 from analysis.report._pooled_tables import exactly, used
-from analysis.report._table import MARK, unreported
-from rigd.view import magnitude_db, phase_deg
+from analysis.report.table import MARK, unreported
+from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns import CampaignResult, NominalModel, PooledParameter, SessionResult
+    from analysis.campaigns import CampaignResult, NominalModel, SessionResult
+    from analysis.campaigns.pooling import PooledParameter
 
 _PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.campaigns import by_model, label, lost_trials
+from analysis.campaigns import by_model
+from analysis.campaigns.sentences import label, lost_trials
 from analysis.report._paper_tables import NAMES, paper_tables
 from analysis.report._pooled_tables import (
     homogeneity_table,
@@ -22,7 +23,7 @@ from analysis.report._pooled_tables import (
     tolerant_table,
     uniform_beam_table,
 )
-from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
+from analysis.report.table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
 from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 

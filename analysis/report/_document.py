@@ -20,9 +20,9 @@ import rigd
 from analysis.identify import ResponseGrid
 from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
-from analysis.report._bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report._shown_model import ShownModel
-from analysis.report._table import unreported
+from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
+from analysis.report.table import unreported
 from analysis.results import finite
 from analysis.statistics import nrmse_percent
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from analysis.identify import DampingSize, RecordFit
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
-    from analysis.report._bands import LossFactor
+    from analysis.report.bands import LossFactor
     from analysis.results import RecordResult, WholeRecord
     from rigd.spectral import FrequencyResponse
 

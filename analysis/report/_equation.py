@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from analysis.identify import BACKGROUND
 from analysis.models import STRUCTURES
-from analysis.report._table import ABSENT, WORDS, Column, Table
+from analysis.report.table import ABSENT, WORDS, Column, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ from analysis.identify import EXACT_CONDITION
 from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._document import response_fit_percent
-from analysis.report._table import (
+from analysis.report.table import (
     ABSENT,
     WORDS,
     Cell,

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns import best_models, title
+from analysis.campaigns import best_models
+from analysis.campaigns.sentences import title
 from analysis.models import STRUCTURES, estimate_text
-from analysis.report._table import (
+from analysis.report.table import (
     MARK,
     WORDS,
     Cell,

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns import title
+from analysis.campaigns.sentences import title
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
-from analysis.report._bands import dense_grid, loss_factors, response_band
 from analysis.report._campaign_figures import INTERVAL, SESSION, draw_session, shown_sessions
 from analysis.report._pooled_tables import exactly, used
+from analysis.report.bands import dense_grid, loss_factors, response_band
 from analysis.statistics import NORMAL_95, student_t_quantile
-from rigd.view import magnitude_db, phase_deg
+from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.campaigns import CampaignResult, PooledEstimate, PooledMode
+    from analysis.campaigns import CampaignResult
+    from analysis.campaigns.pooling import PooledEstimate, PooledMode
     from analysis.identify import ModeEstimate, Plant
     from analysis.models import Structure
 
@@ -38,7 +39,7 @@ _BESIDE: Final = 1.6
 
 @dataclass(frozen=True, slots=True)
 class _PooledFit:
-    """Pooled estimate as `analysis.report._bands` takes an estimate."""
+    """Pooled estimate as `analysis.report.bands` takes an estimate."""
 
     structure: Structure
     plant: Plant

@@ -5,21 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import (
+from analysis.campaigns import campaign_numbers, in_dispute, told
+from analysis.campaigns.sentences import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
-    campaign_numbers,
-    in_dispute,
     label,
     percent,
     probability,
     title,
-    told,
     with_unit,
 )
 from analysis.identify import EXACT_CONDITION
 from analysis.models import STRUCTURES
-from analysis.report._table import (
+from analysis.report.table import (
     MARK,
     WORDS,
     Cell,
@@ -40,14 +38,8 @@ from rigd.units import decimals
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from analysis.campaigns import (
-        CampaignResult,
-        Heterogeneity,
-        Homogeneity,
-        PooledEstimate,
-        PooledParameter,
-        RankedStructure,
-    )
+    from analysis.campaigns import CampaignResult, Heterogeneity, Homogeneity, RankedStructure
+    from analysis.campaigns.pooling import PooledEstimate, PooledParameter
 
 _PARTICIPATION: Final = (
     Column("inertia (10⁻⁶ kg·m²)", "participation_kg_m2"),

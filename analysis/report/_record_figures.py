@@ -22,13 +22,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from analysis.identify import fast_length
 from analysis.report import _style as style
-from analysis.report._bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
 from analysis.report._shown_model import ShownModel
 from analysis.report._uniformity import UNIFORMITY, uniformity_description, uniformity_figure
+from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
-from rigd.view import magnitude_db, phase_deg
+from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Headline, ModeEstimate, RecordAnalysis
-    from analysis.report._bands import Estimate, ResponseBand
+    from analysis.report.bands import Estimate, ResponseBand
     from analysis.results import WholeRecord
     from rigd.spectral import FrequencyResponse
 

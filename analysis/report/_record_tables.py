@@ -9,7 +9,7 @@ from analysis.identify import EXACT_CONDITION
 from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
-from analysis.report._table import (
+from analysis.report.table import (
     MARK,
     WORDS,
     Cell,

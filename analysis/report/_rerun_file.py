@@ -8,37 +8,34 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.report._folder import OutputError, OutputExistsError
 from analysis.report._shown_model import ShownModel
 from analysis.report._text import analysis_tables, as_text, damping_sentences, record_tables
+from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
-from rigd.view import (
+from rigd.view import chart_page, chart_view
+from rigd.view.chart import Chart, Key, Thinning
+from rigd.view.frequency_charts import (
     COHERENCE_AXIS,
     COHERENCE_KEY,
+    MEASURED_KEY,
+    PHASE_AXIS,
+    magnitude_axis,
+    magnitude_db,
+    phase_deg,
+    response_chart,
+)
+from rigd.view.plots import (
     GREEN,
     GREY,
-    MEASURED_KEY,
     ORANGE,
-    PHASE_AXIS,
     PURPLE,
     SKY_BLUE,
     TIMELINE,
     VERMILION,
-    Chart,
     Color,
-    Key,
-    RrdFileError,
-    Thinning,
-    chart_page,
-    chart_view,
-    check_new,
-    magnitude_axis,
-    magnitude_db,
-    new_rrd_file,
-    phase_deg,
-    response_chart,
     send_columns,
 )
+from rigd.view.rrd_file import RrdFileError, check_new, new_rrd_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -51,7 +48,7 @@ if TYPE_CHECKING:
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.report._signal_figures import TorqueInBand
     from analysis.results import RecordResult, WholeRecord
-    from rigd.view import Axis
+    from rigd.view.chart import Axis
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]

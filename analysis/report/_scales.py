@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.identify import SCALE_EXPONENTS, density_check, scales_absorbed
 from analysis.models import QUANTITIES
-from analysis.report._table import estimate
+from analysis.report.table import estimate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

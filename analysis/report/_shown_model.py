@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.identify import ModeEstimate, RecordAnalysis
-from analysis.report._bands import modal_response_band, response_band
+from analysis.report.bands import modal_response_band, response_band
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Headline, ModalFit, ModalModel, Plant, RecordFit
     from analysis.record import Record
-    from analysis.report._bands import ResponseBand
+    from analysis.report.bands import ResponseBand
 
     Real = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
 from analysis.models import QUANTITIES, STRUCTURES
-from analysis.report._folder import write_new
+from analysis.report.folder import write_new
 from analysis.results import FIGURE_FORMATS
-from rigd.view import magnitude_db
+from rigd.view.frequency_charts import magnitude_db
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence

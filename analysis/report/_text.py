@@ -13,7 +13,7 @@ from rich.text import Text
 from analysis.identify import EXACT_CONDITION, MISREAD
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
-from analysis.report._table import MARK, estimate, terminal_table
+from analysis.report.table import MARK, estimate, terminal_table
 from analysis.suited import LEFT_OUT
 from rigd.printable import listed
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from analysis.identify import Headline, Mode, Quantity, Size
-    from analysis.report._table import Table
+    from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
 
 _WIDTH: Final = 120

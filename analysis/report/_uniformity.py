@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import CONSTANTS
 from analysis.report import _style as style
-from analysis.report._table import WORDS, Cell, Column, Table, estimate, number
+from analysis.report.table import WORDS, Cell, Column, Table, estimate, number
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import UniformBeamTest
-    from analysis.report._table import Entry
+    from analysis.report.table import Entry
 
 UNIFORMITY: Final = "uniform_beam"
 """Name of the figure."""

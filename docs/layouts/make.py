@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.view import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
+from rigd.view.plots import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

@@ -14,10 +14,11 @@ import typer
 
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, progress
 from rigd.runtime import raise_on
-from rigd.view import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
+from rigd.view.rrd_file import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
 
 if TYPE_CHECKING:
-    from rigd.live import LiveAddress, Viewer
+    from rigd.live import Viewer
+    from rigd.live.address import LiveAddress
 
 
 _LOOK_S = 0.5

@@ -14,7 +14,7 @@ from typing import Any
 
 from rigd.engine.processes import PROCESSES
 from rigd.engine.shared_state import Phase
-from rigd.live import LiveAddress
+from rigd.live.address import LiveAddress
 from rigd.runner.signal_blocks import SignalBlock
 from rigd.runner.status import ProcessStatus, RigStatus
 

@@ -15,8 +15,8 @@ from typing import Any, Self
 
 from rigd.daemon.address import peer_of, running
 from rigd.errors import FailureError, RigdError
-from rigd.live import LiveAddress
-from rigd.live import running as running_views
+from rigd.live.address import LiveAddress
+from rigd.live.address import running as running_views
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.processes import read_process, read_processes, send_signal
 

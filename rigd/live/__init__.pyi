@@ -1,12 +1,5 @@
-from ._address import LiveAddress as LiveAddress
-from ._address import running as running
-from ._program import RerunError as RerunError
-from ._ring_reader import LiveEnd as LiveEnd
-from ._ring_reader import LiveFit as LiveFit
-from ._ring_reader import LiveJob as LiveJob
-from ._ring_reader import LiveSession as LiveSession
-from ._ring_reader import LiveShown as LiveShown
-from ._ring_reader import LiveTouches as LiveTouches
+from . import address as address
+from . import messages as messages
 from ._viewer import PageOfFile as PageOfFile
 from ._viewer import Viewer as Viewer
 from ._viewer import Window as Window

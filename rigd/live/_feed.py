@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.live._server import Outlet
-from rigd.view import APPLICATION_ID
+from rigd.view.plots import APPLICATION_ID
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

@@ -20,7 +20,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from rigd.live._address import LOOPBACK, LiveAddress
+from rigd.live.address import LOOPBACK, LiveAddress
 
 PAGE_PORT: Final = 9090
 """Rerun's own, unless another process uses it."""

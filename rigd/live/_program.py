@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 from rigd.errors import FailureError
-from rigd.live._address import LOOPBACK
-from rigd.view import without_settings
+from rigd.live.address import LOOPBACK
+from rigd.view.rrd_file import without_settings
 
 _NOWHERE = f"http://{LOOPBACK}:9"
 """The discard port, on which no process listens."""

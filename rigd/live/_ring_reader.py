@@ -1,107 +1,19 @@
-"""Reader of a session's rings for the live view, and what the publisher is told of a session."""
+"""Reader of a session's rings for the live view."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rigd.engine import Observer, Ring
-from rigd.engine.channels import EVENT, SAMPLE, TIMING, TOPICS, Channels, ChannelSpecs
+from rigd.engine.channels import EVENT, SAMPLE, TIMING, TOPICS, Channels
 from rigd.engine.shared_state import read_events
+from rigd.live.messages import LiveSession
 from rigd.session.layout import decode_samples, decode_timings
-from rigd.view import LastResponse, Note, Scene, Subject
+from rigd.view import Note, Scene
+from rigd.view.frequency_charts import LastResponse
 
 if TYPE_CHECKING:
     from rigd.view import Drawing
-
-
-# Jobs of the publisher
-
-
-@dataclass(frozen=True, slots=True)
-class LiveJob:
-    """The rig whose sessions are shown.
-
-    Attributes
-    ----------
-    rig
-        The profile's name, by which the view is found.
-    channels
-        The shared memory of the rig's processes.
-    linger_s
-        How long the view stays open after the last session.
-    """
-
-    rig: str
-    channels: ChannelSpecs
-    linger_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class LiveSession:
-    """A session to show.
-
-    Attributes
-    ----------
-    subject
-        What the views need to know of it.
-    recording_id
-        By which viewers tell it from others; the same for a publisher that takes it over.
-    begins
-        How many records had been written to each ring before it, in the order of
-        :data:`rigd.engine.channels.TOPICS`.
-    folder
-        Folder of its file, where the sessions before it are; None: it is not known.
-    """
-
-    subject: Subject
-    recording_id: str
-    begins: tuple[int, ...]
-    folder: Path | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LiveTouches:
-    """Estimates of touches in the session that is shown."""
-
-    touches: tuple[Mapping[str, Any], ...]
-    """As in JSON documents; a later estimate of a touch takes the place of an earlier one."""
-
-
-@dataclass(frozen=True, slots=True)
-class LiveFit:
-    """Fit of the record so far, of the session that is shown."""
-
-    fit: Mapping[str, Any]
-    """As in JSON documents; it takes the place of the one before."""
-
-
-@dataclass(frozen=True, slots=True)
-class LiveEnd:
-    """The end of a session that is shown.
-
-    Attributes
-    ----------
-    ends
-        How many records each ring had then, as :attr:`LiveSession.begins`.
-    outcome, reason
-        How the session ended, if that is known.
-    """
-
-    ends: tuple[int, ...]
-    outcome: str = ""
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class LiveShown:
-    """A session is shown from now on."""
-
-    recording_id: str
-    """That of its :class:`LiveSession`."""
-
-
-# Rings
 
 Records = TypeVar("Records")
 

@@ -10,9 +10,9 @@ import time
 from contextlib import suppress
 from typing import Final
 
-from rigd.live._address import LOOPBACK, LiveAddress, announce, withdraw
 from rigd.live._page import serve_page
 from rigd.live._program import RerunError, RerunProgram
+from rigd.live.address import LOOPBACK, LiveAddress, announce, withdraw
 
 GRPC_PORT: Final = 9876
 """Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""

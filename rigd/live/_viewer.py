@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import Final, Self
 
-from rigd.live._address import LiveAddress, proxy_url
 from rigd.live._page import serve_page
 from rigd.live._program import RerunError, RerunProgram
 from rigd.live._server import GRPC_PORT, free_port
+from rigd.live.address import LiveAddress, proxy_url
 from rigd.runtime.addresses import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"

@@ -22,19 +22,14 @@ from rigd.engine.processes import Parent, Pulse
 from rigd.engine.shared_state import Activity, Phase, Word, activity
 from rigd.live._feed import Feed
 from rigd.live._program import RerunError
-from rigd.live._ring_reader import (
-    Intake,
-    LiveEnd,
-    LiveFit,
-    LiveSession,
-    LiveShown,
-    LiveTouches,
-)
+from rigd.live._ring_reader import Intake
 from rigd.live._server import Outlet
+from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.quick_look import last_look, look_path, read_look
 from rigd.session.touches import touch_line
-from rigd.view import (
+from rigd.view import Health, Note, outcome_note
+from rigd.view.banner import (
     FINISHING,
     RETURNING,
     RUNNING,
@@ -43,18 +38,15 @@ from rigd.view import (
     SUPERVISOR_LOST_TORQUE_OFF,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    Health,
-    LastResponse,
-    Note,
     State,
     ended,
-    outcome_note,
     preparing,
-    settle_sdk,
 )
+from rigd.view.frequency_charts import LastResponse
+from rigd.view.rrd_file import settle_sdk
 
 if TYPE_CHECKING:
-    from rigd.live._ring_reader import LiveJob
+    from rigd.live.messages import LiveJob
     from rigd.view import Drawing
 
 

@@ -12,12 +12,14 @@ from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine.messages import Failed
 from rigd.engine.processes import LIVE, ChildError, Pulse
 from rigd.engine.shared_state import Event, Level, Word
-from rigd.live import LiveAddress, LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
+from rigd.live.address import LiveAddress
+from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
 from rigd.runtime import StopRequest
-from rigd.view import OF_A_BUS, OF_REAL_TIME, Subject, band_of, sweep_of
+from rigd.view import Subject, band_of, sweep_of
+from rigd.view.plots import OF_A_BUS, OF_REAL_TIME
 
 _PATIENCE_S = 10.0
 """It takes its time to start: a session waits so long for it."""

@@ -15,7 +15,7 @@ from rigd.engine import Observer, Ring
 from rigd.engine.channels import TOPICS
 from rigd.engine.processes import PROCESSES, SUPERVISOR, Pulse
 from rigd.engine.shared_state import Activity, Phase, Word, activity
-from rigd.live import LiveAddress
+from rigd.live.address import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
 from rigd.units import with_half_width
-from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

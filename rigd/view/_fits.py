@@ -15,8 +15,8 @@ import numpy.typing as npt
 from rigd.session import Validity
 from rigd.session.online_fit import unseen_modes
 from rigd.units import suffix_of, unit_of, with_half_width, with_share
-from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
 from rigd.view._session_info import plain
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.view import _antenna as antenna
-from rigd.view import _banner
-from rigd.view import _plots as plots
+from rigd.view import banner, plots
 from rigd.view._fits import TABLE as FIT_TABLE
 from rigd.view._fits import fit_source
-from rigd.view._frequency_charts import (
+from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view.frequency_charts import (
     COHERENCE,
     MAGNITUDE,
     OVERVIEW_MAGNITUDE,
@@ -32,9 +32,8 @@ from rigd.view._frequency_charts import (
     SIZES,
     SPECTROGRAM,
 )
-from rigd.view._frequency_charts import SIZE as SPECTROGRAM_SIZE
-from rigd.view._plots import TIMELINE, Plot, Source, Values, send_columns
-from rigd.view._session_info import EVENTS, RECENT_EVENTS, SUMMARY
+from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
+from rigd.view.plots import TIMELINE, Plot, Source, Values, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -132,18 +131,15 @@ def fit_views(source: Source) -> tuple[TimeView, ...]:
 
 
 def blueprint(
-    active_tab: str = TABS[0],
     *,
     absent: Collection[str] = (),
     fit_modes: int | None = None,
     fit_asked: bool = False,
 ) -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample, with one of its tabs in front.
+    """Return the layout, which follows the newest sample, with its first tab in front.
 
     Parameters
     ----------
-    active_tab
-        The tab in front.
     absent
         Components of plots that are left out, for nothing of theirs comes.
     fit_modes
@@ -168,7 +164,7 @@ def blueprint(
     for tab, name in zip(contents, names, strict=True):
         tab.name = name
     return rrb.Blueprint(
-        rrb.Tabs(*contents, active_tab=names.index(active_tab)),
+        rrb.Tabs(*contents, active_tab=0),
         rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -178,7 +174,7 @@ def blueprint(
 def _overview() -> "rrb.Container":
     import rerun.blueprint as rrb
 
-    state, values = _banner.views()
+    state, values = banner.views()
     return rrb.Vertical(
         rrb.Horizontal(state, values, column_shares=[6, 7]),
         rrb.Horizontal(

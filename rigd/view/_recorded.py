@@ -16,11 +16,11 @@ from rigd.session.quick_look import fit_of
 from rigd.session.touches import touch_line, touches_of
 from rigd.text_table import decode_text
 from rigd.units import unit_of
-from rigd.view._banner import ended
 from rigd.view._layout import blueprint
-from rigd.view._plots import AGES, FAULTY_TICKS, HEALTH, OF_REAL_TIME, TIMELINE
 from rigd.view._scene import Scene
 from rigd.view._session_info import Health, Note, Subject, band_of, outcome_note, sweep_of
+from rigd.view.banner import ended
+from rigd.view.plots import AGES, FAULTY_TICKS, HEALTH, OF_REAL_TIME, TIMELINE
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

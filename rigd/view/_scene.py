@@ -9,20 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.spectral import RunningSpectrogram
-from rigd.view import _banner
+from rigd.view import banner
 from rigd.view._antenna import Antenna
-from rigd.view._banner import State, preparing
 from rigd.view._fits import fit_record, fit_source, send_table
-from rigd.view._frequency_charts import (
-    LAST_HZ,
-    LastResponse,
-    ResponseCharts,
-    SpectrogramChart,
-    SweepResponse,
-)
 from rigd.view._gauges import Gauge, Gauges
 from rigd.view._layout import TIME_VIEWS, Scale, blueprint, fit_views
-from rigd.view._plots import HEALTH, READINGS, SIGNALS, Source, send_columns
 from rigd.view._session_info import (
     Health,
     Note,
@@ -32,6 +23,15 @@ from rigd.view._session_info import (
     send_recent,
     send_summary,
 )
+from rigd.view.banner import State, preparing
+from rigd.view.frequency_charts import (
+    LAST_HZ,
+    LastResponse,
+    ResponseCharts,
+    SpectrogramChart,
+    SweepResponse,
+)
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, Source, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -232,13 +232,13 @@ class Scene:
     def _banner(self) -> list[Drawing]:
         """Draw the state, and the values beside their limits."""
         subject, t_ns, health = self._subject, self._health_ns, self._health
-        missed = _banner.missed_gauge(subject, t_ns, health)
+        missed = banner.missed_gauge(subject, t_ns, health)
         return [
             partial(
-                _banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
+                banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
             ),
             partial(
-                _banner.send_values,
+                banner.send_values,
                 state=self._state,
                 t_ns=t_ns,
                 gauges={**self._peaks, "missed": missed},

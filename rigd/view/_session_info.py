@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.session import sweep_frequency_hz
-from rigd.view._plots import TIMELINE
+from rigd.view.plots import TIMELINE
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

@@ -13,14 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
-from rigd.view import (
-    LAST_HZ,
-    Subject,
-    SweepResponse,
-    Thinning,
-    nominal_response,
-    response_thinning,
-)
+from rigd.view import Subject
+from rigd.view.chart import Thinning
+from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response, response_thinning
 
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]

@@ -7,14 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from analysis.campaigns import campaign
-from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns import (
+    RecordEstimate,
+    SessionResult,
+    WelchFit,
+    analyse_session,
+    campaign,
+)
 from analysis.campaigns._experiment import Experiment
-from analysis.campaigns._session import SessionResult
 from analysis.identify import ModeEstimate, Plant
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper._route import Indices, Peak
+from analysis.paper import Indices, Peak
 from rigd.beam import Beam, Damping
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
@@ -91,6 +96,37 @@ class Here:
             found.append(function(*task))
             on_done(number)
         return found
+
+
+class Prepared(Here):
+    """Workers of this process that have results of sessions already, in the order of the paths."""
+
+    def __init__(self, results):
+        self._results = results
+
+    def run(self, function, tasks, on_done=lambda _number: None):
+        if function is analyse_session:
+            return list(self._results)
+        return super().run(function, tasks, on_done)
+
+
+@pytest.fixture(scope="session")
+def campaign_of():
+    """Make the campaign of results that a test made up, of which there are no files to predict."""
+    return lambda results: campaign([each.path for each in results], workers=Prepared(results))
+
+
+@pytest.fixture(scope="session")
+def as_text():
+    """Return what a terminal of 120 columns shows, as plain text."""
+
+    def text(shown):
+        console = Console(width=120, color_system=None, force_terminal=False)
+        with console.capture() as capture:
+            console.print(shown)
+        return capture.get()
+
+    return text
 
 
 @pytest.fixture(scope="session")

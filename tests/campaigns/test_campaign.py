@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns._session import SessionTask, analyse_session
+from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
 from analysis.campaigns._validation import forecasts, left_out_errors
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
-from analysis.report._campaign_document import campaign_document
-from analysis.report._campaign_report import campaign_tables, campaign_text, write_campaign
+from analysis.report import campaign_document
 from analysis.report._campaign_tables import session_list_table, sessions_table, validation_summary
-from analysis.report._table import json_rows
-from analysis.report._text import as_text
+from analysis.report.campaign_report import campaign_tables, campaign_text, write_campaign
+from analysis.report.table import json_rows
 from analysis.results import whole_record
 from rigd.beam import modes
 
@@ -266,7 +264,7 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
             assert each.indices.md == pytest.approx(away.max(), rel=1e-6)
 
 
-def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(done):
+def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(done, as_text):
     found, _ = done
     short = as_text(campaign_tables(found, verbose=False))
     assert found.verdict.sentences[2][:60] in short

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.campaigns._homogeneity import homogeneity
 from analysis.campaigns._orders import common_structure
-from analysis.campaigns._pooling import pooled_estimates
+from analysis.campaigns.pooling import pooled_estimates
 
 FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
 FREQUENCY_HZ = 44.8132
@@ -40,16 +39,15 @@ def sessions(make_estimate, make_session):
     return [make(number) for number in range(40)]
 
 
-def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions):
+def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions, campaign_of):
     selected = {min(each.record_estimates, key=lambda one: one.bic).name for each in sessions}
     assert selected == {"VI", "VII"}
-    pooled = pooled_estimates(sessions)
-    found = homogeneity(sessions, pooled, ())
+    found = campaign_of(sessions).homogeneity
     assert (found.structure, found.mixed) == ("VI", False)
     assert found.of("frequency_hz_1").chance > 0.01
 
 
-def test_another_beam_among_them_is_still_told_apart(sessions):
+def test_another_beam_among_them_is_still_told_apart(sessions, campaign_of):
     moved = []
     for number, session in enumerate(sessions):
         by = 5e-4 * FREQUENCY_HZ if number >= 20 else 0.0
@@ -61,7 +59,7 @@ def test_another_beam_among_them_is_still_told_apart(sessions):
             for each in session.record_estimates
         )
         moved.append(replace(session, record_estimates=estimates))
-    found = homogeneity(moved, pooled_estimates(moved), ())
+    found = campaign_of(moved).homogeneity
     assert found.mixed
     assert sorted(map(len, found.leading.groups)) == [20, 20]
 

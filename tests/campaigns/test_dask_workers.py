@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns import _workers as dask_workers
-from analysis.campaigns._workers import Lost, dask_cluster, versions
+from analysis.campaigns import workers as dask_workers
+from analysis.campaigns.workers import Lost, dask_cluster, versions
 
 ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 

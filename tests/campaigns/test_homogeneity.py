@@ -3,40 +3,41 @@
 import math
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from analysis.campaigns import _sentences as specimen_sentences
-from analysis.campaigns import campaign
-from analysis.campaigns._campaign import campaign_result
-from analysis.campaigns._experiment import stated_specimens
-from analysis.campaigns._homogeneity import Homogeneity, groups, homogeneity
-from analysis.report._campaign_document import campaign_document
+from analysis.campaigns import SessionFailure, campaign
+from analysis.campaigns import sentences as specimen_sentences
+from analysis.report import campaign_document
 from analysis.report._campaign_figures import pooled_figure
-from analysis.report._campaign_report import campaign_page, campaign_text
-from analysis.report._campaign_tables import all_tables
-from analysis.report._table import json_rows
+from analysis.report.campaign_report import campaign_page, campaign_text
 from rigd.beam import undamped_frequencies_rad_s
 
 STIFFER = 1.03
 
 
-def of_frequencies(make_session, make_estimate, values, std):
+@pytest.fixture
+def of_frequencies(make_session, make_estimate, campaign_of):
     """Sessions whose first mode has these frequencies in Hz, each of its own std."""
-    sessions = []
-    for number, (value, own) in enumerate(np.broadcast(values, std)):
-        estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
-        mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=own)
-        sessions.append(
-            make_session(f"{number}.mcap", estimates=[replace(estimate, modes=(mode,))])
-        )
-    return homogeneity(sessions, (), ())
+
+    def found(values, std):
+        sessions = []
+        for number, (value, own) in enumerate(np.broadcast(values, std)):
+            estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
+            mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=own)
+            sessions.append(
+                make_session(f"{number}.mcap", estimates=[replace(estimate, modes=(mode,))])
+            )
+        return campaign_of(sessions).homogeneity
+
+    return found
 
 
-def test_scatter_by_hand(make_session, make_estimate):
+def test_scatter_by_hand(of_frequencies):
     """Two at -5 and two at 5 standard deviations: Q is 100 of 3, tau² = (100 - 3) / 3."""
-    found = of_frequencies(make_session, make_estimate, [2.45, 2.55, 2.45, 2.55], 0.01)
+    found = of_frequencies([2.45, 2.55, 2.45, 2.55], 0.01)
     frequency = found.leading
     assert frequency.quantity == "frequency_hz_1"
     assert frequency.cochran_q == pytest.approx(100.0)
@@ -53,44 +54,36 @@ def test_scatter_by_hand(make_session, make_estimate):
     assert "2.450 Hz in 2 files (0.mcap, 2.mcap); 2.550 Hz in 2 files" in where
 
 
-def test_sessions_that_repeat_are_of_one_specimen(make_session, make_estimate):
+def test_sessions_that_repeat_are_of_one_specimen(of_frequencies):
     """A thousand campaigns of five: no more false alarms than one in a hundred, and few more."""
     rng = np.random.default_rng(3)
-    alarms = sum(
-        of_frequencies(make_session, make_estimate, rng.normal(2.5, 0.01, 5), 0.01).mixed
-        for _ in range(1000)
-    )
+    alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).mixed for _ in range(1000))
     assert alarms <= 15
 
 
-def test_a_scatter_like_their_own_uncertainty_is_no_mixture(make_session, make_estimate):
+def test_a_scatter_like_their_own_uncertainty_is_no_mixture(of_frequencies):
     """It is what the random-effects model is for: significant in many, but no other specimen."""
     rng = np.random.default_rng(4)
-    found = [
-        of_frequencies(make_session, make_estimate, rng.normal(2.5, 0.015, 20), 0.01)
-        for _ in range(50)
-    ]
+    found = [of_frequencies(rng.normal(2.5, 0.015, 20), 0.01) for _ in range(50)]
     assert sum(each.of("frequency_hz_1").chance < 0.01 for each in found) > 25
     assert not any(each.mixed for each in found)
 
 
-def test_one_of_twenty_that_is_another_is_named(make_session, make_estimate):
+def test_one_of_twenty_that_is_another_is_named(of_frequencies):
     """Its share of the variance is small, the gap is not."""
     values = np.random.default_rng(5).normal(2.5, 0.01, 20)
     values[7] = 2.62
-    found = of_frequencies(make_session, make_estimate, values, 0.01)
+    found = of_frequencies(values, 0.01)
     assert found.leading.i_squared < 0.9
     assert found.leading.groups[1] == ("7.mcap",)
     assert "1 file (7.mcap)" in specimen_sentences.specimens(found)[1]
 
 
 @pytest.mark.parametrize(("apart_hz", "slight"), [(0.002, True), (0.02, False)])
-def test_many_standard_deviations_may_be_a_slight_change(
-    make_session, make_estimate, apart_hz, slight
-):
+def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, apart_hz, slight):
     """Both 20 standard deviations apart, but 0.08 % and 0.8 % of the frequency."""
     values = [2.5, 2.5, 2.5 + apart_hz, 2.5 + apart_hz]
-    found = of_frequencies(make_session, make_estimate, values, apart_hz / 20)
+    found = of_frequencies(values, apart_hz / 20)
     assert found.mixed
     said = " ".join(specimen_sentences.specimens(found))
     assert ("temperature or clamp changes" in said) == slight
@@ -105,11 +98,13 @@ def test_many_standard_deviations_may_be_a_slight_change(
         ([0.0, 10.0, 20.0, 30.0, 40.0, 50.0], ()),
     ],
 )
-def test_groups_are_told_only_where_gaps_are_clear(values, parts):
-    assert groups(np.array(values), np.ones(len(values))) == parts
+def test_groups_are_told_only_where_gaps_are_clear(of_frequencies, values, parts):
+    found = of_frequencies(2.5 + 1e-3 * np.array(values), 1e-3)
+    names = tuple(tuple(f"{number}.mcap" for number in part) for part in parts)
+    assert found.of("frequency_hz_1").groups == names
 
 
-def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate):
+def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate, campaign_of):
     sessions = []
     for folder, value in zip("abcd", (2.5, 2.6, 2.5, 2.6), strict=True):
         estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
@@ -117,18 +112,23 @@ def test_files_of_one_name_in_two_folders_are_two(make_session, make_estimate):
         sessions.append(
             make_session(f"/{folder}/x.mcap", estimates=[replace(estimate, modes=(mode,))])
         )
-    found = campaign_result(sessions).homogeneity
+    found = campaign_of(sessions).homogeneity
     _, where, *_ = specimen_sentences.specimens(found)
     assert "2.500 Hz in 2 files (a/x.mcap, c/x.mcap); 2.600 Hz in 2 files" in where
 
 
-def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
-    one = make_experiment("a", tool_inertia_kg_m2=0.0)
-    other = make_experiment("b", tool_inertia_kg_m2=1e-5)
-    stated = [("a", one), ("b", other), ("torn", None), ("c", one)]
-    first, second = stated_specimens(stated, one)
+def test_files_are_grouped_by_the_specimen_that_they_state(
+    make_session, make_experiment, campaign_of
+):
+    results = [
+        replace(make_session(name), experiment=make_experiment(name, tool_inertia_kg_m2=inertia))
+        for name, inertia in (("a", 0.0), ("b", 1e-5), ("c", 0.0))
+    ]
+    torn = SessionFailure(Path("torn"), "torn is incomplete.")
+    found = campaign_of([*results[:2], torn, results[2]]).homogeneity
+    first, second = found.specimens
     assert (first.files, second.files) == (("a", "c"), ("b",))
-    (said,) = specimen_sentences.specimens(Homogeneity((first, second), ()))
+    (said,) = specimen_sentences.specimens(found)
     assert (
         "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
         in said
@@ -194,7 +194,7 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
 @pytest.mark.further  # as made by hand above
 def test_what_agrees_is_not_marked_as_a_mixture(mixture):
     """Both beams are damped alike; their stiffness is not the same."""
-    rows = [row for row in json_rows(all_tables(mixture)["pooled"]) if row["type"] == "III"]
+    rows = [row for row in campaign_document(mixture)["pooled"] if row["type"] == "III"]
     mixed = {row["parameter"] for row in rows if row["mixture"]}
     assert "density_over_stiffness" in mixed
     assert not mixed & {"zeta", "gamma", "delay_s"}
@@ -229,7 +229,7 @@ def test_a_structure_that_none_selects_nor_determines_has_its_row(mixture):
     assert four.determined < 2
     assert four.bic_above_lowest > 1000
     assert sum(each.selected_alone for each in mixture.structures) == 4
-    tables = {name: json_rows(table) for name, table in all_tables(mixture).items()}
+    tables = campaign_document(mixture)
     (written,) = (row for row in tables["structures"] if row["type"] == "IV")
     assert (written["fitted"], written["selected_alone"]) == (4, 0)
     pooled = [row for row in tables["pooled"] if row["type"] == "IV"]

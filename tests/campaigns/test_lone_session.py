@@ -7,8 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from analysis.campaigns._pooling import pooled_bic
-from analysis.campaigns._statistics import ranked_structures
+from analysis.campaigns.pooling import pooled_bic
 
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50",
@@ -67,13 +66,15 @@ def test_samples_that_two_files_have_in_common_count_once(
     assert "whole.mcap is reported alone" in result.stderr
 
 
-def test_one_whole_record_of_several_sessions_is_ranked_by_itself(make_estimate, make_session):
+def test_one_whole_record_of_several_sessions_is_ranked_by_itself(
+    make_estimate, make_session, campaign_of
+):
     """The others' could not be used; with nothing to share, BIC is the session's own."""
     one = make_estimate(
         "III", {"zeta": 3e-4, "gamma": 0.2}, np.diag([1e-12, 1e-6]), ("zeta", "gamma"), cost=90.0
     )
     assert pooled_bic([one]) == pytest.approx(90.0 + 2 * math.log(100), abs=1e-9)
     sessions = [make_session("a.mcap", estimates=[one]), make_session("b.mcap")]
-    (ranked,) = ranked_structures(sessions, ())
+    (ranked,) = campaign_of(sessions).structures
     assert (ranked.name, ranked.fitted, ranked.pooled) == ("III", 1, False)
     assert ranked.bic_above_lowest == 0.0

@@ -9,10 +9,7 @@ import pytest
 from cauchy_residues import modal_constants
 
 from analysis.campaigns import _geometry_sentences as sentences
-from analysis.campaigns._homogeneity import Homogeneity
-from analysis.campaigns._modal import opposite_sweeps, pooled_modal
-from analysis.campaigns._pooling import pooled
-from analysis.campaigns._verdict import campaign_verdict
+from analysis.campaigns._modal import opposite_sweeps
 from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant, uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
@@ -24,6 +21,12 @@ STD = np.tile([3e-5, 2e-3, 1e-3, 1e-3], len(MODES))
 
 UNEVEN = np.zeros(TRUE.size)
 UNEVEN[:: len(CONSTANTS)] = 0.7e-3, -0.3e-3, -0.4e-3
+
+
+@pytest.fixture
+def pooled_modal(campaign_of):
+    """Return the modal model of all sessions."""
+    return lambda sessions: campaign_of(sessions).modal
 
 
 @pytest.fixture
@@ -52,7 +55,7 @@ def sessions_of(make_session, make_experiment):
     return make
 
 
-def test_noise_averages_out_and_an_unevenness_does_not(sessions_of):
+def test_noise_averages_out_and_an_unevenness_does_not(sessions_of, pooled_modal):
     five, forty = (pooled_modal(sessions_of(count, uniformity=3e-3)) for count in (5, 40))
     for few, many in zip(five.modes, forty.modes, strict=True):
         assert many.frequency_std_hz < 0.5 * few.frequency_std_hz
@@ -62,7 +65,7 @@ def test_noise_averages_out_and_an_unevenness_does_not(sessions_of):
     assert stiffness[1] > 2e-3 * PAPER_BEAM.bending_stiffness_n_m2
 
 
-def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of):
+def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of, pooled_modal):
     found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
     rows = (TRUE + UNEVEN).reshape(-1, len(CONSTANTS))
     for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
@@ -72,7 +75,7 @@ def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of):
         assert 0 < mode.participation_std_kg_m2 < 0.01 * mode.participation_kg_m2
 
 
-def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of):
+def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of, pooled_modal):
     even, uneven = (pooled_modal(sessions_of(12, each)) for each in (TRUE, TRUE + UNEVEN))
     assert even.uniform_beam.status == "passed"
     assert even.leads
@@ -87,7 +90,7 @@ def test_a_uniform_beam_passes_and_an_uneven_one_does_not(sessions_of):
             assert low < true < high
 
 
-def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of):
+def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of, pooled_modal):
     zero = pooled_modal(sessions_of(4, uniformity=0.0))
     assert zero.tolerant is None
     assert not zero.leads
@@ -101,7 +104,7 @@ def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of):
     assert uneven.leads
 
 
-def test_a_mode_that_few_sessions_show_is_left_out(sessions_of):
+def test_a_mode_that_few_sessions_show_is_left_out(sessions_of, pooled_modal):
     first, *others = sessions_of(4, uniformity=0.0)
     two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).of_visible())
     assert two.modal.constants.size == 2 * len(CONSTANTS)
@@ -114,7 +117,7 @@ def test_a_mode_that_few_sessions_show_is_left_out(sessions_of):
     assert pooled_modal([replace(first, modal=None), others[0]]) is None
 
 
-def test_phases_are_pooled_modulo_whole_turns(sessions_of):
+def test_phases_are_pooled_modulo_whole_turns(sessions_of, pooled_modal):
     plain = sessions_of(4, uniformity=0.0)
     turn = np.zeros(TRUE.size)
     turn[CONSTANTS.index("residue_phase_rad")] = 2 * np.pi
@@ -168,7 +171,7 @@ def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, count):
     assert "half the amplitude" in advice
 
 
-def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of):
+def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_of, pooled_modal):
     every = sessions_of(4, TRUE + UNEVEN, uniformity=0.0, **UP)
     refused = pooled_modal(every)
     (advice,) = sentences.experiments(None, refused, every)
@@ -185,7 +188,7 @@ VERDICT = SimpleNamespace(
 
 
 @pytest.fixture
-def verdict_of(make_estimate):
+def verdict_of(make_estimate, campaign_of):
     """Verdict on sessions with narrow estimates of type VI, as an exactly uniform beam has them."""
     names = ("zeta", "alpha", "gamma", "lambda")
     values = {name: PLANT.parameters[name] for name in names}
@@ -193,9 +196,7 @@ def verdict_of(make_estimate):
 
     def judge(sessions):
         every = [replace(each, record_estimates=(estimate,), verdict=VERDICT) for each in sessions]
-        found = pooled([estimate] * len(every))
-        modal = pooled_modal(every)
-        return campaign_verdict(every, [found], Homogeneity((), ()), (), (), (), modal)
+        return campaign_of(every).verdict
 
     return judge
 

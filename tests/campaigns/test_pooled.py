@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.campaigns._pooling import pooled, pooled_bic
+from analysis.campaigns.pooling import pooled, pooled_bic
 
 WITHIN = np.array([[0.02**2, -0.99 * 0.02 * 0.004], [-0.99 * 0.02 * 0.004, 0.004**2]])
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from analysis.campaigns._pooling import random_effects
+from analysis.campaigns.pooling import random_effects
 
 
 def one_dimension(values, variances):

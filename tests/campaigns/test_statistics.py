@@ -7,31 +7,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns._statistics import (
-    best_models,
-    mean_deviations,
-    nominal_models,
-    parameter_statistics,
-)
+from analysis.campaigns import best_models
+from analysis.campaigns._statistics import mean_deviations
 from analysis.models import STRUCTURES, FrequencyResponseModel
-from analysis.paper._route import Peak, resonant_peaks
+from analysis.paper import Peak, resonant_peaks
 from analysis.report._paper_tables import papers_table3, papers_table4, papers_wmse
 from rigd.beam import transfer
 
 DATA = Path(__file__).parents[1] / "data"
 
 
-def test_statistics_by_hand(make_fit, make_session):
+def test_statistics_by_hand(make_fit, make_session, campaign_of):
     sessions = [
         make_session(
+            f"{zeta}.mcap",
             fits=[
                 make_fit("III", "const", zeta=zeta, gamma=0.1, at_bounds=bounds),
                 make_fit("IV", "const", zeta=1e-4, alpha=0.5),
-            ]
+            ],
         )
         for zeta, bounds in ((1e-5, ()), (2e-5, ("zeta",)), (6e-5, ()))
     ]
-    rows = parameter_statistics(sessions)
+    rows = campaign_of(sessions).statistics
     assert [(r.structure, r.parameter) for r in rows] == [
         ("III", "zeta"), ("III", "gamma"), ("IV", "zeta"), ("IV", "alpha"),
     ]  # fmt: skip
@@ -41,8 +38,9 @@ def test_statistics_by_hand(make_fit, make_session):
     assert [r.at_bounds for r in rows] == [1, 0, 0, 0]
 
 
-def test_one_session_has_no_scatter(make_fit, make_session):
-    (row,) = parameter_statistics([make_session(fits=[make_fit("I", "const", zeta=1e-5)])])
+def test_one_session_has_no_scatter(make_fit, make_session, campaign_of):
+    one = make_session(fits=[make_fit("I", "const", zeta=1e-5)])
+    (row,) = campaign_of([one]).statistics
     assert row.mean == 1e-5
     assert math.isnan(row.std)
 
@@ -64,16 +62,16 @@ def test_deviation_of_peaks_by_hand():
     assert math.isnan(gone.magnitude_db)
 
 
-def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, truth):
+def test_nominal_model_is_of_the_mean_parameters(make_fit, make_session, campaign_of, truth):
     link, _ = truth
     frequency_hz = np.array([1.0, 2.0])
     damping = STRUCTURES["III"].damping({"zeta": 2e-4, "gamma": 0.2})
     exact = transfer(2j * np.pi * frequency_hz, link, damping)
     sessions = [
-        make_session(fits=[make_fit("III", "omega", zeta=z, gamma=g)], response=exact + off)
+        make_session(f"{z}.mcap", [make_fit("III", "omega", zeta=z, gamma=g)], response=exact + off)
         for z, g, off in ((1e-4, 0.1, 0.0), (3e-4, 0.3, 3.0))
     ]
-    (model,) = nominal_models(sessions)
+    (model,) = campaign_of(sessions).nominal
     assert model.response == pytest.approx(exact)
     assert model.indices[0].mse == pytest.approx(0.0)
     # A deviation of 3 everywhere, whatever the weights.

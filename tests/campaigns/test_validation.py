@@ -1,46 +1,49 @@
 """Every trial of the validation is accounted for: done, or lost and why."""
 
 import os
-import sys
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns._validation import LostTrial, left_out_errors, validate
+from analysis.campaigns import CampaignError, analyse_session, campaign
+from analysis.campaigns.workers import process_pool
 from analysis.cli.campaign import campaign_command
 from analysis.cli.sessions import Outputs
-from analysis.identify import BAND_HZ
-from analysis.report._campaign_document import campaign_document
+from analysis.report import campaign_document
 from analysis.report._campaign_figures import validation_figure
-from analysis.report._campaign_report import campaign_page, campaign_text
+from analysis.report.campaign_report import campaign_page, campaign_text
 
 
-def ends_at_one(path, tried, band_hz):
-    """Predict a session, but end the process that is given 1.mcap, as lack of memory does."""
+def ends_at_one(function, path, *arguments):
+    """Call a function, but end the process that is given 1.mcap, as lack of memory does."""
     if path.name == "1.mcap":
         os._exit(9)
-    return left_out_errors(path, tried, band_hz)
+    return function(path, *arguments)
 
 
-def analysed(results, path, _task):
-    """Analyse a session that was analysed before."""
-    return results[path]
+class Shaken:
+    """Two processes, of which one is killed; sessions are analysed already."""
+
+    def __init__(self, pool, results):
+        self._pool, self._results = pool, results
+
+    def run(self, function, tasks, on_done):
+        if function is analyse_session:
+            for number, _ in enumerate(tasks):
+                on_done(number)
+            return [self._results[path] for path, _ in tasks]
+        return self._pool.run(ends_at_one, [(function, *task) for task in tasks], on_done)
 
 
 @pytest.fixture(scope="module")
 def shaken(short_sessions, settings, done):
     """A campaign of four whose worker is killed in the middle of the validation."""
     results = {each.path: each for each in done[0].sessions}
-    with pytest.MonkeyPatch.context() as patch:
-        module = sys.modules["analysis.campaigns._campaign"]
-        patch.setattr(module, "analyse_session", partial(analysed, results))
-        patch.setattr("analysis.campaigns._validation.left_out_errors", ends_at_one)
-        progress = []
+    progress = []
+    with process_pool(2) as pool:
         found = campaign(
-            short_sessions, settings, structures=("III",), jobs=2,
+            short_sessions, settings, structures=("III",), workers=Shaken(pool, results),
             on_progress=lambda *step: progress.append(step),
         )  # fmt: skip
     assert progress[-1][:2] == (8, 8)
@@ -82,7 +85,7 @@ def test_terminal_page_and_files_account_for_it(shaken):
 
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
-    monkeypatch.setattr("analysis.report.write_campaign", lambda *_, **__: None)
+    monkeypatch.setattr("analysis.report.campaign_report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
     outputs = Outputs(report=tmp_path / "new")
     code = campaign_command(paths, shaken.settings, outputs, structures=("III",))
@@ -90,22 +93,26 @@ def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tm
     assert "1.mcap is not predicted from the others: its worker" in capsys.readouterr().err
 
 
-def test_a_session_that_cannot_be_read_any_more_is_lost_with_the_reason(tmp_path):
-    gone = left_out_errors(tmp_path / "gone.mcap", (), BAND_HZ)
-    assert isinstance(gone, LostTrial)
-    assert "gone.mcap" in gone.reason
+def test_sessions_that_cannot_be_read_any_more_are_lost_with_the_reason(make_session, campaign_of):
+    found = campaign_of([make_session(f"gone{number}.mcap") for number in range(3)])
+    assert found.validation == ()
+    for number, lost in enumerate(found.lost_trials):
+        assert f"gone{number}.mcap" in lost.reason
 
 
 def test_what_was_found_is_kept_though_all_workers_go(make_session):
-    class Gone:
-        def run(self, *_):
-            raise CampaignError("The Dask scheduler went away.")
-
     sessions = [make_session(f"{n}.mcap") for n in range(3)]
-    errors, lost = validate(Gone(), sessions, BAND_HZ, print)
-    assert errors == ()
-    assert [each.path.name for each in lost] == ["0.mcap", "1.mcap", "2.mcap"]
-    assert {each.reason for each in lost} == {"The Dask scheduler went away."}
+
+    class Going:
+        def run(self, function, *_):
+            if function is not analyse_session:
+                raise CampaignError("The Dask scheduler went away.")
+            return sessions
+
+    found = campaign([each.path for each in sessions], workers=Going())
+    assert found.validation == ()
+    assert [each.path.name for each in found.lost_trials] == ["0.mcap", "1.mcap", "2.mcap"]
+    assert {each.reason for each in found.lost_trials} == {"The Dask scheduler went away."}
 
 
 def test_nothing_is_said_where_nothing_was_asked(short_sessions, settings):

@@ -6,11 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity
+from analysis.campaigns import Heterogeneity, Homogeneity, sentences
 from analysis.campaigns._orders import freest_estimate, pooled_order
-from analysis.campaigns._pooling import pooled
-from analysis.campaigns._verdict import campaign_verdict, common_findings
+from analysis.campaigns.pooling import pooled
 from analysis.identify import Finding
 from analysis.statistics import student_t_quantile
 
@@ -145,14 +143,15 @@ def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
     assert ("consistent with 1" in sentences.order(order)) == (status == "compatible")
 
 
-def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_of, make_session):
+def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(
+    estimates_of, make_session, campaign_of
+):
     six, seven = estimates_of("VI", 100.0, 0.996), estimates_of("VII", 95.0)
     sessions = [
         make_session(f"{n}.mcap", estimates=pair, verdict=said("VII", "integer"))
         for n, pair in enumerate(zip(six, seven, strict=True))
     ]
-    both = ranked(six, seven)
-    found = campaign_verdict(sessions, both, ALIKE, (), ())
+    found = campaign_of(sessions).verdict
     assert (found.headline, found.structure) == ("VI", "VII")
     first, second, *_ = found.sentences
     assert "(alpha = 0.9960 ± 0.0159)" in first
@@ -185,14 +184,18 @@ def stiffening(mode):
     )  # fmt: skip
 
 
-def test_findings_are_counted_over_the_sessions(make_session):
+def test_findings_are_counted_over_the_sessions(make_session, estimates_of, campaign_of):
+    six = estimates_of("VI", 100.0)
     sessions = [
-        make_session(f"{number}.mcap", verdict=said(findings=(delay(value), *more)))
+        make_session(
+            f"{number}.mcap", estimates=six[:1], verdict=said(findings=(delay(value), *more))
+        )
         for number, (value, more) in enumerate(
             [(0.29e-3, ()), (0.31e-3, (stiffening(1),)), (0.30e-3, (stiffening(2),))]
         )
     ]
-    late, first, second = common_findings([*sessions, make_session("none.mcap")])
+    found = campaign_of([*sessions, make_session("none.mcap")]).verdict
+    late, first, second = found.findings
     assert late.files == ("0.mcap", "1.mcap", "2.mcap")
     assert late.span == pytest.approx((0.29e-3, 0.31e-3))
     assert late.sentence.startswith("In 3 of 3 sessions: The torque comes 0.300 ms later")
@@ -202,7 +205,7 @@ def test_findings_are_counted_over_the_sessions(make_session):
     assert first.sentence.startswith("In 1 of 3 sessions (1.mcap):")
 
 
-def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimates_of):
+def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimates_of, campaign_of):
     six, seven = estimates_of("VI", 100.0), estimates_of("VII", 150.0)
     sessions = [
         make_session(f"{n}.mcap", estimates=pair, verdict=said())
@@ -210,7 +213,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
     ]
     other = (replace(six[0], bic=180.0), seven[0])
     sessions[2] = make_session("2.mcap", estimates=other, verdict=said("VII"))
-    found = campaign_verdict(sessions, ranked(six, seven), ALIKE, (), ())
+    found = campaign_of(sessions).verdict
     assert found.structure == "VI"
     assert found.alone == {"VI": 3, "VII": 1}
     ((name, structure, margin),) = [(d.file, d.structure, d.margin) for d in found.dissent]
@@ -218,7 +221,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
     (told,) = (s for s in found.sentences if "is excluded by" in s)
     assert "2.mcap (type VII)" in told
     assert found.experiments == ("Sweep longer.",)
-    assert campaign_verdict(sessions, (), ALIKE, (), ()) is None
+    assert campaign_of([make_session(f"{n}.mcap") for n in range(2)]).verdict is None
 
 
 def test_words_about_scatter_and_misfit(estimates_of):

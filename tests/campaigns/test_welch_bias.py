@@ -6,11 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._homogeneity import Homogeneity
-from analysis.campaigns._pooling import pooled_estimates
-from analysis.campaigns._verdict import campaign_verdict
-from analysis.campaigns._welch_bias import welch_biases
+from analysis.campaigns import sentences
 from analysis.paper import Indices
 
 RECORD_STD = 0.001
@@ -40,12 +36,16 @@ def make_sessions(make_fit, make_estimate, make_session):
     return make
 
 
-def biases_of(sessions):
-    pooled = pooled_estimates(sessions)
-    return pooled[0], welch_biases(sessions, pooled)
+@pytest.fixture
+def biases_of(campaign_of):
+    def found(sessions):
+        result = campaign_of(sessions)
+        return result.pooled[0], result.welch_biases
+
+    return found
 
 
-def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions):
+def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.068, 0.001))
     by_name = {each.parameter: each for each in found.parameters}
     bias = by_name["lambda"]
@@ -63,27 +63,24 @@ def test_a_bias_is_the_difference_of_the_means_and_not_the_scatter(make_sessions
     assert sentences.welch_bias(freest, (found,), (), comparable=False) == []
 
 
-def test_a_difference_within_the_scatter_is_no_bias(make_sessions):
+def test_a_difference_within_the_scatter_is_no_bias(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.02, 0.1))
     assert found.significant == ()
     assert sentences.welch_bias(freest, (found,), (), comparable=True) == []
 
 
-def test_a_structure_that_leaves_more_than_noise_is_no_reference(make_sessions):
+def test_a_structure_that_leaves_more_than_noise_is_no_reference(make_sessions, biases_of):
     _, found = biases_of(make_sessions(0.068, 0.001, cost=900.0))
     assert found == ()
 
 
-def test_the_verdict_states_the_bias(make_sessions):
+def test_the_verdict_states_the_bias(make_sessions, campaign_of):
     order = SimpleNamespace(status="compatible")
     verdict = SimpleNamespace(
         adequate=True, visible_modes=(1, 2, 3), findings=(), experiments=(), alpha=order,
         lambda_=order,
     )  # fmt: skip
     sessions = [replace(each, verdict=verdict) for each in make_sessions(0.068, 0.001)]
-    pooled = pooled_estimates(sessions)
-    found = campaign_verdict(
-        sessions, pooled, Homogeneity((), ()), (), (), welch_biases(sessions, pooled)
-    )
+    found = campaign_of(sessions).verdict
     assert "external damping of integer order (lambda = 1.00000 ± 0.00124)" in found.sentences[0]
     assert any("0.06800 above the whole records'" in each for each in found.sentences)

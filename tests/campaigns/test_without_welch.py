@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from analysis.campaigns import campaign
-from analysis.campaigns._campaign import _of_one_experiment
-from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
+from analysis.campaigns import SessionFailure, SessionTask, analyse_session, campaign
 from analysis.models import WelchSettings
-from analysis.report._campaign_report import campaign_page, campaign_text, write_campaign
+from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
 
 @pytest.fixture(scope="module")
@@ -64,29 +62,34 @@ def test_sessions_are_listed_with_what_their_files_say(found):
     assert "<b>" not in page
 
 
-def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_session):
+def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_session, campaign_of):
     sessions = [make_session(f"{number}.mcap") for number in range(3)]
     odd = replace(
         sessions[0].without_welch(), path=Path("odd.mcap"), warnings=("Welch fits left out: x.",),
         experiment=replace(sessions[0].experiment, identity=("odd",)),
     )  # fmt: skip
-    kept, (failure,) = _of_one_experiment([*sessions, odd])
+    found = campaign_of([*sessions, odd])
+    kept, (failure,) = found.sessions, found.failures
     assert [each.path for each in kept] == [each.path for each in sessions]
     assert "odd.mcap: Welch fits left out: x. Most others have them" in failure.message
-    both, none = _of_one_experiment([sessions[0], odd])
-    assert none == []
+    found = campaign_of([sessions[0], odd])
+    both, none = found.sessions, found.failures
+    assert none == ()
     assert [each.frequency_hz.size for each in both] == [0, 0]
 
 
-def test_a_search_beside_chirps_counts_and_all_do_without(make_session, make_experiment):
+def test_a_search_beside_chirps_counts_and_all_do_without(
+    make_session, make_experiment, campaign_of
+):
     chirps = [make_session(f"{number}.mcap") for number in range(3)]
     search = replace(
         chirps[0].without_welch(),
         path=Path("until.mcap"),
         experiment=make_experiment("until.mcap", excitation="until"),
     )
-    kept, none = _of_one_experiment([*chirps, search])
-    assert none == []
+    found = campaign_of([*chirps, search])
+    kept, none = found.sessions, found.failures
+    assert none == ()
     assert [each.frequency_hz.size for each in kept] == [0, 0, 0, 0]
 
 

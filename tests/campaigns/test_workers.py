@@ -6,7 +6,7 @@ import pytest
 from cases import further
 
 from analysis.campaigns import CampaignError
-from analysis.campaigns._workers import Lost, process_pool
+from analysis.campaigns.workers import Lost, process_pool
 
 
 def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):

@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 from processes import eventually
 
-from rigd.live import LiveAddress
-from rigd.live._address import announce
+from rigd.live.address import LiveAddress, announce
 
 VIEWER = """#!/bin/sh
 echo "$@" > "$SEEN.arguments"

@@ -26,9 +26,10 @@ from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
-from rigd.view import GREEN, GREY, ORANGE, SKY_BLUE, draw_session, nominal_damping
-from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view import draw_session, nominal_damping
 from rigd.view._recorded import subject_of_session
+from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")

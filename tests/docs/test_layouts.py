@@ -17,7 +17,7 @@ import pytest
 from graphics import viewer_ended
 from session_schemas import message_class
 
-from rigd.view import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
+from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAYOUTS = DOCS / "layouts"

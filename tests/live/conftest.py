@@ -14,17 +14,30 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine import Ring, shared_memory_fd
-from rigd.engine.channels import DESCRIPTORS, TOPICS, Channels
+from rigd.engine import Ring, create_channels, shared_memory_fd
+from rigd.engine.channels import TOPICS, Channels
 from rigd.engine.messages import Failed, MessageReader, encode
 from rigd.engine.shared_state import Event, SharedState, Word, write_event
-from rigd.live._address import LiveAddress
-from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
+from rigd.live.address import LiveAddress
+from rigd.live.messages import LiveEnd, LiveJob, LiveSession, LiveShown
 from rigd.session.layout import pack_sample_into, pack_timing_into
-from rigd.view._session_info import Subject
+from rigd.view import Subject
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
+
+
+def descriptors() -> list[int]:
+    """Return shared memory for every ring, the board and the reference."""
+    return [shared_memory_fd() for _ in (*TOPICS, "board", "reference")]
+
+
+@pytest.fixture
+def channels():
+    """The memory of a rig at 1 kHz, to which nobody writes."""
+    made = create_channels(1000.0, descriptors())
+    yield made
+    made.close()
 
 
 class Producer(threading.Thread):
@@ -37,7 +50,7 @@ class Producer(threading.Thread):
     def __init__(self, capacity: int = 16_000, speed: float = 1.0) -> None:
         super().__init__(daemon=True)
         self.speed = speed
-        self.fds = [shared_memory_fd() for _ in range(DESCRIPTORS)]
+        self.fds = descriptors()
         *for_rings, for_board, _ = self.fds
         rings = [
             Ring.create(topic.record_size, capacity if topic.every else 256, fd)
@@ -366,6 +379,16 @@ def receive(save):
 @pytest.fixture
 def send():
     return send_message
+
+
+def read_message(pipe, timeout_s: float = 60.0) -> object:
+    return MessageReader(pipe.fileno()).next(timeout_s)
+
+
+@pytest.fixture
+def receive_message():
+    """Return the next message from a publisher's pipe."""
+    return read_message
 
 
 @pytest.fixture

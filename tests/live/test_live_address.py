@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.live._address import LiveAddress, announce, find, running, withdraw
 from rigd.live._server import free_port
+from rigd.live.address import LiveAddress, announce, find, running, withdraw
 from rigd.runtime.addresses import runtime_folder
 
 

@@ -4,9 +4,7 @@ from functools import partial
 
 import pytest
 
-from rigd.engine import shared_memory_fd
-from rigd.engine.channels import DESCRIPTORS, create_channels
-from rigd.engine.shared_state import UNKNOWN, Word
+from rigd.engine.shared_state import Word
 from rigd.live.publisher import LOOK_S, Backlog, Vitals
 
 
@@ -56,13 +54,6 @@ def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
     assert names(backlog.take()[0]) == ["a"]
 
 
-@pytest.fixture
-def channels():
-    made = create_channels(1000.0, [shared_memory_fd() for _ in range(DESCRIPTORS)])
-    yield made
-    made.close()
-
-
 def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
     board = channels.board
     for word, value in {
@@ -87,7 +78,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
 
 def test_vitals_of_what_there_is_not_are_not_known(channels):
     for word in (Word.BUS_LOAD_PPM, Word.BUS_ERRORS, Word.SENSOR_STATUS):
-        channels.board[word] = UNKNOWN
+        channels.board[word] = -1
     health = Vitals(channels).look(0.0, view_dropped=0)
     assert health.disk_free_mb is None
     assert (health.bus_load_percent, health.bus_errors, health.sensor_status) == (None, None, None)

@@ -15,10 +15,10 @@ import pytest
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
-from rigd.engine.messages import Failed, MessageReader
+from rigd.engine.messages import Failed
 from rigd.engine.shared_state import Word
-from rigd.live._address import LiveAddress, find
-from rigd.live._ring_reader import LiveFit, LiveJob
+from rigd.live.address import LiveAddress, find
+from rigd.live.messages import LiveFit, LiveJob
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
@@ -184,7 +184,7 @@ def test_a_killed_publisher_leaves_no_server(publisher):
 
 
 @pytest.mark.further  # as when killed
-def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
+def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send, receive_message):
     middle = subprocess.Popen(
         [
             sys.executable,
@@ -201,7 +201,7 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
     with middle:
         pid = int(middle.stderr.readline())
         send(middle.stdin, LiveJob("orphan", producer.channels.specs, linger_s=60.0))
-        assert isinstance(MessageReader(middle.stdout.fileno()).next(60.0), LiveAddress)
+        assert isinstance(receive_message(middle.stdout), LiveAddress)
         (server,) = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
         middle.kill()
         assert eventually(lambda: has_ended(pid) and has_ended(server))

@@ -12,8 +12,8 @@ import pytest
 from processes import eventually
 
 from rigd.engine.shared_state import Word
-from rigd.excitation._named import make_excitation
-from rigd.live._address import find
+from rigd.excitation import make_excitation
+from rigd.live.address import find
 from rigd.profile import load_profile
 from rigd.runner import Rig
 from rigd.runner import _live_view as live_view

@@ -10,29 +10,23 @@ from cases import further
 from processes import eventually
 
 from rigd.beam import Beam
-from rigd.engine import shared_memory_fd
-from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.shared_state import Phase, Stop, Word
-from rigd.live._ring_reader import LiveSession
-from rigd.live.publisher import _PERIOD_S, StateWatch, last_response
-from rigd.view import (
+from rigd.live.messages import LiveSession
+from rigd.live.publisher import StateWatch, last_response
+from rigd.view import Subject
+from rigd.view.banner import (
     FINISHING,
     RETURNING,
     RUNNING,
     STOPPING,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    LastResponse,
-    Subject,
     preparing,
 )
+from rigd.view.frequency_charts import LastResponse
 
-
-@pytest.fixture
-def channels():
-    made = create_channels(1000.0, [shared_memory_fd() for _ in range(DESCRIPTORS)])
-    yield made
-    made.close()
+PERIOD_S = 1 / 15
+"""Between two looks at the board, of a publisher that shows a session."""
 
 
 def test_the_board_tells_every_state_of_a_session(channels):
@@ -58,22 +52,22 @@ def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
     board, states, now_s = channels.board, StateWatch(channels), 100.0
     board[Word.GO], board[Word.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
-        now_s += _PERIOD_S
+        now_s += PERIOD_S
         board.beat(Word.SUPERVISOR_BEAT)
         assert states.look(now_s) == RUNNING
     hung_s = now_s
     while states.look(now_s) != SUPERVISOR_SILENT:
-        now_s += _PERIOD_S
+        now_s += PERIOD_S
     assert now_s - hung_s < 0.8
     board.beat(Word.SUPERVISOR_BEAT)
-    assert states.look(now_s + _PERIOD_S) == RUNNING
+    assert states.look(now_s + PERIOD_S) == RUNNING
     board[Word.PHASE] = Phase.OFF
     for _ in range(20):
-        now_s += _PERIOD_S
+        now_s += PERIOD_S
         state = states.look(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
     board[Word.GO] = 0  # before a record nobody need be there at once
-    assert states.look(now_s + _PERIOD_S) == preparing()
+    assert states.look(now_s + PERIOD_S) == preparing()
 
 
 def words(columns) -> list[str]:

@@ -8,8 +8,8 @@ import pytest
 from graphics import viewer_ended
 from processes import eventually, sockets
 
-from rigd.live._address import LiveAddress
-from rigd.live._viewer import Viewer
+from rigd.live import Viewer
+from rigd.live.address import LiveAddress
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from processes import eventually
 from rigd.daemon import page_address
 from rigd.daemon._page import _job
 from rigd.profile import load_profile
-from rigd.web import _access, _server
+from rigd.web import _access, _jobs, _library, _live, _server
 
 _RIGD = Path(sys.executable).parent / "rigd"
 TOKEN = "the-right-one"
@@ -202,8 +202,35 @@ def served(tmp_path_factory):
     server.close()
 
 
+JobError, Jobs, MOST_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MOST_JOBS
+
+_PARTS = {
+    "silent_s": (_access, "_SILENT_S"),
+    "read_s": (_access, "_READ_S"),
+    "most_connections": (_access, "_MOST_CONNECTIONS"),
+    "most_pages": (_live, "MOST_PAGES"),
+    "most_waiting": (_live, "_MOST_WAITING"),
+    "list_sessions": (_library, "list_sessions"),
+    "response": (_server, "SessionResponse"),
+    "program": (_jobs, "_PROGRAM"),
+    "poll_s": (_jobs, "_LOOK_S"),
+    "give_way": (_jobs, "give_way"),
+}
+"""Limits and parts of the page's server that tests replace."""
+
+
 @pytest.fixture
-def hurried(monkeypatch):
+def replace_in_page(monkeypatch):
+    """Replace limits and parts of the page's server for a test, by name."""
+
+    def replace(**values):
+        for name, value in values.items():
+            monkeypatch.setattr(*_PARTS[name], value)
+
+    return replace
+
+
+@pytest.fixture
+def hurried(replace_in_page):
     """Who says nothing is let go soon."""
-    monkeypatch.setattr(_access, "_SILENT_S", 0.2)
-    monkeypatch.setattr(_access, "_READ_S", 0.2)
+    replace_in_page(silent_s=0.2, read_s=0.2)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from rich.console import Console
 
 from analysis.identify import (
     Candidate,
@@ -14,9 +15,9 @@ from analysis.identify import (
     of_fit,
 )
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report._record_report import _write_page
+from analysis.report.record_report import write_report
 from analysis.results import RecordResult, WholeRecord
 
 TYPES = ("I", "III", "VI", "VII")
@@ -81,9 +82,22 @@ def retold():
 
 
 @pytest.fixture(scope="session")
+def as_text():
+    """Return what a terminal of 120 columns shows, as plain text."""
+
+    def text(shown):
+        console = Console(width=120, color_system=None, force_terminal=False)
+        with console.capture() as capture:
+            console.print(shown)
+        return capture.get()
+
+    return text
+
+
+@pytest.fixture(scope="session")
 def report(record_result, tmp_path_factory):
     """Folder of the written page with its figures and tables."""
     folder = tmp_path_factory.mktemp("reports") / "report"
     folder.mkdir()
-    _write_page(record_result, record_result.whole, folder, lambda _done: None)
+    write_report(record_result, folder)
     return folder

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import Measurement, fit_record
-from analysis.identify._plant import LOGARITHMIC
+from analysis.identify import LOGARITHMIC, Measurement, fit_record
 from analysis.models import STRUCTURES
-from analysis.report._bands import loss_factors, response_band
+from analysis.report.bands import loss_factors, response_band
 from rigd.beam import Beam, Damping, transfer
 
 FREQUENCY_HZ = np.array([1.0, 2.5, 2.57, 8.0, 11.3, 16.01, 30.0, 44.8])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.report._document import document, document_text
+from analysis.report import document, document_text
 from analysis.results import RecordResult
 
 

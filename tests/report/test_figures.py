@@ -10,14 +10,19 @@ from matplotlib.text import Text
 from PIL import Image
 
 from analysis.models import WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
 from analysis.report import _style as style
-from analysis.report._folder import OutputExistsError
-from analysis.report._frf_figure import frf_figure
+from analysis.report import frf_figure
 from analysis.report._record_figures import plain_logarithmic
-from analysis.report._signal_figures import best_model, torque_figure
-from analysis.report._signal_figures import paper_signals_figure as signals_figure
+from analysis.report._signal_figures import (
+    best_model,
+    paper_signals_figure,
+    resonance_moments,
+    torque_figure,
+    torque_in_band,
+)
+from analysis.report.folder import OutputExistsError
 
 
 def pixels(figure, path):
@@ -33,7 +38,7 @@ def count(image, colour):
 @pytest.mark.parametrize(
     ("draw", "colours"),
     [
-        (signals_figure, (style.ORANGE, style.BLUE, style.GREEN)),
+        (paper_signals_figure, (style.ORANGE, style.BLUE, style.GREEN)),
         further(frf_figure, (style.BLUE, style.VERMILION, style.GREY)),
         (torque_figure, (style.BLUE, style.VERMILION, style.GREY)),
     ],
@@ -110,7 +115,7 @@ def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
     assert np.abs(residual).max() < 0.15 * np.abs(measured).max()
 
 
-@pytest.mark.parametrize("draw", [signals_figure, frf_figure, torque_figure])
+@pytest.mark.parametrize("draw", [paper_signals_figure, frf_figure, torque_figure])
 def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
     with style.styled():
         figure = draw(paper_analysis)
@@ -146,6 +151,18 @@ def test_a_picture_is_written_in_the_formats_asked_for(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["v1.0.pdf"]
     assert picture.name == "v1.0"
     assert picture.svg.startswith(b"<?xml")
+
+
+def test_a_figure_stands_in_the_page_as_svg_unless_that_is_far_larger():
+    longer = b"twice or more"
+    assert style.Picture("name", "seen", b"png", longer).source == "data:image/png;base64,cG5n"
+    assert style.Picture("name", "seen", b"png", b"svg").source == "data:image/svg+xml;base64,c3Zn"
+
+
+def test_a_title_that_is_no_text_is_no_obstacle(tmp_path):
+    with style.styled():
+        style.save(style.new_figure(6.0, 4.0, "caf\udce9.mcap", "—"), tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_long_name_and_many_words_fit(tmp_path):
@@ -199,3 +216,54 @@ def test_labels_of_a_logarithmic_axis_stand_apart(span, height_in):
         )
     assert boxes
     assert all(below.y1 <= above.y0 for below, above in pairwise(boxes))
+
+
+# Enlarged stretches: where each mode rings, marked as such
+
+MODES_HZ = np.array([2.5537, 16.003, 44.810])
+
+
+def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_analysis):
+    record = paper_analysis.record
+    moments = resonance_moments(record, 3)
+    assert [moment.name for moment in moments] == [
+        "Mode 1, 2.55 Hz", "Mode 2, 16 Hz", "Mode 3, 44.8 Hz"
+    ]  # fmt: skip
+    passes_s = 1.0 + 120.0 * (MODES_HZ - 0.05) / (50.0 - 0.05)
+    for moment, frequency_hz, passed_s in zip(moments, MODES_HZ, passes_s, strict=True):
+        middle_s = (moment.first_s + moment.last_s) / 2
+        # A resonance rings on for a while after the chirp has passed it.
+        assert passed_s - 0.2 < middle_s < passed_s + 2.0
+        assert moment.last_s - moment.first_s == pytest.approx(
+            max(12 / frequency_hz, 0.3), abs=0.01
+        )
+        times_s = record.time_s[moment.samples]
+        assert (times_s[0], times_s[-1]) == (moment.first_s, moment.last_s)
+
+
+@pytest.mark.parametrize("draw", [paper_signals_figure, torque_figure])
+def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysis, draw):
+    with style.styled():
+        figure = draw(paper_analysis)
+    whole = figure.axes[0]
+    assert [text.get_text() for text in whole.texts] == ["1", "2", "3"]
+    details = [axes for axes in figure.axes if axes.get_title(loc="left")[:1].isdigit()]
+    for number, shade in enumerate(whole.patches, start=1):
+        shown = [axes for axes in details if axes.get_title(loc="left").startswith(f"{number}  ")]
+        assert shown
+        for axes in shown:
+            assert axes.get_xlim() == pytest.approx(
+                (shade.get_x(), shade.get_x() + shade.get_width())
+            )
+    assert len(whole.patches) == 3
+
+
+def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
+    """The same number from signals: measured against predicted torque, without their means."""
+    whole = record_result.whole
+    torque = torque_in_band(whole.record, whole.fit.plant, whole.band_hz[1])
+    measured = torque.measured - torque.measured.mean()
+    expected = 100 * (1 - np.linalg.norm(torque.residual) / np.linalg.norm(measured))
+    found = whole.analysis.fit_percent(whole.fit)
+    assert found == pytest.approx(expected, abs=0.3)
+    assert 50 < found < 100

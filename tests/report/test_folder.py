@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.report._folder import (
+from analysis.report.folder import (
     LIST,
     OutputError,
     OutputExistsError,

@@ -5,8 +5,8 @@ import re
 import pytest
 from matplotlib.mathtext import MathTextParser
 
-from analysis.report._record_report import report_tables
-from analysis.report._table import Cell, Column, Table, latex_table, latex_text, with_validity
+from analysis.report.record_report import report_tables
+from analysis.report.table import Cell, Column, Table, latex_table, latex_text, with_validity
 
 
 @pytest.mark.parametrize(

@@ -8,21 +8,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from analysis.identify import of_fit
 from analysis.models import STRUCTURES
-from analysis.report import _style as style
-from analysis.report._bands import excited_band_hz, supported_band_hz
-from analysis.report._document import document
-from analysis.report._record_figures import illustrations
-from analysis.report._record_report import record_page, report_tables
-from analysis.report._style import Picture
-from analysis.report._table import MARK, Cell, csv_text, unreported
-from analysis.report._text import damping_sentences, record_text, tables_text
+from analysis.report import document, illustrations, result_text
+from analysis.report.bands import excited_band_hz, supported_band_hz
+from analysis.report.record_report import record_page, report_tables
+from analysis.report.table import MARK, Cell, csv_text, unreported
 
 ALPHA = frozenset({"alpha"})
-PICTURES = (Picture("one", "A figure.", b""), Picture("two", "Another one.", b""))
+PICTURES = tuple(
+    SimpleNamespace(name=name, description="A figure.", source="data:image/png;base64,")
+    for name in ("one", "two")
+)
 REASON = "order 1 on another beam explains as much"
 
 
@@ -96,7 +94,7 @@ def test_nothing_is_marked_where_all_is_supported(record_result):
         assert not any(cell.doubtful for row in table.shown_rows for cell in row)
 
 
-def test_page_terminal_and_text_tables_show_the_mark(careful):
+def test_page_terminal_and_text_tables_show_the_mark(careful, as_text):
     modes, tables, of_paper = report_tables(careful)
     made_at = datetime(2026, 1, 1, tzinfo=UTC)
     text = record_page(careful, PICTURES, modes, tables, made_at, (), of_paper)
@@ -104,19 +102,17 @@ def test_page_terminal_and_text_tables_show_the_mark(careful):
     cells = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
     assert len(cells) == 2  # among the parameters, and among the structures
     assert all(cell.endswith(MARK) for cell in cells)
-    console = Console(width=140)
-    with console.capture() as capture:
-        console.print(record_text(careful.whole))
-    assert f"3{MARK}" in capture.get()
-    (row,) = [line.split() for line in capture.get().splitlines() if line.split()[:1] == ["α"]]
+    complete = as_text(result_text(replace(careful, welch=None), verbose=True))
+    assert f"3{MARK}" in complete
+    (row,) = [line.split() for line in complete.splitlines() if line.split()[:1] == ["α"]]
     assert row[4].endswith(MARK)
-    assert REASON in capture.get()
-    welch = tables_text(careful)
+    assert " ".join(REASON.split()) in " ".join(complete.split())
+    welch = as_text(result_text(careful, verbose=True)).partition("Welch method")[2]
     fits, *others = [line for line in welch.splitlines() if re.match(r"VI\s+omega", line)]
     assert fits.count(MARK) == 2
     assert MARK not in "".join(others)
     assert f"{MARK} not reported" in welch
-    assert MARK not in tables_text(replace(careful, whole=None))
+    assert MARK not in as_text(result_text(replace(careful, whole=None), verbose=True))
 
 
 def test_the_document_flags_and_keeps_the_numbers(careful):
@@ -141,17 +137,21 @@ def test_the_document_flags_and_keeps_the_numbers(careful):
     assert visible == {1: True, 2: True, 3: False}
 
 
-def test_of_modes_that_do_not_show_no_damping_is_told(careful):
-    told = " ".join(damping_sentences(careful.whole.headline))
+def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
+    def verdict(result):
+        shown = as_text(result_text(replace(result, welch=None), verbose=True))
+        return shown.partition("Modes with locked hub")[0]
+
+    told = verdict(careful)
     assert "at 2.57 Hz and" in told
     assert "44.8" not in told
     none = of_fit("VI", careful.whole.fit, ())
-    assert "damping ratio" not in " ".join(damping_sentences(none))
+    assert "damping ratio is" in told
+    assert "damping ratio" not in verdict(retold(careful, headline=none))
 
 
 def loss_axes(result):
-    with style.styled():
-        (found,) = [each for each in illustrations(result.whole) if each.name == "loss_factor"]
+    (found,) = [each for each in illustrations(result.whole) if each.name == "loss_factor"]
     return found.figure.axes[0], found.description
 
 

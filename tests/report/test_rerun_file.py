@@ -10,18 +10,16 @@ from rerun_files import batches
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
-from analysis.identify import ResponseGrid
+from analysis.identify import ResponseGrid, fast_length
 from analysis.models import WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report import _rerun_file as fit_charts
-from analysis.report._folder import OutputError
-from analysis.report._record_figures import measured_response
-from analysis.report._rerun_file import write_rerun_file
+from analysis.report import write_rerun_file
+from analysis.report.folder import OutputError
 from analysis.results import RecordResult
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
-from rigd.view._rrd_file import new_rrd_file
+from rigd.spectral import fft_response
 
 BAND = (0.5875, 50.0)
 
@@ -179,7 +177,10 @@ def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
 ):
     chunks, _ = of_record
     whole = record_result.whole
-    found = measured_response(whole)
+    angle = whole.record.angle_rad - (whole.record.rest_angle_rad or 0.0)
+    size = fast_length(len(angle))
+    found = fft_response(angle, whole.record.torque_nm, whole.record.rate_hz, size)
+    found = found.band(0.1, whole.band_hz[1])
     grid_hz, delay_s = found.frequency_hz, whole.fit.parameters["delay_s"]
     measured = found.response * np.exp(2j * np.pi * delay_s * grid_hz)
     plant = replace(whole.fit.plant, delay_s=0.0)
@@ -245,15 +246,17 @@ def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tm
     analysis = analyse(load_record(paper_file), settings)
     assert analysis.response.coherence is None
     path = tmp_path / "own.rrd"
-    with new_rrd_file(path) as stream:
-        fit_charts.draw(analysis, "numbers", stream)
+    write_rerun_file(RecordResult(analysis.record, welch=analysis), path)
     chunks = batches(path)
     names = {
         entity.rpartition("/")[2] for entity in chunks if "/type_III/magnitude/model" in entity
     }
     assert names == {"model_omega", "model_omega_0_5", "model_omega__0_5"}
-    keys = fit_charts.line_keys(settings.weightings)
-    assert len({key.color for key in keys.values()}) == 3
+    colors = {
+        value(chunks[f"/fits/type_III/magnitude/{name}"], "LineStrips2D:colors")[0]
+        for name in names
+    }
+    assert len(colors) == 3
 
 
 @pytest.fixture
@@ -274,7 +277,7 @@ def run(application, *arguments):
 
 def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
     # The figures take longer than all the rest, and are tested elsewhere.
-    monkeypatch.setattr("analysis.report.write_report", lambda *_, **__: None)
+    monkeypatch.setattr("analysis.report.record_report.write_report", lambda *_, **__: None)
     out = tmp_path / "new" / "fits.rrd"
     quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)

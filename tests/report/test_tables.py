@@ -2,12 +2,12 @@ import math
 from dataclasses import replace
 
 import pytest
-from rich.console import Console
 
 from analysis.models import WelchSettings
-from analysis.paper._route import analyse
+from analysis.paper import analyse
 from analysis.record import load_record
-from analysis.report._table import (
+from analysis.report import result_text, summary_table
+from analysis.report.table import (
     WORDS,
     Cell,
     Column,
@@ -17,8 +17,6 @@ from analysis.report._table import (
     json_rows,
     terminal_table,
 )
-from analysis.report._text import as_text, summary_table
-from analysis.report._text import tables_text as text_of_result
 from analysis.results import RecordResult
 from rigd.beam import modes
 
@@ -36,7 +34,7 @@ from rigd.beam import modes
         (3.0, float("nan"), "3"),
     ],
 )
-def test_a_value_shows_the_digits_its_spread_leaves(value, std, text):
+def test_a_value_shows_the_digits_its_spread_leaves(value, std, text, as_text):
     columns = (Column("value", "value"), Column("std", "std", spread=True))
     table = Table.of("name", "", columns, [estimate((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
@@ -46,8 +44,10 @@ def by_welch(analysis):
     return RecordResult(analysis.record, welch=analysis)
 
 
-def tables_text(analysis):
-    return text_of_result(by_welch(analysis))
+@pytest.fixture(scope="module")
+def tables_text(as_text):
+    """Return what a terminal shows of Welch fits, with everything."""
+    return lambda analysis: as_text(result_text(by_welch(analysis), verbose=True))
 
 
 def rows(text, *starts):
@@ -56,7 +56,7 @@ def rows(text, *starts):
     ]
 
 
-def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis):
+def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     for model in paper_analysis.models:
         fits, peaks, modes = rows(text, model.fit.structure.name, model.fit.weighting)
@@ -75,13 +75,13 @@ def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis):
     assert "standard deviation" in " ".join(text.split())
 
 
-def test_absent_and_fixed_parameters_are_told_apart(paper_analysis):
+def test_absent_and_fixed_parameters_are_told_apart(paper_analysis, tables_text):
     text = tables_text(paper_analysis)
     internal_only = rows(text, "I", "const")[0]
     assert internal_only[4:7] == ["1", "–", "–"]
 
 
-def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis):
+def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis, tables_text):
     model = paper_analysis.models[0]
     edge = replace(model, fit=replace(model.fit, std=None, at_bounds=("zeta",)))
     text = tables_text(
@@ -91,26 +91,25 @@ def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis):
     assert "Warning: Mind the gap [b]of[/b] 3 ticks." in text
 
 
-def test_the_summary_is_mean_and_standard_deviation(paper_analysis):
+def test_the_summary_is_mean_and_standard_deviation(paper_analysis, as_text):
     model = paper_analysis.models[0]
     others = []
     for zeta in (1e-4, 2e-4, 4e-4):
         fit = replace(model.fit, parameters={**model.fit.parameters, "zeta": zeta})
         others.append(replace(paper_analysis, models=(replace(model, fit=fit),)))
-    console = Console(width=120)
-    with console.capture() as capture:
-        console.print(summary_table([by_welch(each) for each in others]))
-    assert "over 3 files" in capture.get()
-    (row,) = rows(capture.get(), "I", "const")
+    text = as_text(summary_table([by_welch(each) for each in others]))
+    assert "over 3 files" in text
+    (row,) = rows(text, "I", "const")
     assert row[2:5] == ["23", "±15", "1"]
 
 
-def modes_rows(analysis):
-    text = tables_text(analysis)
+def modes_rows(text):
     return text, [row[2:] for row in (rows(text, "I", "const")[2], rows(text, "VI", "omega")[2])]
 
 
-def test_modes_that_do_not_vibrate_are_left_out(write_session, short_signals, tmp_path):
+def test_modes_that_do_not_vibrate_are_left_out(
+    write_session, short_signals, tmp_path, tables_text
+):
     """One segment of a short sweep, to which type II answers with a damping ratio of 8."""
     record = load_record(write_session(tmp_path / "a.mcap", short_signals))
     settings = WelchSettings(segment_length=4000, types=("II",), weightings=("const",))
@@ -130,21 +129,23 @@ def test_modes_that_do_not_vibrate_are_left_out(write_session, short_signals, tm
     )
 
 
-def test_modes_that_left_their_resonance_are_marked(paper_analysis):
-    text, (first, last) = modes_rows(paper_analysis)
+def test_modes_that_left_their_resonance_are_marked(paper_analysis, tables_text):
+    text, (first, last) = modes_rows(tables_text(paper_analysis))
     assert "‡" not in text
     assert [float(hz) for hz in last[:3]] == sorted(float(hz) for hz in last[:3])
     *others, model = paper_analysis.models
     slow = replace(model.modes[2], frequency_hz=8.5)
     left = replace(model, modes=(*model.modes[:2], slow), followed=(True, True, False))
-    text, (unmarked, marked) = modes_rows(replace(paper_analysis, models=(*others, left)))
+    text, (unmarked, marked) = modes_rows(
+        tables_text(replace(paper_analysis, models=(*others, left)))
+    )
     assert unmarked == first
     assert marked[2] == "8.5000‡"
     assert marked[5] == f"{last[5]}‡"
     assert "‡ more than 10 % off" in " ".join(text.split())
 
 
-def test_one_table_is_shown_in_its_units_and_written_in_full():
+def test_one_table_is_shown_in_its_units_and_written_in_full(as_text):
     """A file's name may look like markup, a value may be missing, unknown or for programs only."""
     columns = (
         Column("file", "file", WORDS), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
@@ -170,7 +171,7 @@ def test_one_table_is_shown_in_its_units_and_written_in_full():
     ]
 
 
-def test_rows_that_belong_together_are_ruled_off():
+def test_rows_that_belong_together_are_ruled_off(as_text):
     columns = (Column("type", "type", WORDS), Column("n", "n"))
     table = Table.of("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
     lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.report._document import document, document_text
-from analysis.report._text import as_text, result_text, summary_table, tables_text
+from analysis.report import document, document_text, result_text, summary_table
 from analysis.results import RecordResult
 from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
 from rigd.session import Validity
@@ -25,28 +24,36 @@ def with_stated(result, slope):
     return RecordResult(record, whole, result.welch)
 
 
-def outputs(result):
+def outputs(result, as_text):
     """Everything that is printed or written of results, but the files of a report."""
     return {
         "terminal": as_text(result_text(result, verbose=False)),
         "terminal, verbose": as_text(result_text(result, verbose=True)),
-        "tables.txt": tables_text(result),
         "JSON": document_text(document([result])),
         "summary of several": as_text(summary_table([result, result])),
     }
 
 
-def test_every_output_with_a_damping_has_its_validity(record_result, report):
+def test_every_output_with_a_damping_has_its_validity(record_result, report, as_text):
     validity = record_result.validity
     assert validity.predicted_peak_tip_slope_rad > 2 * SMALL_SLOPE_RAD
-    alone = {f"{n}, Welch alone": t for n, t in outputs(replace(record_result, whole=None)).items()}
+    alone = {
+        f"{n}, Welch alone": t
+        for n, t in outputs(replace(record_result, whole=None), as_text).items()
+    }
     written = {
         path.name: path.read_text("utf-8")
         for path in report.rglob("*")
         if path.suffix in (".html", ".tex", ".txt", ".json", ".csv") and path.name != "model.tex"
     }
-    assert {"report.html", "modes.tex", "parameters.tex", "modes.csv"} <= written.keys()
-    searched = outputs(record_result) | alone | written
+    assert {
+        "report.html",
+        "modes.tex",
+        "parameters.tex",
+        "modes.csv",
+        "tables.txt",
+    } <= written.keys()
+    searched = outputs(record_result, as_text) | alone | written
     found = {name for name, text in searched.items() if NUMBER_OF_DAMPING.search(text)}
     assert len(found) > 15
     # From Welch's fits alone the slope comes out larger: the largest of theirs counts.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping
-from rigd.session.layout import SAMPLE_DTYPE
-from rigd.view._plots import TIMELINE
-from rigd.view._session_info import Subject
+from rigd.session.layout import SAMPLE_DTYPE, TIMING_SIZE, decode_timings, pack_timing_into
+from rigd.view import Scene, Subject
+from rigd.view.plots import TIMELINE
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +92,45 @@ def shown(drawn):
         return found
 
     return draw
+
+
+class _LayoutTaker:
+    """A stream that keeps the layout sent to it and drops everything else."""
+
+    layout = None
+
+    def send_blueprint(self, blueprint):
+        self.layout = blueprint
+
+    def __getattr__(self, _name):
+        return lambda *_, **__: None
+
+
+@pytest.fixture
+def layout_of(subject):
+    """Return the root of the layout that a scene sends to a new connection."""
+
+    def taken(of=subject):
+        stream = _LayoutTaker()
+        for drawing in Scene(of).frame():
+            drawing(stream)
+        return stream.layout.root_container
+
+    return taken
+
+
+@pytest.fixture
+def make_timings():
+    """Make ages of readings (n,) at 1 kHz, of angle and wrench in s."""
+
+    def make(n: int, angle_age_s: float = 0.0, wrench_age_s: float = 0.0) -> np.ndarray:
+        block = bytearray(n * TIMING_SIZE)
+        for tick in range(n):
+            offset = tick * TIMING_SIZE
+            pack_timing_into(block, offset, tick * 1_000_000, tick, angle_age_s, wrench_age_s)
+        return decode_timings(block)
+
+    return make
 
 
 @pytest.fixture

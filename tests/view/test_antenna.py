@@ -6,20 +6,13 @@ import numpy as np
 import pytest
 
 from rigd.beam import DeflectionFilter
-from rigd.view import _antenna as antenna
-from rigd.view._antenna import (
-    ANTENNA,
-    BEAM,
-    DRAWN_HZ,
-    FACTOR,
-    LABEL,
-    TITLE,
-    TOUCH,
-    TRAIL,
-    TRAIL_S,
-    Antenna,
-)
+from rigd.view import Scene
 
+ANTENNA = "/antenna"
+BEAM, TRAIL, LABEL, TOUCH = (f"{ANTENNA}/{name}" for name in ("beam", "trail", "label", "touch"))
+FACTOR = 2.0
+DRAWN_HZ = 20.0
+TRAIL_S = 0.5
 STRIPS = "LineStrips3D:strips"
 
 
@@ -45,11 +38,12 @@ def blocks(samples, size: int):
 
 @pytest.fixture
 def follow(subject, drawn):
-    """Feed an antenna with blocks of samples; return what it sent, by entity."""
+    """Feed a scene with blocks of samples; return what it sent, by entity."""
 
     def run(blocks_of_samples, of=subject):
-        drawing = Antenna(of)
-        return drawn([d for block in blocks_of_samples for d in drawing.samples(block)])
+        scene = Scene(of)
+        drawings = [d for block in blocks_of_samples for d in scene.samples(block)]
+        return drawn([*drawings, *scene.finish()])
 
     return run
 
@@ -88,22 +82,28 @@ def test_the_factor_stands_at_the_tip(samples, follow):
     assert 10 <= len(labels) <= 15  # readable: four a second
 
 
-@pytest.mark.parametrize(
-    ("tip_m", "text"),
-    [(0.0, "± 0.0 mm"), (0.00123, "± 1.2 mm"), (0.0456, "± 46 mm"), (0.3519, "± 350 mm")],
-)
-def test_label(tip_m, text):
-    assert antenna.label(tip_m) == f"tip deflection {text}, drawn × {FACTOR:g}"
+def label(tip_m, drawn=f"drawn × {FACTOR:g}"):
+    """Return the text of a deflection: two figures, but no less than tenths of a mm."""
+    tip_mm = 1e3 * tip_m
+    text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.2g}'):.0f}"
+    return f"tip deflection ± {text} mm, {drawn}"
+
+
+def last_label(batches):
+    times = [t for b in batches for t in b.column("session_time").cast("int64").to_pylist()]
+    texts = [text for b in batches for text in b.column("Points3D:labels").to_pylist()]
+    time_ns, (text,) = max(zip(times, texts, strict=True))
+    return time_ns, text
 
 
 @pytest.mark.parametrize("excitation", ["move", "touch"])
 def test_where_the_motor_goes_far_all_is_drawn_to_scale(subject, samples, drawn, excitation):
-    drawing = Antenna(dataclasses.replace(subject, excitation=excitation))
+    scene = Scene(dataclasses.replace(subject, excitation=excitation))
     turned = samples.copy()
     turned["angle_rad"] += 1.0
     bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
-    for block in blocks(turned, 50):
-        sent = drawn(drawing.samples(block))
+    for block in blocks(turned, 100):
+        sent = drawn(scene.samples(block))
         deflection = bends.feed(block["angle_rad"]) / subject.beam.length_m
         line, beam = moments(sent[BEAM])[-1][1]
         angle_rad = block["angle_rad"][-1]
@@ -111,18 +111,18 @@ def test_where_the_motor_goes_far_all_is_drawn_to_scale(subject, samples, drawn,
         bent = beam - line
         assert np.linalg.norm(bent, axis=1) == pytest.approx(np.abs(deflection), abs=1e-6)
         assert bent @ line[-1] == pytest.approx(0.0, abs=1e-6)
-    assert antenna.label(0.01, to_scale=True) == "tip deflection ± 10 mm, drawn to scale"
+        if LABEL in sent:
+            assert last_label(sent[LABEL])[1].endswith(" mm, drawn to scale")
 
 
-def test_the_label_tells_the_largest_deflection_of_late(subject, samples, follow):
-    sent = follow(blocks(samples, 50))[LABEL]
-    times = [t for batch in sent for t in batch.column("session_time").cast("int64").to_pylist()]
-    labels = [label for batch in sent for label in batch.column("Points3D:labels").to_pylist()]
-    last_ns, (last,) = max(zip(times, labels, strict=True))
+@pytest.mark.parametrize("amplitude", [0.0, 0.01, 0.1, 1.0])
+def test_the_label_tells_the_largest_deflection_of_late(subject, samples, follow, amplitude):
+    samples["angle_rad"] = amplitude * (samples["angle_rad"] - 0.3)
+    last_ns, last = last_label(follow(blocks(samples, 50))[LABEL])
     bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
     tips_m = np.array([abs(bends.feed(block["angle_rad"])[-1]) for block in blocks(samples, 1)])
     lately = (samples["t_ns"] <= last_ns) & (samples["t_ns"] > last_ns - 1e9 * TRAIL_S)
-    assert last == antenna.label(tips_m[lately][9::10].max())
+    assert last == label(tips_m[lately][9::10].max())
 
 
 def test_the_trail_is_what_the_beam_has_been(samples, follow):
@@ -186,22 +186,27 @@ def test_without_a_damping_the_beam_swings_on(subject, make_samples, follow):
 
 
 def test_nothing_comes_of_nothing(subject, make_samples):
-    assert Antenna(subject).samples(make_samples(0)) == []
+    assert Scene(subject).samples(make_samples(0)) == []
 
 
 def test_frame_draws_the_motor_and_how_the_beam_looks(subject, drawn):
-    sent = drawn(Antenna(subject).frame())
+    sent = drawn(Scene(subject).frame())
     assert {f"{ANTENNA}/motor", f"{ANTENNA}/positive", BEAM, TRAIL, LABEL} <= sent.keys()
     # Nothing of it moves, so nothing of it has a time.
-    assert all("session_time" not in b.schema.names for batches in sent.values() for b in batches)
+    of_antenna = [b for entity in sent if entity.startswith(ANTENNA) for b in sent[entity]]
+    assert all("session_time" not in batch.schema.names for batch in of_antenna)
     (styles,) = sent[BEAM]
     assert len(styles.column("LineStrips3D:colors")[0]) == 2
 
 
-def test_view_shows_the_antenna_and_its_trail_from_a_fixed_place():
-    view = antenna.view()
-    assert view.name == TITLE
-    assert view.origin == ANTENNA
+def test_view_shows_the_antenna_and_its_trail(layout_of):
+    def leaves(part):
+        parts = getattr(part, "contents", None)
+        inner = isinstance(parts, list | tuple) and not isinstance(parts[0], str)
+        return [leaf for each in parts for leaf in leaves(each)] if inner else [part]
+
+    (view,) = [each for each in leaves(layout_of()) if each.class_identifier == "3D"]
+    assert (view.name, view.origin) == ("Antenna", ANTENNA)
     assert TRAIL in view.visualizer_overrides
 
 
@@ -224,10 +229,10 @@ def values_of(batches, component):
 
 
 def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, samples, drawn):
-    drawing = Antenna(subject)
+    scene = Scene(subject)
     for block in blocks(samples, 100):
-        drawing.samples(block)
-    sent = drawn(drawing.touch(TOUCH_AT_2_S))
+        scene.samples(block)
+    sent = drawn(scene.touches([TOUCH_AT_2_S]))
     times, (point,) = values_of(sent[f"{TOUCH}/3/point"], "Points3D:positions")
     assert times == [2_012_300_000]
     # The exact shape of that very tick.
@@ -255,11 +260,11 @@ def test_a_touch_is_drawn_where_the_beam_was_and_against_its_motion(subject, sam
     "changes", [{"x_m": None}, {"time_s": None}, {"time_s": known(0.01, 0.001)}]
 )
 def test_a_touch_of_unknown_place_or_time_is_not_drawn(subject, samples, changes):
-    drawing = Antenna(subject)
-    drawing.samples(samples)
-    assert drawing.touch(TOUCH_AT_2_S | changes) == []
-    assert drawing.touch(TOUCH_AT_2_S)
+    scene = Scene(subject)
+    scene.samples(samples)
+    assert scene.touches([TOUCH_AT_2_S | changes]) == []
+    assert scene.touches([TOUCH_AT_2_S])
 
 
 def test_before_the_beam_is_drawn_there_is_no_place_for_a_touch(subject):
-    assert Antenna(subject).touch(TOUCH_AT_2_S) == []
+    assert Scene(subject).touches([TOUCH_AT_2_S]) == []

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.view._banner import (
+from rigd.view import Gauge, Health, Note, Scene, sweep_of
+from rigd.view.banner import (
     RUNNING,
     STATE,
     SUPERVISOR_LOST,
@@ -15,10 +16,7 @@ from rigd.view._banner import (
     gauge_text,
     preparing,
 )
-from rigd.view._gauges import Gauge
-from rigd.view._plots import GREEN, GREY, ORANGE, RED
-from rigd.view._scene import Scene
-from rigd.view._session_info import RECENT_EVENTS, Health, Note, sweep_of
+from rigd.view.plots import GREEN, GREY, ORANGE, RED
 
 FAULT = ended("fault", "The disk is full.")
 
@@ -146,7 +144,7 @@ def test_events_are_shown_in_full_the_newest_first(sweep, shown):
     found = shown(
         scene.events([Note(0, "info", "Record starts."), Note(2_500_000_000, "warning", long)])
     )
-    newest, first = found[RECENT_EVENTS].last("TextDocument:text").split("\n\n")
+    newest, first = found["/recent_events"].last("TextDocument:text").split("\n\n")
     assert newest.startswith("**2.5 s** ⚠ The \\*torque\\* command is above")
     assert newest.endswith("level now.")
     assert first == "**0.0 s** Record starts."

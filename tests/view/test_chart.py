@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view._chart import Axis, Chart, Key, decades, number, steps
-from rigd.view._plots import SKY_BLUE, TIMELINE
+from rigd.view.chart import Axis, Chart, Key, decades, number, steps
+from rigd.view.plots import SKY_BLUE, TIMELINE
 
 AXIS_ENDS = st.tuples(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.integers(1, 12))
 

@@ -8,20 +8,36 @@ import pytest
 from online_fits import online_fit
 
 from rigd.session import read_session
-from rigd.session.layout import TIMING_DTYPE
-from rigd.view._fits import TABLE, fit_record, fit_source, fit_table
-from rigd.view._layout import FIT_TAB, TABS, blueprint
-from rigd.view._recorded import draw_session, subject_of_session
-from rigd.view._scene import Scene
+from rigd.view import Scene, draw_session
+
+TABLE = "/fit_table"
 
 
-def curves(fit, modes=3):
-    """What each plot shows of a fit: low and high of what is asked, of the interval; estimate."""
-    columns = fit_source(modes, asked=True).columns(fit_record(fit, modes))
-    return {name: values[0].tolist() for name, values in columns.items()}
+@pytest.fixture
+def fitted(subject):
+    """The paper's session as a search, of which the fits of so many modes are plotted."""
+    return lambda modes=3: replace(subject, fit_modes=modes, excitation="until")
 
 
-def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for():
+@pytest.fixture
+def curves(fitted, shown):
+    """Low and high of what each plot shows as requested and of the interval; the estimate."""
+
+    def last(fit, modes=3):
+        scene = Scene(fitted(modes))
+        found = shown(scene.frame() if fit is None else scene.fit(fit))["/fits"]
+        return {name: values[-1] for name, values in found.values.items()}
+
+    return last
+
+
+@pytest.fixture
+def fit_table(fitted, shown):
+    """Return the text of the table of a fit."""
+    return lambda fit: shown(Scene(fitted()).fit(fit))[TABLE].last("TextDocument:text")
+
+
+def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for(curves):
     shown = curves(online_fit(width=2.0))
     half = 1.96 * 2e-4
     assert shown["damping_1_percent"] == pytest.approx(
@@ -43,22 +59,22 @@ def test_a_plot_has_the_estimate_its_interval_and_what_is_asked_for():
         (None, "damping_1_percent"),
     ],
 )
-def test_what_is_not_known_is_not_plotted(fit, component):
+def test_what_is_not_known_is_not_plotted(curves, fit, component):
     assert np.isnan(curves(fit)[component]).all()
 
 
-def test_where_nothing_can_be_asked_for_there_are_estimate_and_interval():
-    plots = fit_source(2, asked=False).plots
-    assert {curve.label.split(" (")[0] for plot in plots for curve in plot.curves} == {
-        "95 % interval", "estimate",
-    }  # fmt: skip
+def test_where_nothing_can_be_asked_for_there_are_estimate_and_interval(fitted, shown):
+    scene = Scene(replace(fitted(2), excitation="chirp"))
+    found = shown(scene.fit(online_fit()))["/fits"]
+    assert len(found.values) == 4
+    assert all(len(values[-1]) == 3 for values in found.values.values())
 
 
-def test_modes_without_a_plot_are_left_to_the_table():
+def test_modes_without_a_plot_are_left_to_the_table(curves):
     assert curves(online_fit(), modes=1).keys() == {"damping_1_percent", "frequency_1_hz"}
 
 
-def test_the_table_says_what_is_reached_and_how_long_it_takes():
+def test_the_table_says_what_is_reached_and_how_long_it_takes(fit_table):
     table = fit_table(online_fit(width=2.0))
     assert "| damping of mode 1 | 0.0091 | **0.0002 (2.2 %)** | 9.1e-05 (1 %) |" in table
     assert "| damping of mode 3 | – | – | – |" in table
@@ -79,24 +95,22 @@ def test_the_table_says_what_is_reached_and_how_long_it_takes():
     assert "doubtful: It depends" in fit_table(online_fit(third="doubtful"))
 
 
-def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode():
-    names = [tab.name for tab in blueprint().root_container.contents]
-    assert names == list(TABS)
-    layout = blueprint("Events", fit_modes=2).root_container
-    assert [tab.name for tab in layout.contents] == [TABS[0], FIT_TAB, *TABS[1:]]
-    assert layout.active_tab == len(TABS)
+def test_sessions_that_are_fitted_have_a_tab_with_two_plots_of_each_mode(subject, layout_of):
+    first, *others = [tab.name for tab in layout_of().contents]
+    layout = layout_of(replace(subject, fit_modes=2))
+    assert [tab.name for tab in layout.contents] == [first, "Fit", *others]
     grid, table = layout.contents[1].contents
     assert [view.name for view in grid.contents] == [
         "Damping ratio of mode 1 (%)", "Frequency of mode 1 (Hz)",
         "Damping ratio of mode 2 (%)", "Frequency of mode 2 (Hz)",
     ]  # fmt: skip
     assert table.origin == TABLE
-    (only,) = blueprint(fit_modes=0).root_container.contents[1].contents
+    (only,) = layout_of(replace(subject, fit_modes=0)).contents[1].contents
     assert only.origin == TABLE
 
 
-def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(subject, shown):
-    picture = Scene(replace(subject, fit_modes=2, excitation="until"))
+def test_fits_grow_with_the_session_and_are_all_there_for_new_connections(fitted, shown):
+    picture = Scene(fitted(2))
     assert shown(picture.frame())[TABLE].last("TextDocument:text") == "No fit yet."
     picture.fit(online_fit(6.0, 2.0))
     drawn = picture.fit(online_fit(8.0))
@@ -118,10 +132,10 @@ def test_a_session_that_is_not_fitted_draws_none(subject, shown):
 
 
 @pytest.mark.further  # as one that runs
-def test_a_recorded_session_shows_the_fit_in_its_file(touch_file, shown):
-    timings = np.empty(0, TIMING_DTYPE)
+def test_a_recorded_session_shows_the_fit_in_its_file(touch_file, shown, make_timings):
+    timings = make_timings(0)
     recorded = read_session(touch_file.path)
-    assert subject_of_session(recorded).fit_modes is None
+    assert TABLE not in shown([lambda stream: draw_session(stream, recorded, timings)])
     fit = online_fit(1.5) | {"search": {"reason": "Reached.", "pieces": []}}
     session = replace(recorded, outcome={"fit": json.dumps(fit)})
     found = shown([lambda stream: draw_session(stream, session, timings)])

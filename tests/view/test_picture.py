@@ -14,11 +14,9 @@ from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import read_session
-from rigd.session.layout import TIMING_DTYPE, Status
-from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
-from rigd.view._recorded import draw_session
-from rigd.view._scene import Scene
-from rigd.view._session_info import Health, Note, Subject
+from rigd.session.layout import Status
+from rigd.view import Health, Note, Scene, Subject, draw_session
+from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
 
 RIGD = Path(sys.executable).parent / "rigd"
 
@@ -115,13 +113,12 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
     assert points[inside, 1].min() == pytest.approx(at[:, 1].min(), abs=1e-3)
 
 
-def test_everything_has_its_place(subject, make_samples, shown):
+def test_everything_has_its_place(subject, make_samples, make_timings, shown):
     picture = Scene(subject)
     frame = picture.frame()
     t_s = np.arange(3000) / 1000.0
     samples = make_samples(3000, angle_rad=0.01 * np.sin(t_s), coupling_torque_nm=0.1)
-    timings = np.zeros(3000, TIMING_DTYPE)
-    timings["tick"], timings["t_ns"] = samples["tick"], samples["t_ns"]
+    timings = make_timings(3000)
     drawings = list(frame)
     for i in range(0, 3000, 50):
         drawings += picture.samples(samples[i : i + 50])
@@ -178,10 +175,10 @@ def test_touches_stay_on_the_antenna_for_new_connections(subject, make_samples, 
     assert place[0] == pytest.approx(0.5 / subject.beam.length_m)
 
 
-def test_a_recorded_session_shows_its_touches(touch_file, drawn, tmp_path):
+def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
     outcome = {"touches": json.dumps([{"number": 1, "x_m": known(0.6), "time_s": known(1.3)}])}
     session = replace(read_session(touch_file.path), outcome=outcome)
-    timings = np.empty(0, TIMING_DTYPE)
+    timings = make_timings(0)
     found = drawn([lambda stream: draw_session(stream, session, timings)])
     assert "/antenna/touch/1/point" in found
     lines = [

@@ -7,9 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from rigd.session.layout import TIMING_DTYPE
-from rigd.view._plots import HEALTH, READINGS, SIGNALS, send_columns
-from rigd.view._session_info import Health, health_record
+from rigd.view import Health, Scene
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, send_columns
 
 SOURCES = (SIGNALS, READINGS, HEALTH)
 PLOTS = [plot for source in SOURCES for plot in source.plots]
@@ -41,18 +40,29 @@ def test_signals_have_the_unit_their_name_ends_in(make_samples):
     assert len(shown) == 7
 
 
-def test_ages_and_health_have_the_unit_their_name_ends_in():
-    timings = np.zeros(2, TIMING_DTYPE)
-    timings["angle_age_s"], timings["wrench_age_s"] = 1e-3, [0.0, 2.5e-4]
-    assert READINGS.columns(timings)["ages_ms"] == pytest.approx(
-        np.array([[1.0, 0.0], [1.0, 0.25]])
-    )
+def test_ages_have_the_unit_their_name_ends_in(make_timings):
+    shown = READINGS.columns(make_timings(2, angle_age_s=1e-3, wrench_age_s=2.5e-4))
+    assert shown["ages_ms"] == pytest.approx(np.array([[1.0, 0.25]] * 2))
+
+
+@pytest.fixture
+def health_values(subject, shown):
+    """Return what the plots of the health are sent of a reading, by component."""
+
+    def values(health):
+        found = shown(Scene(subject).health(5, health))["/health"]
+        assert set(map(tuple, found.times_ns.values())) == {(5,)}
+        return {name: column[0] for name, column in found.values.items()}
+
+    return values
+
+
+def test_health_has_the_unit_its_name_ends_in(health_values):
     health = Health(
         missed_ticks=3, late_ticks=7, lost_ticks=0, recorder_lag_ticks=80, disk_free_mb=51_234.0,
         view_dropped=1500, bus_load_percent=31.5, bus_errors=2, sensor_status=0x41, rate_hz=999.9,
     )  # fmt: skip
-    shown = HEALTH.columns(health_record(5, health))
-    assert {name: values[0].tolist() for name, values in shown.items()} == {
+    assert health_values(health) == {
         "faulty_ticks": [3.0, 7.0, 0.0],
         "backlog_samples": [80.0, 1500.0],
         "bus_load_percent": [31.5],
@@ -62,9 +72,9 @@ def test_ages_and_health_have_the_unit_their_name_ends_in():
     }
 
 
-def test_what_is_not_known_is_not_drawn_as_a_number():
-    shown = HEALTH.columns(health_record(5, Health(missed_ticks=0)))
-    assert shown["faulty_ticks"][0].tolist() == pytest.approx([0.0, np.nan, np.nan], nan_ok=True)
+def test_what_is_not_known_is_not_drawn_as_a_number(health_values):
+    shown = health_values(Health(missed_ticks=0))
+    assert shown["faulty_ticks"] == pytest.approx([0.0, np.nan, np.nan], nan_ok=True)
     assert np.isnan(shown["bus_load_percent"]).all()
 
 
@@ -106,5 +116,5 @@ def test_rerun_gets_the_columns_at_the_time_of_the_session(shown, make_samples):
 
 
 def test_views_are_imported_without_the_viewer():
-    code = "import sys, rigd.view._scene; sys.exit('rerun' in sys.modules)"
+    code = "import sys; from rigd.view import Scene; sys.exit('rerun' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

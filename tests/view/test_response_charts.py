@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import transfer
 from rigd.spectral import FrequencyResponse, RunningEstimate
-from rigd.view._frequency_charts import (
+from rigd.view.frequency_charts import (
     COHERENCE,
     FIRST_HZ,
     LAST_HZ,
@@ -18,7 +18,7 @@ from rigd.view._frequency_charts import (
     magnitude_db,
     phase_deg,
 )
-from rigd.view._plots import GREY
+from rigd.view.plots import GREY
 
 GRID = np.arange(9601) / 160.0
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.view._layout import CLOSE_UP_S, TIME_VIEWS, Scale, TimeView, missing_ticks
-from rigd.view._plots import COUPLING_TORQUE, HEALTH, LOOP, READINGS, SIGNALS, Plot
+from rigd.view.plots import COUPLING_TORQUE, HEALTH, LOOP, READINGS, SIGNALS, Plot
 
 RATE_HZ = 1000
 BLOCK = 100

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rigd.spectral import RunningSpectrogram
-from rigd.view._frequency_charts import (
+from rigd.view.frequency_charts import (
     HIGHEST_DB,
     LOWEST_DB,
     MOST_COLUMNS,

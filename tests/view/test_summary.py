@@ -1,6 +1,8 @@
 """The state of a session at one look."""
 
-from rigd.view._session_info import Health, summary
+import pytest
+
+from rigd.view import Health, Scene
 
 WELL = Health(
     missed_ticks=0, late_ticks=0, lost_ticks=0, recorder_lag_ticks=17, disk_free_mb=51_234.0,
@@ -16,8 +18,19 @@ def rows(text: str) -> dict[str, str]:
     return dict([lines[0], *lines[2:]])
 
 
-def test_a_session_that_goes_well(subject):
-    assert rows(summary(subject, 43_200_000_000, WELL)) == {
+@pytest.fixture
+def summary(subject, shown):
+    """Return the text that is shown of a reading of the health."""
+
+    def text(t_ns, health):
+        found = shown(Scene(subject).health(t_ns, health))
+        return found["/summary"].last("TextDocument:text")
+
+    return text
+
+
+def test_a_session_that_goes_well(summary):
+    assert rows(summary(43_200_000_000, WELL)) == {
         "session": "43 of 136 s",
         "rate": "1000.0 Hz",
         "missed ticks": "0",
@@ -32,10 +45,8 @@ def test_a_session_that_goes_well(subject):
     }
 
 
-def test_what_is_wrong_stands_out(subject):
-    found = rows(
-        summary(subject, 0, Health(missed_ticks=3, lost_ticks=0, bus_errors=2, sensor_status=0x41))
-    )
+def test_what_is_wrong_stands_out(summary):
+    found = rows(summary(0, Health(missed_ticks=3, lost_ticks=0, bus_errors=2, sensor_status=0x41)))
     assert {name for name, text in found.items() if "⚠" in text} == {
         "missed ticks",
         "bus errors",
@@ -45,5 +56,5 @@ def test_what_is_wrong_stands_out(subject):
     assert "3" in found["missed ticks"]
 
 
-def test_what_is_not_known_is_left_out(subject):
-    assert set(rows(summary(subject, 0, Health()))) == {"session"}
+def test_what_is_not_known_is_left_out(summary):
+    assert set(rows(summary(0, Health()))) == {"session"}

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view._chart import Thinning
+from rigd.view.chart import Thinning
 
 GRID = np.arange(9601) / 160.0
 

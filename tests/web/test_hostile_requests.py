@@ -12,7 +12,6 @@ from web_daemon import TOKEN, rig_with_page
 
 from rigd.daemon.address import find
 from rigd.daemon.client import Client
-from rigd.web import _access
 
 START = json.dumps({"command": "start", "excitation": "chirp"}).encode()
 RIGHT = {
@@ -303,8 +302,8 @@ def test_who_says_nothing_or_half_is_let_go(served, hurried):
     assert b" 408 " in served.send(body)
 
 
-def test_connections_of_others_shut_nobody_out(served, monkeypatch):
-    monkeypatch.setattr(_access, "_MOST_CONNECTIONS", 8)
+def test_connections_of_others_shut_nobody_out(served, replace_in_page):
+    replace_in_page(most_connections=8)
     host = f"Host: 127.0.0.1:{served.port}"
     opening = "\r\n".join(f"{name}: {value}" for name, value in handshake().items())
     with contextlib.ExitStack() as ending:

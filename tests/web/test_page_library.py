@@ -12,10 +12,7 @@ from pathlib import Path
 
 import pytest
 from processes import eventually
-from web_daemon import TOKEN
-
-from rigd.web import _jobs, _library
-from rigd.web._jobs import JobError, Jobs
+from web_daemon import MOST_JOBS, TOKEN, JobError, Jobs
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -25,10 +22,10 @@ ACTING = {
 
 
 @pytest.fixture
-def two(served, record_briefly, write_look, monkeypatch):
+def two(served, record_briefly, write_look, replace_in_page):
     """Two sessions, of which one has a quick look and a report."""
     # What runs only while nothing else does may not run for minutes beside the other tests.
-    monkeypatch.setattr(_jobs, "give_way", lambda _: None)
+    replace_in_page(give_way=lambda _: None)
     for name, specimen in (("first", "antenna"), ("second", "")):
         record_briefly(name, day=float(name == "second"), specimen=specimen).replace(
             served.folder / f"{name}.mcap"
@@ -59,11 +56,11 @@ def test_the_rows_are_the_librarys(served, two):
     assert (found["total"], [row["id"] for row in found["sessions"]]) == (2, ["first"])
 
 
-def test_a_list_that_cannot_be_made_is_refused_in_words(served, monkeypatch):
+def test_a_list_that_cannot_be_made_is_refused_in_words(served, replace_in_page):
     status, _, told = get(served, "/api/sessions?since=abc")
     assert status == 400
     assert "abc" in told["error"]
-    monkeypatch.setattr(_library, "list_sessions", {}.popitem)
+    replace_in_page(list_sessions={}.popitem)
     status, _, told = get(served, "/api/sessions")
     assert status == 500
     assert "The page's server failed: " in told["error"]
@@ -118,9 +115,9 @@ def test_another_format_is_made_and_sent(served, two):
 
 @pytest.mark.usefixtures("two")
 @pytest.mark.parametrize("begun", [True, False], ids=["running", "behind another job"])
-def test_a_session_ends_the_wait_for_another_format(served, monkeypatch, tmp_path, begun):
+def test_a_session_ends_the_wait_for_another_format(served, replace_in_page, tmp_path, begun):
     assert eventually(lambda: not served.server._jobs.paused)
-    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", PATIENT, str(tmp_path)))
+    replace_in_page(program=(sys.executable, "-c", PATIENT, str(tmp_path)))
     if not begun:
         assert served.ask("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
     try:
@@ -150,10 +147,9 @@ while not (folder / "end").exists():
 
 
 @pytest.fixture
-def jobs(tmp_path, monkeypatch):
+def jobs(tmp_path, replace_in_page):
     """Jobs whose program runs the Python code it is given."""
-    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c"))
-    monkeypatch.setattr(_jobs, "_LOOK_S", 0.02)
+    replace_in_page(program=(sys.executable, "-c"), poll_s=0.02)
     told = []
     jobs = Jobs(tmp_path, told.append)
     jobs.told = told
@@ -286,7 +282,7 @@ def test_what_became_of_a_job_is_told(jobs):
 
 def test_only_so_many_jobs_wait(jobs):
     async def scenario():
-        for _ in range(_jobs.MOST_JOBS + 1):
+        for _ in range(MOST_JOBS + 1):
             await asyncio.sleep(0)
             jobs.put("report", ["pass"])
         with pytest.raises(JobError):
@@ -295,8 +291,10 @@ def test_only_so_many_jobs_wait(jobs):
     run(jobs, scenario)
 
 
-def test_a_report_and_a_campaign_are_queued_with_the_token(served, two, monkeypatch):
-    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", "pass"))
+def test_a_report_and_a_campaign_are_queued_with_the_token(
+    served, two, monkeypatch, replace_in_page
+):
+    replace_in_page(program=(sys.executable, "-c", "pass"))
     told = []
     monkeypatch.setattr(served.server._jobs, "_tell", told.append)
     status, _, body = served.ask("POST", "/api/sessions/first/report", ACTING, b"{}")
@@ -310,9 +308,9 @@ BOTH = ["report", "campaign"]
 
 
 @pytest.mark.usefixtures("two")
-def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch):
+def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch, replace_in_page):
     making = "import os, sys; os.mkdir(sys.argv[-1])"  # at its end, and never over another
-    monkeypatch.setattr(_jobs, "_PROGRAM", (sys.executable, "-c", making))
+    replace_in_page(program=(sys.executable, "-c", making))
     told = []
     monkeypatch.setattr(served.server._jobs, "_tell", told.append)
     ids = json.dumps({"ids": ["first", "second"]}).encode()

@@ -19,7 +19,6 @@ from processes import eventually
 from web_daemon import TOKEN
 
 from rigd.excitation import KINDS
-from rigd.web import _library, _live, _server
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -266,8 +265,10 @@ def test_a_daemon_that_falls_silent_or_goes_is_told_within_a_second(served, page
     assert gone_s < 1.0
 
 
-def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(served, pages, monkeypatch):
-    monkeypatch.setattr(_live, "_MOST_WAITING", 20)
+def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(
+    served, pages, replace_in_page
+):
+    replace_in_page(most_waiting=20)
     stopped = served.connect()
     stopped.sendall(
         f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nConnection: Upgrade\r\n"
@@ -295,8 +296,8 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_are_not(served, pag
         served.server.pages._events.clear()
 
 
-def test_no_more_pages_than_there_is_room_for(served, pages, monkeypatch):
-    monkeypatch.setattr(_live, "MOST_PAGES", 1)
+def test_no_more_pages_than_there_is_room_for(served, pages, replace_in_page):
+    replace_in_page(most_pages=1)
 
     async def scenario(session):
         async with session.ws_connect("/api/live") as socket:
@@ -328,9 +329,9 @@ def begin(served):
     assert eventually(lambda: served.server._session is None)
 
 
-def test_the_response_of_a_search_is_that_of_its_scan(served, begin, monkeypatch):
+def test_the_response_of_a_search_is_that_of_its_scan(served, begin, replace_in_page):
     begun = []
-    monkeypatch.setattr(_server, "SessionResponse", begun.append)
+    replace_in_page(response=begun.append)
     excitation = KINDS["until"](rate_hz=1000, targets="damping 1%", at_most_s=60)
     begin("out/1-until.mcap", excitation)
     assert eventually(lambda: begun)
@@ -454,7 +455,7 @@ def test_control_is_given_back_after_a_series_that_ends_before_its_reply(served,
 
 
 @pytest.mark.usefixtures("asked_before")
-def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, monkeypatch):
+def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, replace_in_page):
     began, go_on, at_once = threading.Event(), threading.Event(), []
 
     def list_slowly(_):
@@ -464,7 +465,7 @@ def test_a_stop_does_not_wait_for_lists_of_sessions(served, pages, monkeypatch):
         at_once.pop()
         return []
 
-    monkeypatch.setattr(_library, "list_sessions", list_slowly)
+    replace_in_page(list_sessions=list_slowly)
 
     async def scenario(session):
         listings = [asyncio.create_task(session.get("/api/sessions")) for _ in range(40)]

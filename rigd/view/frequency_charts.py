@@ -10,8 +10,8 @@ import numpy.typing as npt
 from rigd.beam import Beam, Damping, transfer
 from rigd.session.layout import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
-from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
-from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
+from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
+from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -244,7 +244,15 @@ class ResponseCharts:
                 )
 
     def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
-        """Take what is known of the response at a time of the session."""
+        """Take what is known of the response at a time of the session.
+
+        Parameters
+        ----------
+        t_ns
+            Time since the start of the session.
+        estimate
+            The response so far.
+        """
         response = estimate.response.without_delays(**self._delays_s)
         grid = response.frequency_hz
         if self._thinning is None or self._thinning.grid.size != grid.size:
@@ -321,7 +329,7 @@ def phase_deg(response: Complex) -> Real:
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.view import phase_deg
+    >>> from rigd.view.frequency_charts import phase_deg
     >>> print(phase_deg(np.array([1.0, 1j, -1.0, -1j])))
     [  0.  90. 180. -90.]
     """
@@ -503,7 +511,15 @@ class SpectrogramChart:
         self._bar.draw_frame(stream)
 
     def update(self, t_ns: int, columns: Sequence[tuple[float, Real]]) -> None:
-        """Take columns: the middle of their window in s, and their levels (m,) in dB re 1 N·m."""
+        """Take columns of the spectrogram.
+
+        Parameters
+        ----------
+        t_ns
+            Time since the start of the session.
+        columns
+            The middle of each column's window in s, and its levels (m,) in dB re 1 N·m.
+        """
         self._t_ns = t_ns
         for time_s, level_db in columns:
             slot = min(max(int(time_s / self._slot_s), 0), self._image.shape[1] - 1)

@@ -43,7 +43,13 @@ _HOPELESS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """In the place of a result: what became of the worker, each time the task was tried."""
+    """Stands in for the result of a task whose worker ended each time it was tried.
+
+    Attributes
+    ----------
+    reason : str
+        What became of the worker.
+    """
 
     reason: str
 
@@ -56,7 +62,7 @@ def available_cores() -> int:
         return os.cpu_count() or 1
 
 
-def unheard(_number: int) -> None:
+def _unheard(_number: int) -> None:
     """Do without progress."""
 
 
@@ -66,6 +72,11 @@ class Workers:
     A process that ends by itself (killed for lack of memory, mostly) takes other tasks with it:
     all that are under way in a pool, or those that wait at the same worker of a cluster. They are
     tried once more, each alone, so that only the one that ends its process is lost.
+
+    Parameters
+    ----------
+    executor : Executor
+        Runs the tasks.
     """
 
     _died: type[Exception] = BrokenExecutor
@@ -84,7 +95,7 @@ class Workers:
         self,
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
-        on_done: Callable[[int], None] = unheard,
+        on_done: Callable[[int], None] = _unheard,
     ) -> list[Result | Lost]:
         """Call a function with every tuple of arguments.
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rigd.view._chart import LABEL_DROP
 from rigd.view._gauges import NEAR, Gauge
-from rigd.view._plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
 from rigd.view._session_info import plain
+from rigd.view.chart import LABEL_DROP
+from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -140,7 +140,21 @@ def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str
 def send_banner(
     stream: "RecordingStream", subject: "Subject", state: State, t_ns: int, health: "Health"
 ) -> None:
-    """Show the banner of one moment."""
+    """Show the banner of one moment.
+
+    Parameters
+    ----------
+    stream
+        Takes the drawing.
+    subject
+        The session.
+    state
+        Its state.
+    t_ns
+        Time since its start.
+    health
+        The readings of that time.
+    """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
@@ -229,7 +243,19 @@ def gauge_color(gauge: Gauge) -> Color:
 def send_values(
     stream: "RecordingStream", state: State, t_ns: int, gauges: Mapping[str, Gauge]
 ) -> None:
-    """Draw the band in the state's colour, and bars of the values up to their limits."""
+    """Draw the band in the state's colour, and bars of the values up to their limits.
+
+    Parameters
+    ----------
+    stream
+        Takes the drawing.
+    state
+        State of the session.
+    t_ns
+        Time since its start.
+    gauges
+        Values and limits by name, as of `rigd.view.Gauges`.
+    """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

@@ -62,7 +62,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     import rerun as rr
 
     from rigd.session import rename_new
-    from rigd.view._plots import APPLICATION_ID
+    from rigd.view.plots import APPLICATION_ID
 
     check_new(path)
     part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")

@@ -146,7 +146,25 @@ class Table:
         selected: int | None = None,
         grouped: bool = False,
     ) -> Table:
-        """Make a table whose rows have their entries in the order of the columns."""
+        """Make a table whose rows have their entries in the order of the columns.
+
+        Parameters
+        ----------
+        name : str
+            Name of its file, without suffix.
+        caption : str
+            Title.
+        columns : sequence of Column
+            The columns.
+        rows : iterable of sequence
+            Entries of each row.
+        notes : sequence of str, optional
+            Sentences below it.
+        selected : int, optional
+            Number of the row that is marked.
+        grouped : bool
+            Whether rows with the same first entry are ruled off from the others.
+        """
         keys = [column.key for column in columns]
         by_key = tuple(dict(zip(keys, row, strict=True)) for row in rows)
         return cls(name, caption, tuple(columns), by_key, tuple(notes), selected, grouped)
@@ -182,6 +200,13 @@ def with_validity(table: Table, validity: Validity) -> Table:
     """State in a table that stands alone how exact the linear model is for its numbers.
 
     People read it under the table; programs have it in each row.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+    validity : Validity
+        How exact the linear model is.
     """
     stated = {
         "predicted_peak_tip_slope_rad": validity.predicted_peak_tip_slope_rad,
@@ -268,7 +293,7 @@ def latex_text(text: str) -> str:
 
     Examples
     --------
-    >>> from analysis.report._table import latex_text
+    >>> from analysis.report.table import latex_text
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
@@ -323,7 +348,17 @@ def latex_table(table: Table) -> str:
 
 
 def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Cell:
-    """Show `value` times `factor` in a format; a dash if it is not known or not finite."""
+    """Return a cell that shows a number; a dash if it is not known or not finite.
+
+    Parameters
+    ----------
+    value : float or None
+        The number, in SI units.
+    form : str
+        Format, as of `format`.
+    factor : float
+        Factor of the number shown.
+    """
     if value is None or not math.isfinite(value):
         return Cell(None, ABSENT)
     return Cell(float(value), f"{factor * value:{form}}".replace("-", "−"))
@@ -337,7 +372,17 @@ def count(value: int) -> Cell:
 def estimate(
     values: Sequence[float | None], std: float | None, factor: float = 1.0
 ) -> tuple[Cell, ...]:
-    """Show numbers that are uncertain by `std`, all to its second digit."""
+    """Return cells that show numbers to the second digit of their standard deviation.
+
+    Parameters
+    ----------
+    values : sequence of float or None
+        The numbers, in SI units.
+    std : float or None
+        Standard deviation of all of them.
+    factor : float
+        Factor of the numbers shown.
+    """
     return tuple(
         number(value, factor=factor)
         if value is None or not math.isfinite(value)

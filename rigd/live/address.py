@@ -90,7 +90,15 @@ class LiveAddress:
 
 
 def proxy_url(host: str, grpc_port: int) -> str:
-    """Return where the SDK and native viewers connect to a server."""
+    """Return the address at which the SDK and native viewers connect to a server.
+
+    Parameters
+    ----------
+    host
+        Name or number of the computer.
+    grpc_port
+        Port of the server.
+    """
     return f"rerun+http://{host}:{grpc_port}/proxy"
 
 

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns import lost_trials, specimens
+from analysis.campaigns.sentences import lost_trials, specimens
 from analysis.identify import EXACT_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
-from analysis.report._folder import write_new
 from analysis.report._paper_tables import paper_tables, welch_text
-from analysis.report._table import csv_text
 from analysis.report._text import as_text, spaced
+from analysis.report.folder import write_new
+from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
@@ -95,7 +95,15 @@ def campaign_tables(
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
-    """Return the same as plain text, with the files that were left out."""
+    """Return the tables as plain text, with the files that were left out.
+
+    Parameters
+    ----------
+    campaign : CampaignResult
+        The results.
+    with_paper : bool
+        Whether the paper's numbers are shown with them.
+    """
     left_out = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
     return as_text(Group(campaign_tables(campaign, with_paper=with_paper), *left_out))
 

@@ -6,8 +6,8 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from analysis.report._document import document_text, versions
-from analysis.report._folder import write_new
-from analysis.report._table import WORDS, Cell, Column, Entry, Table, csv_text, number
+from analysis.report.folder import write_new
+from analysis.report.table import WORDS, Cell, Column, Entry, Table, csv_text, number
 from analysis.results import DEFAULT_FORMATS, finite
 from rigd.units import decimals, with_half_width
 

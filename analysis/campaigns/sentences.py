@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._pooling import PooledEstimate, PooledMode
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
+    from analysis.campaigns.pooling import PooledEstimate, PooledMode
     from analysis.identify import Order, Size
 
 
@@ -61,7 +61,7 @@ def with_unit(parameter: str) -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns import with_unit
+    >>> from analysis.campaigns.sentences import with_unit
     >>> with_unit("zeta"), with_unit("frequency_hz_2")
     ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
     """
@@ -74,7 +74,7 @@ def probability(chance: float) -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns import probability
+    >>> from analysis.campaigns.sentences import probability
     >>> probability(0.0312), probability(0.0)
     ('0.031', '< 1e-99')
     """
@@ -86,7 +86,7 @@ def percent(share: float) -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns import percent
+    >>> from analysis.campaigns.sentences import percent
     >>> percent(0.4321), percent(0.99999)
     ('43.2 %', '> 99.9 %')
     """
@@ -350,7 +350,19 @@ def selected(
     alone: Mapping[str, int],
     sessions: int,
 ) -> str:
-    """Say what all sessions together would select, what it cannot be told from, and who agrees."""
+    """Name the structure that all sessions together select, its equals, and who agrees.
+
+    Parameters
+    ----------
+    ranked : sequence of PooledEstimate
+        The lowest BIC first.
+    close : sequence of PooledEstimate
+        Those whose BIC does not distinguish them from the first.
+    alone : mapping of str to int
+        How many sessions select each structure by themselves.
+    sessions : int
+        Number of sessions.
+    """
     best = ranked[0]
     said = f"Lowest BIC: type {best.name}."
     if close:
@@ -367,7 +379,17 @@ def selected(
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
-    """Say whether what the structure leaves is noise."""
+    """Say whether the residual of a structure is noise.
+
+    Parameters
+    ----------
+    best : PooledEstimate
+        Estimate of that structure.
+    adequate : int
+        Sessions whose residual is noise.
+    sessions : int
+        Number of sessions.
+    """
     if best.misfit > LARGEST_MISFIT:
         return (
             f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
@@ -377,7 +399,15 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
 
 
 def noise_alone(adequate: int, sessions: int) -> str:
-    """Say in how many sessions the residual is noise."""
+    """Say in how many sessions the residual is noise.
+
+    Parameters
+    ----------
+    adequate : int
+        Sessions whose residual is noise.
+    sessions : int
+        Number of sessions.
+    """
     if adequate == sessions:
         return "The residual is noise in every session: the model suffices for these records."
     return (
@@ -387,7 +417,17 @@ def noise_alone(adequate: int, sessions: int) -> str:
 
 
 def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
-    """Say how the modes are damped; of a mixture, that it is one."""
+    """Say how the modes are damped.
+
+    Parameters
+    ----------
+    found : sequence of PooledMode
+        The modes.
+    sessions : int
+        Number of sessions.
+    mixed : bool
+        Whether the sessions are of several specimens.
+    """
     if not found:
         return []
     t = student_t_quantile(0.95, sessions - 1)
@@ -483,7 +523,15 @@ def _biased(each: ParameterBias) -> str:
 
 
 def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
-    """Name the sessions, with what they select, that by themselves dismiss it."""
+    """Name the sessions that by themselves exclude the structure selected by all together.
+
+    Parameters
+    ----------
+    who : sequence of tuple
+        File of each session, and the structure that it selects.
+    best : PooledEstimate
+        Estimate of the structure that all select.
+    """
     if not who:
         return []
     names = ", ".join(f"{file} (type {structure})" for file, structure in who[:_MANY])
@@ -517,7 +565,17 @@ def scatter(best: PooledEstimate) -> str:
 
 
 def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
-    """Say how well the sessions predict one that they have not seen."""
+    """Say how well the sessions predict one that they have not seen.
+
+    Parameters
+    ----------
+    best : PooledEstimate
+        Estimate of the structure in question.
+    validation : sequence of LeftOutError
+        Errors of sessions predicted from the others.
+    sessions : int
+        Number of sessions.
+    """
     of_best = [each for each in validation if each.method == "record" and each.name == best.name]
     own = [each.own_error for each in of_best if each.own_error is not None]
     if not own:
@@ -558,7 +616,15 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
 
 
 def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
-    """Say what single sessions find, and how many of them."""
+    """Say what single sessions find, and how many of them.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+        Number of sessions by what they find.
+    sessions : int
+        Number of sessions.
+    """
     (first, count), *others = counts.items()
     more = "".join(f", {what} in {n}" for what, n in others)
     return f"Single sessions: {first} in {count} of {sessions}{more}."

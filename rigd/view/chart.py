@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rigd.view._plots import GREY, Color
+from rigd.view.plots import GREY, Color
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -399,7 +399,7 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
 
     Examples
     --------
-    >>> from rigd.view._chart import decades
+    >>> from rigd.view.chart import decades
     >>> decades(0.5, 20.0)[0]
     (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     """
@@ -426,7 +426,7 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
 
     Examples
     --------
-    >>> from rigd.view._chart import steps
+    >>> from rigd.view.chart import steps
     >>> steps(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """

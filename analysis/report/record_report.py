@@ -11,10 +11,10 @@ from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
-from analysis.report._folder import write_new
-from analysis.report._table import Table, csv_text, latex_table, with_validity
 from analysis.report._text import damping_sentences, tables_text
 from analysis.report._uniformity import UNIFORMITY, uniformity_table
+from analysis.report.folder import write_new
+from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
