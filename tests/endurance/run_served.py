@@ -26,7 +26,7 @@ from run_campaign import Look, growth_table
 from run_starved import judge
 from run_viewers import Reading, children
 
-from rigd.live import running
+from rigd.live.address import running
 
 RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from run_viewers import Reading
 
-from rigd.live import running
+from rigd.live.address import running
 from rigd.safety.limits import OVERLOADED
 from rigd.session import read_session
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench.measure import measurement
-from rigd.live import Viewer, running
+from rigd.live import Viewer
 from rigd.live._program import RerunProgram
-from rigd.live.address import LiveAddress
+from rigd.live.address import LiveAddress, running
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

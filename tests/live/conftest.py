@@ -14,8 +14,8 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine import Ring, create_channels, shared_memory_fd
-from rigd.engine.channels import TOPICS, Channels
+from rigd.engine import Ring, shared_memory_fd
+from rigd.engine.channels import TOPICS, Channels, create_channels
 from rigd.engine.messages import Failed, MessageReader, encode
 from rigd.engine.shared_state import Event, SharedState, Word, write_event
 from rigd.live.address import LiveAddress

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rigd.devices.running_simulator import SimulatorAddress, announce, find_simulator
-from rigd.runtime import runtime_folder as current_folder
+from rigd.runtime.addresses import runtime_folder as current_folder
 
 
 @pytest.fixture
