@@ -1,10 +1,9 @@
 """What moves with an identified model leave, against what their plan states.
 
 Rigs with a tip mass, an elastic clamp, more or less friction than the controller compensates, and a
-sensor without noise are each identified from one chirp of 20 s (``--identify``). A tip mass is
-also moved with the model of the same analysis in which each mode has a stiffness of its own. Moves
-are run with each model; a quintic of the same time is run with them. The torque of the modes left
-is measured as in ``bench_moves.py``, with the noise of the sensor and without.
+sensor without noise are each identified from one chirp of 20 s (``--identify``). Moves are run with
+the model; a quintic of the same time is run with them. The torque of the modes left is measured as
+in ``bench_moves.py``, with the noise of the sensor and without.
 
 Printed per move: the vibration in the record, the same with a sensor without noise, the same of the
 quintic, and its ratio; what the plan states and the floor below which it says that nothing is
@@ -60,24 +59,6 @@ def run(profile: Path, *arguments: str) -> Path:
     return Path(json.loads(done.stdout)["sessions"][0]["path"])
 
 
-def with_free_modes(model: Path) -> Path | None:
-    """Write the model whose modes have stiffnesses of their own, if the analysis fitted one."""
-    document = json.loads(model.read_text())
-    fits = [fit for fit in document["fits"] if fit.get("candidate", "").endswith(", modes free")]
-    if not fits:
-        return None
-    best = min(fits, key=lambda fit: fit["cost"])
-    parameters = {
-        name: {"value": value, "std": best["std"][name]}
-        for name, value in best["parameters"].items()
-    }
-    of_modes = document["headlines"][0]["modes"]
-    headline = {"file": "free modes", "parameters": parameters, "modes": of_modes, "named": []}
-    path = model.with_name("free-modes.json")
-    path.write_text(json.dumps({"headlines": [headline]}))
-    return path
-
-
 def main() -> None:
     """Print a table of all moves."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -91,7 +72,7 @@ def main() -> None:
 
 
 def one_rig(name: str, folder: Path, identify_s: float) -> None:
-    """Identify a rig, and move it with each model."""
+    """Identify a rig, and move it with the model."""
     profiles = []
     for kind, other in (("noisy", {}), ("silent", SILENT)):
         (folder / kind).mkdir()
@@ -104,8 +85,6 @@ def one_rig(name: str, folder: Path, identify_s: float) -> None:
         capture_output=True,
     )
     one_model(name, profiles, model)
-    if "tip" in name and (free := with_free_modes(model)) is not None:
-        one_model(f"{name}, free modes", profiles, free)
 
 
 def one_model(name: str, profiles: list[Path], model: Path) -> None:
