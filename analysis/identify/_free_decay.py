@@ -82,7 +82,7 @@ def mode_poles(
         k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
         for pole in pair[: 1 if pair[0].imag else 2]:
             moved = pole_gradient(complex(pole), k4_per_m4, plant.beam, plant.damping, wrt)
-            found.append(Pole(i + 1, complex(pole), moved))
+            found.append(Pole(i + 1, complex(pole), moved.astype(np.complex128, copy=False)))
     return tuple(found)
 
 
