@@ -29,7 +29,7 @@ from rigd.session import read_session
 from rigd.testing import write_profile
 
 ANGLES_RAD = (0.1, 0.4, 0.8)
-SILENT = {"simulation.torque_noise_nm": 1e-9, "simulation.force_noise_n": 1e-9}
+SILENT = {"simulation.torque_noise_nm": 0.0, "simulation.force_noise_n": 0.0}
 RIGS: dict[str, dict[str, float]] = {
     "uniform": {},
     "friction 0.02": {"motor.coulomb_nm": 0.02},
