@@ -125,15 +125,7 @@ class OnlineEstimate:
         untold = {name for name in COEFFICIENT_OF if name in told.flags}
         if not untold or fit is not told.fit:
             return fit
-        at_ends = _named(fit.plant)
-        simple = (
-            each
-            for each in analysis.fits
-            if each.structure is INTEGER
-            and not each.plant.stiffness_offsets
-            and _named(each.plant) == at_ends
-        )
-        return next(simple, fit)
+        return next((each for each in analysis.fits if each.structure is INTEGER), fit)
 
     @property
     def plant(self) -> Plant | None:
@@ -177,11 +169,6 @@ class OnlineEstimate:
             }
             del content["file"]
         return dict(finite(content))
-
-
-def _named(plant: Plant) -> set[str]:
-    """Names of what a rig has beside the beam."""
-    return {name for name, size in plant.extras.items() if size}
 
 
 def _noise(analysis: RecordAnalysis) -> dict[str, Any]:

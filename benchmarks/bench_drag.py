@@ -23,7 +23,7 @@ from analysis.identify import select
 
 AMPLITUDES_RAD = (0.025, 0.0125, 0.00625)
 DIAMETERS_M = (0.5e-3, 1e-3, 2e-3)
-FALSE = ("delay", "beam data", "not uniform", "tool inertia", "elastic clamp", "tip mass")
+FALSE = ("delay", "beam data", "tool inertia", "rival explanations")
 """Kinds of findings that drag passed for."""
 
 

@@ -278,7 +278,7 @@ def scored(
     (headline,), (entry,) = results["headlines"], results["records"]
     contains = containing(truth)
     curves = entry["curves"]
-    own = _own(record, truth, contains[0], loss_frequencies_hz(curves))
+    own = _own(record, truth, contains[0], loss_frequencies_hz(curves)) if contains else []
     of_name = {name: [each for each in own if each.name == name] for name in names_of(own)}
     return Scored(
         cell=name,
@@ -300,9 +300,7 @@ def scored(
 
 def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) -> list[Told]:
     """Fit the true structure, and nothing else."""
-    uniform = not any(truth.offsets)
-    structure = STRUCTURES[name.partition(",")[0]]
-    (fit,) = fit_record(Measurement.of_record(record), [structure], uniform=uniform).fits
+    (fit,) = fit_record(Measurement.of_record(record), [STRUCTURES[name]]).fits
     entries = [
         Told(key, truth.parameters[key], fit.parameters[key], ends)
         for key, ends in fit.interval.items()

@@ -57,7 +57,7 @@ def rig(folder: Path, number: int) -> tuple[Path, Path]:
         "beam.damping.gamma": nominal.damping.gamma * off[3],
     }
     values = {key: value if key == "name" else float(value) for key, value in values.items()}
-    silent = {"simulation.torque_noise_nm": 1e-9, "simulation.force_noise_n": 1e-9}
+    silent = {"simulation.torque_noise_nm": 0.0, "simulation.force_noise_n": 0.0}
     profiles = []
     for kind, other in (("noisy", {}), ("silent", silent)):
         where = folder / f"{kind}-{number}"

@@ -10,6 +10,7 @@ sessions are those of ``exact_sessions.py``.
 
 import argparse
 import csv
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,15 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_record, select
+from analysis.identify import (
+    Plant,
+    RecordFit,
+    ResponseGrid,
+    Selection,
+    fit_record,
+    mode_poles,
+    select,
+)
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
 from rigd.beam import Beam, Damping, modes
@@ -94,45 +103,40 @@ def table3(count: int) -> dict[str, PaperRoute]:
     return routes
 
 
-def record_method(count: int) -> tuple[list[Selection], list[RecordFit]]:
+def record_method(count: int) -> list[Selection]:
     """Print what the whole-record method says of the beam that is not uniform."""
     made = session(NOT_UNIFORM)
     found = [select(made.noisy(seed).measurement()) for seed in range(count)]
-    chosen = [(each.verdict.structure, each.verdict.uniform) for each in found]
-    print(f"\nWhole record, not uniform, {count} sessions; selected (type, uniform):")
-    for each in sorted(set(chosen)):
-        print(f"  {chosen.count(each)} times {each}")
+    print(f"\nWhole record, not uniform, {count} sessions")
+    tests = [each.headline.uniform_beam for each in found]
+    statuses = ["not tested" if test is None else test.status for test in tests]
+    print(f"  uniform beam: {dict(Counter(statuses))}")
     for order in ("alpha", "lambda_"):
-        statuses = [getattr(each.verdict, order).status for each in found]
-        print(f"  {order}: { {s: statuses.count(s) for s in sorted(set(statuses))} }")
-    fits = [
-        fit_record(made.noisy(seed).measurement(), [STRUCTURES["VI"]], uniform=False).fits[0]
-        for seed in range(count)
-    ]
-    truth = NOT_UNIFORM.parameters
-    print(f"{'parameter':26}{'truth':>10}  selected          VI, modes free")
-    for parameter in truth:
-        cells = []
-        for kind in ([each.fit for each in found], fits):
-            values = np.array([each.parameters.get(parameter, np.nan) for each in kind])
-            cells.append(f"{np.nanmean(values):9.4g} ± {np.nanstd(values, ddof=1):6.2g}")
-        print(f"{parameter:26}{truth[parameter]:10.4g}  " + "  ".join(cells))
-    worse: dict[str, list[float]] = {}
-    for each in found:
-        for row in each.verdict.table:
-            worse.setdefault(f"{row.structure}{'' if row.uniform else ' free'}", []).append(
-                row.delta_bic
+        print(f"  {order}: {dict(Counter(getattr(e.verdict, order).status for e in found))}")
+    print(f"  {'mode':26}{'truth':>10}  mean ± std of the sessions; typical std stated; flags")
+    for place, pole in enumerate(mode_poles(NOT_UNIFORM, 3, ())):
+        at = pole.at_rad_s
+        for name, unit, truth, size in (
+            ("frequency_hz", "Hz", at.imag / (2 * np.pi), 1.0),
+            ("damping_ratio", "%", -100 * at.real / abs(at), 100.0),
+        ):
+            numbers = [getattr(each.headline.modes[place], name) for each in found]
+            values = size * np.array([each.value for each in numbers])
+            stated = size * np.median([each.std for each in numbers])
+            flags = sum(each.flag is not None for each in numbers)
+            print(
+                f"  {f'{name} of mode {pole.mode}, {unit}':26}{truth:10.5g}  "
+                f"{values.mean():.5g} ± {values.std(ddof=min(1, count - 1)):.2g}; "
+                f"{stated:.2g}; {flags}"
             )
-    for name, values in worse.items():
-        print(f"  BIC of {name:9} above the lowest: {min(values):.0f} to {max(values):.0f}")
-    uniform = [
-        candidate.fit.parameters["alpha"]
-        for each in found
-        for candidate in each.candidates
-        if candidate.structure.name == "VI" and candidate.uniform
-    ]
-    print(f"  alpha of VI on a uniform beam: {np.mean(uniform):.3f} ± {np.std(uniform):.3f}")
-    return found, fits
+    alphas = [fit.parameters["alpha"] for fit in _type_vi(found)]
+    print(f"  alpha of VI on a uniform beam: {np.mean(alphas):.3f} ± {np.std(alphas):.3f}")
+    return found
+
+
+def _type_vi(found: list[Selection]) -> list[RecordFit]:
+    """Fits of type VI to each session, whether a uniform beam is refused or not."""
+    return [next(c.fit for c in each.candidates if c.structure.name == "VI") for each in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,10 +237,12 @@ def main() -> None:
         if given.figures:
             draw.weights(given.figures, routes["not uniform"].parameters, session(NOT_UNIFORM))
     if given.part in (None, "record"):
-        selections, free = record_method(given.sessions)
+        selections = record_method(given.sessions)
         if given.figures:
             route = PaperRoute.of(session(NOT_UNIFORM), given.sessions)
-            draw.order(given.figures, route.parameters, [each.fit for each in selections], free)
+            uniform = [fit.parameters["alpha"] for fit in _type_vi(selections)]
+            modes_found = selections[0].headline.modes
+            draw.order(given.figures, route.parameters, np.array(uniform), modes_found)
     if given.part in (None, "first_peak"):
         peaks = first_peaks()
         if given.figures:

@@ -143,11 +143,7 @@ def times(plant: str) -> None:
     print(f"\nPlant of type {plant}, CPU s")
     for name, structure in STRUCTURES.items():
         spent = cpu_s(lambda one=structure: fit_record(measurement, [one]))
-        line = f"type {name:4} {spent:.3f}"
-        if name in ("III", "VII"):
-            spent = cpu_s(lambda one=structure: fit_record(measurement, [one], uniform=False))
-            line += f", stiffness of each mode free {spent:.3f}"
-        print(line, flush=True)
+        print(f"type {name:4} {spent:.3f}", flush=True)
     print(f"all seven {cpu_s(lambda: fit_record(measurement), 3):.3f}", flush=True)
 
 

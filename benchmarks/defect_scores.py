@@ -33,8 +33,6 @@ _STATED_STIFFNESS = 0.090275
 _OF_EFFECT = {
     "delay": "delay_s",
     "tool inertia": "tool_inertia_kg_m2",
-    "tip mass": "tip_mass_kg",
-    "elastic clamp": "root_nm_per_rad",
     "air drag": "drag_m",
 }
 """True value that a named effect's size is compared with."""
@@ -337,7 +335,7 @@ def _false_effects(
             continue
         true = _true_size(entry, ranges)
         if true is not None:
-            if what in truth["effects"] and what != "tip mass":
+            if what in truth["effects"]:
                 # Its size is an idealisation: that it is there is what counts.
                 continue
             if _deviation(value, (interval[0], interval[1]), true) > FAR:

@@ -264,14 +264,16 @@ def containing(truth: Truth) -> tuple[str, ...]:
     Parameters
     ----------
     truth : Truth
+        One whose beam is not uniform is a case of none.
     """
+    if any(truth.offsets):
+        return ()
     types = ["VI"]
     if truth.alpha == 1:
         types.insert(0, "VII")
         if truth.lambda_ == 1:
             types.insert(0, "III")
-    beams = ("{}, modes free",) if any(truth.offsets) else ("{}", "{}, modes free")
-    return tuple(beam.format(name) for beam in beams for name in types)
+    return tuple(types)
 
 
 def wilson(hits: float, of: int) -> Interval:

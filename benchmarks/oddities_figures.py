@@ -11,7 +11,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from analysis.identify import ResponseGrid
 from analysis.report import _style as style
-from analysis.report.bands import loss_factors
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import RecordFit
+    from analysis.identify import Mode
     from rigd.spectral import FrequencyResponse
 
     Parameters = dict[tuple[str, str], dict[str, NDArray[np.float64]]]
@@ -124,26 +123,24 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
         _save(figure, folder / "paper_method_first_peak.png")
 
 
-def order(folder: Path, found: Parameters, fits: list[RecordFit], free: list[RecordFit]) -> None:
+def order(
+    folder: Path, found: Parameters, uniform: NDArray[np.float64], modes: tuple[Mode, ...]
+) -> None:
     """Draw loss factors that follow from what is found, and alpha session by session."""
     hz = np.geomspace(1.0, 50.0, 300)
     true = Damping(7.1e-5, 1.0, 5.5e-2, 0.594)
     with style.styled():
         figure = style.new_figure(
             10.0, 4.0, "Three stiffness offsets, read as a fractional order",
-            f"{len(fits)} sessions of a beam with α = 1 whose modes are +0.6, +0.5 and −1.3 % off "
-            "in stiffness; left: type VI, right: also the structure selected",
+            f"{uniform.size} sessions of a beam with α = 1 whose modes are +0.6, +0.5 and −1.3 % "
+            "off in stiffness; left: type VI on a uniform beam, right: also the modes found",
         )  # fmt: skip
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
         figure.subplots_adjust(0.125, 0.125, 0.985, 0.81, wspace=0.15)
         rows = [
             ("paper's route,\nconstant weights", found["VI", "const"]["alpha"], style.BLUE),
             ("paper's route,\n1/ω weights", found["VI", "omega"]["alpha"], style.VERMILION),
-            (
-                "whole record,\nmodes free",
-                np.array([fit.parameters["alpha"] for fit in free]),
-                style.GREEN,
-            ),
+            ("whole record\n(refused there)", uniform, style.GREEN),
         ]
         for height, (_, alphas, colour) in enumerate(reversed(rows)):
             jitter = np.linspace(-0.18, 0.18, alphas.size)
@@ -170,10 +167,12 @@ def order(folder: Path, found: Parameters, fits: list[RecordFit], free: list[Rec
                     hz, 100 * _loss(damping, hz), linewidth=0.8,
                     label=f"paper's route, {NAMES[weighting]}" if k == 0 else None, **line,
                 )  # fmt: skip
-        band = loss_factors(fits[0], hz).total
-        right.fill_between(
-            hz, *(100 * limit for limit in band.limits()),
-            color=style.GREEN, alpha=0.45, linewidth=0, label="whole record, 95 % band",
+        right.errorbar(
+            [mode.frequency_hz.value for mode in modes],
+            [200 * mode.damping_ratio.value for mode in modes],
+            [2 * 196 * (mode.damping_ratio.std or 0.0) for mode in modes],
+            fmt="D", markersize=4, color=style.GREEN, linewidth=1.2, zorder=6,
+            label="whole record, twice the damping ratio",
         )  # fmt: skip
         for mode, mark in enumerate(np.array([16.045, 100.55, 281.55]) / (2 * np.pi), start=1):
             right.axvline(mark, color=style.FAINT, linewidth=0.8, zorder=0)

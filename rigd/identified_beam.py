@@ -81,8 +81,9 @@ _PARAMETERS: Final[Mapping[str, _Parameter]] = {
         remedy="leave --model out, and expect more vibration than stated",
     ),
 }
-"""All parameters that a document may have. A document with another one is refused, for nobody here
-knows what it changes."""
+"""All parameters that a document may have, of this version or an older one: offsets of modes, the
+compliance of the clamp and the difference of clocks are no longer estimated. A document with
+another parameter is refused, for nobody here knows what it changes."""
 
 _WITHOUT_EFFECT: Final = frozenset(
     {"hum", "sensor drift", "ringing start", "knock", "clipping", "stop"}
@@ -92,8 +93,9 @@ the numbers are flagged."""
 
 _IN_PARAMETERS: Final = frozenset(
     {
-        *("delay", "tool inertia", "beam data", "not uniform", "elastic clamp", "tip mass"),
-        *("torque filter", "clock rate difference", "air drag", "rival explanations"),
+        *("delay", "tool inertia", "beam data", "air drag", "rival explanations"),
+        # Of analyses that fitted other rigs than the uniform beam:
+        *("not uniform", "elastic clamp", "tip mass", "torque filter"),
     }
 )
 """Findings whose size is among the parameters."""
@@ -476,6 +478,7 @@ def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) ->
     flag = entry.get("flag")
     if flag is None:
         return _deviation(entry)
+    # Of analyses that fitted other rigs: the deviation whichever of them is the true one.
     any_rig = finite_number(entry.get("std_any_rig"))
     if any_rig is not None and any_rig > 0:
         return any_rig

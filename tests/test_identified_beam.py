@@ -121,7 +121,9 @@ def test_an_effect_of_no_size_changes_nothing(analysed):
     ("what", "accepted"),
     [
         *((what, True) for what in ("hum", "beam data", "delay", "rival explanations", "knock")),
+        *((what, True) for what in ("not uniform", "elastic clamp", "tip mass", "torque filter")),
         *((what, False) for what in ("nonlinear stiffness", "play", "drifting stiffness")),
+        ("clock rate difference", False),
         *((what, False) for what in ("unexplained", "unit", "of a later version", None)),
     ],
 )

@@ -34,10 +34,8 @@ from ._modal_model import ModalModel as ModalModel
 from ._noise import Line as Line
 from ._parametrization import Steps as Steps
 from ._parametrization import Unknowns as Unknowns
-from ._plant import EXTRAS as EXTRAS
 from ._plant import LOGARITHMIC as LOGARITHMIC
 from ._plant import SETTINGS as SETTINGS
-from ._plant import Extra as Extra
 from ._plant import Plant as Plant
 from ._plant import Setting as Setting
 from ._predictor import Prediction as Prediction

@@ -50,7 +50,7 @@ import numpy as np
 from analysis.identify._data import fast_length
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._plant import OF_BEAM
-from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, torque_channel
+from analysis.identify._predictor import eigenvalues, torque_channel
 from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -186,8 +186,6 @@ class DragResponse:
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, MODES, POINTS)
         k = (eigenvalues(MODES) / beam.length_m) ** 4
-        offsets = plant.stiffness_offsets[: MODES - 1]
-        k[FIRST_OFFSET - 1 : FIRST_OFFSET - 1 + len(offsets)] *= 1 + np.array(offsets)
         log_s = np.log(s)
         p = beam.density_over_stiffness * s * s + damping.gamma * np.exp(damping.lambda_ * log_s)
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))

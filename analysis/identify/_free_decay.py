@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
+from analysis.identify._predictor import eigenvalues
 from rigd.beam import LoadedBeam, pole_gradient, poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 
 _HARDLY: Final = 1e-6
-
-_OF_ENDS: Final = frozenset({"tip_mass_kg", "root_compliance_rad_per_nm"})
-"""Extras that move poles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,19 +70,19 @@ def mode_poles(
         Where the poles are expected, if all of them are; in the order of the modes.
     """
     near = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
-    if plant.tip_mass_kg or plant.root_compliance_rad_per_nm or not _OF_ENDS.isdisjoint(wrt):
+    if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
         return _loaded_poles(plant, count, wrt, near)
     z = eigenvalues(count).copy()
-    for mode, offset in enumerate(plant.stiffness_offsets[: count - 1], start=FIRST_OFFSET):
-        z[mode - 1] *= (1 + offset) ** 0.25
+    for place, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
+        z[place] *= (1 + offset) ** 0.25
     found = []
     for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near)):
         if np.isnan(pair[0]):
             continue
-        stiffness = float((z[i] / plant.beam.length_m) ** 4)
+        k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
         for pole in pair[: 1 if pair[0].imag else 2]:
-            moved = _pole_derivative(complex(pole), stiffness, i + 1, plant, wrt)
-            found.append(Pole(i + 1, complex(pole), moved))
+            moved = pole_gradient(complex(pole), k4_per_m4, plant.beam, plant.damping, wrt)
+            found.append(Pole(i + 1, complex(pole), moved.astype(np.complex128, copy=False)))
     return tuple(found)
 
 
@@ -106,19 +103,6 @@ def _loaded_poles(
     return tuple(
         Pole(mode, complex(pole), row) for (mode, pole), row in zip(found, moved, strict=True)
     )
-
-
-def _pole_derivative(
-    s: complex, stiffness: float, mode: int, plant: Plant, wrt: Sequence[str]
-) -> NDArray[np.complex128]:
-    """Differentiate a pole of a beam whose modes may have stiffnesses of their own, k⁴ here."""
-    offset = mode - FIRST_OFFSET
-    own = offset_name(mode) if 0 <= offset < len(plant.stiffness_offsets) else None
-    names = ["ln_k4" if name == own else name for name in wrt]
-    moved = pole_gradient(s, stiffness, plant.beam, plant.damping, names)
-    if own in wrt:
-        moved[names.index("ln_k4")] /= 1 + plant.stiffness_offsets[offset]
-    return moved.astype(np.complex128, copy=False)
 
 
 class DecaySpectra:

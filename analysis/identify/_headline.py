@@ -77,16 +77,6 @@ class Quantity:
     interval_95: tuple[float, float] | None
     flag: str | None = None
 
-    def admits(self, value: float) -> bool:
-        """Whether a value lies in the 95 % interval; any does where there is none.
-
-        Parameters
-        ----------
-        value : float
-        """
-        low, high = self.interval_95 or (-math.inf, math.inf)
-        return low <= value <= high
-
     def flagged(self, flag: str | None) -> Quantity:
         """Give it a flag, unless it has one.
 

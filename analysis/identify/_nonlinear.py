@@ -126,11 +126,9 @@ class ModalForces:
         return spectrum
 
     def _stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
-        """k⁴ of a mode with its offset, and with its damping."""
+        """k⁴ of a mode, and the same with its damping."""
         plant = self._plant
         k = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
-        if 2 <= mode <= 1 + len(plant.stiffness_offsets):
-            k *= 1 + plant.stiffness_offsets[mode - 2]
         damped = k * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
         return k, damped.astype(np.complex128)
 

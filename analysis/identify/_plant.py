@@ -1,4 +1,4 @@
-"""Parameters that the predicted torque depends on: beam, damping, settings and extras."""
+"""Parameters that the predicted torque depends on: beam, damping, settings and what is stated."""
 
 from __future__ import annotations
 
@@ -33,13 +33,7 @@ def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
     return tuple(name for name in SETTINGS if name not in fixed)
 
 
-Extra = Literal[
-    "root_compliance_rad_per_nm",
-    "tip_mass_kg",
-    "filter_time_constant_s",
-    "second_order_filter_time_constant_s",
-]
-EXTRAS: Final[tuple[Extra, ...]] = (
+EXTRAS: Final = (
     "root_compliance_rad_per_nm",
     "tip_mass_kg",
     "filter_time_constant_s",
@@ -98,7 +92,7 @@ class Plant:
     def parameters(self) -> dict[str, float]:
         """Values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
 
-        Those of the `EXTRAS` that are not neutral.
+        Those of the `EXTRAS` that are not 0.
         """
         return {
             "zeta": self.damping.zeta,

@@ -2,19 +2,12 @@
 
 The response from measured angle to measured torque is::
 
-    H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G' / (1 + kappa G'),    G' = G + sum_i G_i
+    H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G / (1 + kappa G)
 
-G is Eq. 25 of the paper. A real link is not quite uniform, which moves its modes one by one: G_i
-replaces mode i of the sum that G is (`rigd.beam._modes`) by one of another stiffness. With p the
-inertial and c the elastic factor, ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``,
-k⁴ the mode's stiffness and d its offset::
-
-    G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
-
-kappa is the clamp's compliance, between tool and beam; with a tip mass G is that of
-`rigd.beam._tip_mass`. Q holds the low-pass filters of the torque's channel,
-``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the
-delay of the torque's channel relative to the angle's.
+G is Eq. 25 of the paper; with a tip mass, or with modes that have a stiffness of their own, that of
+`rigd.beam._tip_mass`. kappa is the clamp's compliance, between tool and beam. Q holds the low-pass
+filters of the torque's channel, ``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)``
+(Butterworth), and tau is the delay of the torque's channel relative to the angle's.
 
 The angle is convolved with H causally, over the whole record, on ``s = sigma + j omega``: see
 `Prediction`.
@@ -40,14 +33,6 @@ if TYPE_CHECKING:
 
 
 # Response
-
-FIRST_OFFSET: Final = 2
-"""Mode whose offset comes first: that of mode 1 is 0, its frequency is what rho/EI says."""
-
-
-def offset_name(mode: int) -> str:
-    """Name of a mode's offset among the parameters."""
-    return f"stiffness_offset_{mode}"
 
 
 @lru_cache(maxsize=16)
@@ -92,15 +77,6 @@ def _divisor(name: str, constant_s: float, s: NDArray[np.complex128]) -> NDArray
     return 1 + constant_s * (_BUTTERWORTH * s + constant_s * s * s)
 
 
-def _divisor_slope(
-    name: str, constant_s: float, s: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Differentiate it by the constant."""
-    if name == "filter_time_constant_s":
-        return s
-    return _BUTTERWORTH * s + 2 * constant_s * s * s
-
-
 class ResponseGrid:
     """H and its derivatives on one grid of s.
 
@@ -136,8 +112,8 @@ class ResponseGrid:
         plant : Plant
             Where to evaluate.
         wrt : sequence of str
-            Names from `rigd.beam.PARAMETERS`, "delay_s", "tool_inertia_kg_m2", those of offsets and
-            `EXTRAS`; each derivative holds all others constant.
+            Names from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2"; each derivative
+            holds all others constant.
         angle : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
@@ -147,23 +123,16 @@ class ResponseGrid:
             The torque's transform, then the derivatives in the order of `wrt`.
         """
         response, rows = self._of_beam(plant, wrt)
-        if plant.stiffness_offsets:
-            response += self._offset_modes(plant, rows)
-        if plant.root_compliance_rad_per_nm or "root_compliance_rad_per_nm" in wrt:
+        if plant.root_compliance_rad_per_nm:
             softened = 1 / (1 + plant.root_compliance_rad_per_nm * response)
             for name in rows:
                 rows[name] = rows[name] * softened**2
             response = response * softened
-            rows["root_compliance_rad_per_nm"] = -response * response
         response += plant.tool_inertia_kg_m2 * self._s_squared
         rows["tool_inertia_kg_m2"] = self._s_squared
         late = torque_channel(plant, self._s) * angle
         if "delay_s" in wrt:
             rows["delay_s"] = -self._s * response
-        for name in _FILTERS:
-            if name in wrt:
-                at = plant.extras[name], self._s
-                rows[name] = -(_divisor_slope(name, *at) / _divisor(name, *at)) * response
         found = np.empty((1 + len(wrt), late.size), dtype=np.complex128)
         for out, row in zip(found, [response, *(rows[name] for name in wrt)], strict=True):
             np.multiply(row, late, out=out)
@@ -173,59 +142,21 @@ class ResponseGrid:
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
         """G on a rigid clamp, and its derivatives by what of `wrt` it depends on."""
-        if plant.tip_mass_kg or "tip_mass_kg" in wrt:
-            return self._with_tip_mass(plant, wrt)
         of_beam = [name for name in wrt if name in PARAMETERS]
+        if plant.tip_mass_kg or plant.stiffness_offsets:
+            found, slopes = differentiated_response(
+                self._log_s,
+                self._s_squared,
+                plant.beam,
+                plant.damping,
+                plant.tip_mass_kg,
+                plant.stiffness_offsets,
+            )
+            return found.response, {name: slopes[name]() for name in of_beam}
         if not of_beam:
             return self._beam.evaluate(plant.beam, plant.damping), {}
         response, gradient = self._beam.evaluate_with_gradient(plant.beam, plant.damping, of_beam)
         return response, dict(zip(of_beam, gradient, strict=True))
-
-    def _with_tip_mass(
-        self, plant: Plant, wrt: Sequence[str]
-    ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """Compute the same with a mass at the tip."""
-        found, slopes = differentiated_response(
-            self._log_s, self._s_squared, plant.beam, plant.damping, plant.tip_mass_kg
-        )
-        return found.response, {name: slopes[name]() for name in wrt if name in slopes}
-
-    def _offset_modes(
-        self, plant: Plant, rows: dict[str, NDArray[np.complex128]]
-    ) -> NDArray[np.complex128]:
-        """Sum of all G_i, shape (n,); their derivatives are added to `rows`."""
-        damping, ratio = plant.damping, plant.beam.density_over_stiffness
-        stiffness = plant.beam.bending_stiffness_n_m2
-        s_alpha = np.exp(damping.alpha * self._log_s)
-        s_lambda = np.exp(damping.lambda_ * self._log_s)
-        c = 1 + damping.zeta * s_alpha
-        p = ratio * self._s_squared + damping.gamma * s_lambda
-        total, by_p, by_c = np.zeros((3, self._s.size), dtype=np.complex128)
-        last = FIRST_OFFSET + len(plant.stiffness_offsets) - 1
-        of_modes = (eigenvalues(last)[FIRST_OFFSET - 1 :] / plant.beam.length_m) ** 4
-        shares = 4 * stiffness / (plant.beam.length_m * of_modes)
-        for i, (share, k, offset) in enumerate(
-            zip(shares, of_modes, plant.stiffness_offsets, strict=True)
-        ):
-            before, after = 1 / (c * k + p), 1 / (c * (k * (1 + offset)) + p)
-            by_offset = (share * k) * p * p * c * after
-            total += by_offset * before * offset
-            rows[offset_name(FIRST_OFFSET + i)] = by_offset * after
-            by_p += (share * k * k) * (((1 + offset) * after) ** 2 - before**2)
-            by_c += (share * k) * ((1 + offset) * after**2 - before**2)
-        by_p *= c * c
-        by_c *= p * p
-        slopes = {
-            "zeta": lambda: by_c * s_alpha,
-            "alpha": lambda: by_c * (damping.zeta * self._log_s * s_alpha),
-            "gamma": lambda: by_p * s_lambda,
-            "lambda": lambda: by_p * (damping.gamma * self._log_s * s_lambda),
-            "ln_density_over_stiffness": lambda: by_p * (ratio * self._s_squared),
-            "ln_stiffness": lambda: total,
-        }
-        for name in slopes.keys() & rows.keys():
-            rows[name] = rows[name] + slopes[name]()
-        return total
 
 
 # Prediction

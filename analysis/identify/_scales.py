@@ -6,11 +6,10 @@ parameters make up for it exactly. With z = beta L the response (Eq. 25) is::
     G = -(EI/L) (1 + zeta s^alpha) F(z),    z^4 = -(rho/EI L^4 s² + gamma L^4 s^lambda) / (1 + ...)
 
 so that a session shows EI/L, rho/EI L^4, gamma L^4, zeta and both orders, and nothing else of the
-beam. A torque that is read too large by a factor enlarges EI by it, the tool inertia and
-the mass at the tip with it, and lessens the clamp's compliance; the drag of the air goes with the
-torque and with the square of the speed, which goes with the length, times the square of the length
-that it acts over. So every parameter goes with a power of each scale (`SCALE_EXPONENTS`), and the
-relative variances add (JCGM 100:2008, GUM, 5.1.6).
+beam. A torque that is read too large by a factor enlarges EI by it, and the tool inertia with it;
+the drag of the air goes with the torque and with the square of the speed, which goes with the
+length, times the square of the length that it acts over. So every parameter goes with a power of
+each scale (`SCALE_EXPONENTS`), and the relative variances add (JCGM 100:2008, GUM, 5.1.6).
 """
 
 from __future__ import annotations
@@ -42,8 +41,6 @@ SCALE_EXPONENTS: Final[Mapping[str, Mapping[str, int]]] = MappingProxyType(
         _RATIO: {"length": -4},
         _STIFFNESS: {"torque_scale": 1, "length": 1},
         _TOOL: {"torque_scale": 1},
-        "root_compliance_rad_per_nm": {"torque_scale": -1},
-        "tip_mass_kg": {"torque_scale": 1, "length": -2},
         "drag": {"torque_scale": 1, "length": -4},
     }
 )

@@ -350,11 +350,9 @@ def remembered(
         found: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
         return found
 
-    uniform = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    offsets = np.zeros(uniform.size)
-    offsets[1 : 1 + len(plant.stiffness_offsets)] = plant.stiffness_offsets
-    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * uniform)
-    for share, k in zip(shares.tolist(), (uniform * (1 + offsets)).tolist(), strict=True):
+    of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
+    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * of_modes)
+    for share, k in zip(shares.tolist(), of_modes.tolist(), strict=True):
         compliance = 1 / ((1 + internal) * k + inertial)
         follows = inertial * compliance
         at_first = own * k * -follows + external * (1 - follows)

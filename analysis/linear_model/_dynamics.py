@@ -143,7 +143,6 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     Parameters
     ----------
     plant : Plant
-        Its difference of clocks is left out.
 
     Raises
     ------

@@ -40,7 +40,8 @@ _NOT_LINEAR: Final = {
     "drag": "the drag of the air grows with the amplitude",
     "clock_rate_difference": "it is a property of the instruments",
 }
-"""Parameters that a linear model from motion to torque leaves out, and why."""
+"""Parameters that a linear model from motion to torque leaves out, and why. Clocks are a parameter
+in documents of older versions only, as offsets of modes and the compliance of the clamp are."""
 _SIGNED: Final = ("delay_s", _OFFSET)
 _ORDERS: Final = ("alpha", "lambda")
 _DEFAULT_BAND_HZ: Final = (0.05, 50.0)

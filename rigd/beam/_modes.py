@@ -292,7 +292,7 @@ def pole_gradient(
     beam, damping
         Parameters of the exact model.
     wrt
-        Names of `rigd.beam.PARAMETERS`, and ``ln_k4``; what does not move a pole gives 0.
+        Names of `rigd.beam.PARAMETERS`; what does not move a pole gives 0.
 
     Examples
     --------
@@ -318,7 +318,6 @@ def pole_gradient(
         "gamma": external,
         "lambda": damping.gamma * log_s * external,
         "ln_density_over_stiffness": ratio * s * s,
-        "ln_k4": k4_per_m4 + damping.zeta * internal,
     }
     return np.array([-by.get(name, 0.0) / slope for name in wrt], dtype=np.complex128)
 

@@ -10,6 +10,7 @@ from rigd.beam import (
     Damping,
     LoadedBeam,
     clamped_free_eigenvalues,
+    pole_gradient,
     poles,
     root_shear_ratio,
     transfer,
@@ -233,6 +234,23 @@ def test_next_to_the_pole_on_a_rigid_clamp_the_derivatives_are_those_of_differen
         poles = loaded.poles(z)[:, 0]
         moved = (changed(loaded, name, step).poles(z)[:, 0] - poles) / step
         assert loaded.pole_gradients(poles, [name])[:, 0] == pytest.approx(moved, rel=5e-3)
+
+
+@pytest.mark.parametrize("stiffness", [3.224590545296398e-06, 3.352924149249553e-05, 0.090275])
+@pytest.mark.parametrize("damping", [Damping(), Damping(zeta=7e-5)])
+def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(stiffness, damping):
+    """Without a warning, and by what is the beam's own as in the bare beam's closed form."""
+    beam = Beam(0.98, 4.7e-3, stiffness)
+    own, ends = ("zeta", "ln_density_over_stiffness"), ("tip_mass_kg", "root_compliance_rad_per_nm")
+    loaded, z = LoadedBeam(beam, damping), clamped_free_eigenvalues(3)
+    poles = loaded.poles(z)[:, 0]
+    moved = loaded.pole_gradients(poles, (*own, *ends))
+    for pole, root, row in zip(poles, z, moved, strict=True):
+        bare = pole_gradient(pole, (root / beam.length_m) ** 4, beam, damping, own)
+        np.testing.assert_allclose(row[:2], bare, rtol=1e-6)
+        assert np.isfinite(row).all()
+        # Both make the mode slower.
+        assert (row[2:].imag < 0).all()
 
 
 def test_without_either_it_is_the_bare_beam():

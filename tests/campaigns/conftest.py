@@ -152,9 +152,7 @@ def welch_fit(structure, weighting, at_bounds=(), **free):
     return WelchFit(structure, weighting, damping, values, 1.0, at_bounds)
 
 
-def record_estimate(
-    structure, values, covariance, determined, at_bounds=(), cost=100.0, uniform=True, bic=0.0
-):
+def record_estimate(structure, values, covariance, determined, at_bounds=(), cost=100.0, bic=0.0):
     """Estimate with the link's own settings where `values` says nothing."""
     every = Plant(LINK, Damping()).parameters | dict(STRUCTURES[structure].fixed) | values
     beam = Beam(
@@ -167,11 +165,9 @@ def record_estimate(
         Damping(every["zeta"], every["alpha"], every["gamma"], every["lambda"]),
         every["delay_s"],
         every["tool_inertia_kg_m2"],
-        tuple(value for name, value in every.items() if name.startswith("stiffness_offset")),
     )
     return RecordEstimate(
-        structure=structure, uniform=uniform, beam="" if uniform else ", modes free", plant=plant,
-        parameters=every,
+        structure=structure, plant=plant, parameters=every,
         std=dict.fromkeys(every, 0.0), determined=tuple(determined),
         covariance=np.asarray(covariance), at_bounds=at_bounds,
         modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), cost=cost, degrees_of_freedom=100,

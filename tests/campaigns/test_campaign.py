@@ -178,7 +178,7 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
 def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     found, _ = done
     verdict = found.verdict
-    assert (verdict.structure, verdict.uniform, verdict.sessions) == ("III", True, 4)
+    assert (verdict.structure, verdict.sessions) == ("III", 4)
     assert verdict.adequate == 4
     # Of those asked for III has the lowest BIC; the numbers are the freest structure's.
     assert verdict.headline == "VI"
@@ -259,9 +259,8 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
         model = FrequencyResponseModel(session.frequency_hz, plant.beam, plant.tool_inertia_kg_m2)
         late = np.exp(-2j * np.pi * session.frequency_hz * plant.delay_s)
         away = np.abs(model.evaluate(plant.damping) * late - session.response)
-        if each.uniform:
-            assert each.indices.mse == pytest.approx(np.mean(away**2), rel=1e-6)
-            assert each.indices.md == pytest.approx(away.max(), rel=1e-6)
+        assert each.indices.mse == pytest.approx(np.mean(away**2), rel=1e-6)
+        assert each.indices.md == pytest.approx(away.max(), rel=1e-6)
 
 
 def test_the_terminal_shows_pooled_modes_and_parameters_unless_asked_for_more(done, as_text):

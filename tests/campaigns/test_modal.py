@@ -182,7 +182,7 @@ def test_a_refused_beam_in_sweeps_of_one_direction_asks_for_the_other(sessions_o
 # Verdict
 
 VERDICT = SimpleNamespace(
-    structure="VI", uniform=True, adequate=True, visible_modes=MODES, findings=(), experiments=(),
+    structure="VI", adequate=True, visible_modes=MODES, findings=(), experiments=(),
     alpha=SimpleNamespace(status="compatible"), lambda_=SimpleNamespace(status="fractional"),
 )  # fmt: skip
 

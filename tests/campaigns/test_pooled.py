@@ -122,20 +122,3 @@ def test_what_a_session_leaves_undetermined_counts_in_each(make_estimate):
     )
     found = pooled_bic([good, lost])
     assert found == pytest.approx(2000.0 + math.log(200) + 2 * math.log(100), abs=1e-9)
-
-
-def test_modes_with_a_stiffness_of_their_own_are_pooled(make_estimate):
-    names = ("zeta", "gamma", "stiffness_offset_2")
-    estimates = [
-        make_estimate(
-            "III", {"zeta": 1e-4, "gamma": 0.1, "stiffness_offset_2": offset},
-            np.diag([1e-4, 1e-4, 1e-6]), names, uniform=False,
-        )
-        for offset in (0.019, 0.021)
-    ]  # fmt: skip
-    found = pooled(estimates)
-    assert found.name == "III, modes free"
-    assert found.plant.stiffness_offsets == pytest.approx((0.02,))
-    (mode,) = found.modes
-    assert (mode.number, mode.frequency_hz) == (1, 2.5)
-    assert mode.frequency_std_hz == pytest.approx(1e-4 / math.sqrt(2))

@@ -17,7 +17,7 @@ ALIKE = Homogeneity((), ())
 
 def said(structure="VI", alpha="fractional", adequate=True, modes=(1, 2, 3), findings=()):
     return SimpleNamespace(
-        structure=structure, uniform=True, adequate=adequate, visible_modes=modes,
+        structure=structure, adequate=adequate, visible_modes=modes,
         findings=findings, experiments=("Sweep longer.",),
         alpha=SimpleNamespace(status=alpha), lambda_=SimpleNamespace(status="fractional"),
     )  # fmt: skip
@@ -81,18 +81,6 @@ def test_an_order_is_not_called_fractional(estimates_of, rival, verdict, status,
     assert order.status == status
     assert reason in order.reason if reason else order.reason is None
     assert "1 is excluded" not in sentences.order(order)
-
-
-@pytest.mark.parametrize("order", ["alpha", "lambda"])
-def test_an_order_on_a_beam_with_free_modes_is_withheld(make_estimate, order):
-    """Four parameters of damping from three loss factors."""
-    values = {"zeta": 1e-4, "alpha": 0.8, "gamma": 0.1, "lambda": 0.6}
-    free = make_estimate(
-        "VI", values, np.diag([1e-4] * 4), tuple(values), uniform=False, cost=100.0, bic=100.0
-    )
-    found = pooled_order(order, ranked([free] * 4), [said()] * 4, ALIKE)
-    assert (found.status, found.value) == ("not identifiable", None)
-    assert "3 loss factors" in sentences.order(found)
 
 
 def mixed_in(quantity):

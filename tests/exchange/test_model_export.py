@@ -309,10 +309,17 @@ def test_the_beam_is_exported_on_request_with_what_is_doubtful(export, exported)
     parameters = {name: {"value": value, "flag": None} for name, value in NOMINAL.items()}
     parameters["alpha"]["flag"] = "not identifiable"
     parameters["drag"] = {"value": 1e-3, "flag": None}
-    named = [{"what": "soft stiffness", "sentence": "It softens."}]
+    parameters["clock_rate_difference"] = {"value": -1e-5, "flag": None}  # of older versions
+    named = [
+        {"what": "soft stiffness", "sentence": "It softens."},
+        {"what": "clock rate difference", "sentence": "Clocks differ."},
+    ]
     result = export(document(parameters=parameters, named=named), "b.npz", *FEW)
     assert result.exit_code == 0
-    for words in ("flagged by the analysis: alpha", "drag is not part", "soft stiffness (It soft"):
+    for words in (
+        "flagged by the analysis: alpha", "drag is not part", "soft stiffness (It soft",
+        "clock_rate_difference is not part", "clock rate difference (Clocks differ)",
+    ):  # fmt: skip
         assert words in result.stdout
 
 

@@ -75,10 +75,10 @@ def short():
     return compared(swept(16.0, 20.0))
 
 
-def plant(zeta=5.4e-5, gamma=0.02, density=4.7e-3, offset=0.0, delay_s=0.0, lambda_=1.0):
+def plant(zeta=5.4e-5, gamma=0.02, density=4.7e-3, delay_s=0.0, lambda_=1.0):
     damping = Damping(zeta=zeta, alpha=1.0, gamma=gamma, lambda_=lambda_)
     beam = Beam(LINK.length_m, density, LINK.bending_stiffness_n_m2)
-    return Plant(beam, damping, delay_s, stiffness_offsets=(offset, 0.0))
+    return Plant(beam, damping, delay_s)
 
 
 LAW = DragLaw(2e-3, 5e-4)
@@ -100,7 +100,6 @@ def test_derivatives_by_the_law(short, place):
         ("zeta", 5.4e-5, 2e-6, 5e-3),
         further("gamma", 0.02, 1e-3, 5e-3),
         ("density", 4.7e-3, 4.7e-8, 1e-3),
-        further("offset", 0.0, 1e-5, 1e-3),
         further("delay_s", 0.0, 1e-5, 1e-4),
     ],
 )

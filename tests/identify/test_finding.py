@@ -37,12 +37,12 @@ def test_what_is_seen_in_the_record_stays_a_fact(kind):
 
 def test_a_finding_on_a_flagged_parameter_is_no_fact():
     """What the headline flags is flagged in the findings as well, for the same reason."""
-    late, mass = (
+    late, tool = (
         Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), parameters=(name,))
-        for kind, name in (("delay", "delay_s"), ("tip mass", "tip_mass_kg"))
+        for kind, name in (("delay", "delay_s"), ("tool inertia", "tool_inertia_kg_m2"))
     )
     first, second = _as_sure(
-        (late, mass), (), None, None, {"delay_s": "type VII fits as well"}, explained=True
+        (late, tool), (), None, None, {"delay_s": "type VII fits as well"}, explained=True
     )
     assert first.sentence == "Not established, because type VII fits as well: it is there."
-    assert (first.interval, second) == (None, mass)
+    assert (first.interval, second) == (None, tool)

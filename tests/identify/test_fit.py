@@ -221,21 +221,9 @@ def test_what_a_wrong_structure_leaves_is_no_hum(sessions):
     assert analysis.fits[0].cost > 2 * analysis.fits[0].degrees_of_freedom
 
 
-def test_a_beam_that_is_not_uniform(sessions, true_parameters):
-    offsets = (0.006, -0.013)
-    session = sessions("III", offsets=offsets)
-    expected = {
-        **true_parameters("III"),
-        "stiffness_offset_2": offsets[0],
-        "stiffness_offset_3": offsets[1],
-    }
-    assert_exact(fit(session.measured(), "VII", uniform=False), expected)
-    measurement = session.measured(noise_nm=1e-2, seed=17)
-    found = fit(measurement, "VII", uniform=False)
-    assert_within(found, expected)
-    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
-    assert found.modes[1].frequency_hz == pytest.approx(100.55 * 1.003 / (2 * np.pi), rel=1e-3)
-    as_if = fit(measurement, "VI")  # what is not uniform passes for an order of the damping
+def test_a_beam_that_is_not_uniform_passes_for_an_order_of_the_damping(sessions):
+    session = sessions("III", offsets=(0.006, -0.013))
+    as_if = fit(session.measured(noise_nm=1e-2, seed=17), "VI")
     assert abs(as_if.parameters["alpha"] - 1) > 10 * as_if.std["alpha"]
 
 

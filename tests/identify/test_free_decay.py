@@ -41,17 +41,10 @@ def test_poles_and_their_derivatives(damping):
 
 
 def test_an_offset_moves_its_own_mode():
-    names = ("stiffness_offset_2", "stiffness_offset_3", "delay_s")
-    loose, after, before = (
-        mode_poles(Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05 + h)), 3, names)
-        for h in (0.0, 1e-6, -1e-6)
-    )
+    loose = mode_poles(Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05)), 3, ())
     uniform = mode_poles(Plant(BEAM, FRACTIONAL), 3, ())
     ratio = [abs(p.at_rad_s) / abs(q.at_rad_s) for p, q in zip(loose, uniform, strict=True)]
     assert ratio == pytest.approx([1, 1.03**0.5, 0.95**0.5], rel=1e-3)
-    slope = (after[2].at_rad_s - before[2].at_rad_s) / 2e-6
-    assert loose[2].derivative == pytest.approx([0, slope, 0], rel=1e-6)
-    assert loose[0].derivative == pytest.approx([0, 0, 0])
 
 
 def signal(pole, t):
@@ -113,22 +106,6 @@ def test_no_mode_no_column():
     spectra = DecaySpectra(100, 125.0, np.array([1.0, 2.0]))
     assert spectra.columns(()).shape == (0, 2)
     assert mode_poles(Plant(BEAM, FRACTIONAL), 0, NAMES) == ()
-
-
-@pytest.mark.parametrize("stiffness", [3.224590545296398e-06, 3.352924149249553e-05, 0.090275])
-@pytest.mark.parametrize("damping", [Damping(), Damping(zeta=7e-5)])
-def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(stiffness, damping):
-    """Without a warning, and by what is the beam's own as in the bare beam's closed form."""
-    plant = Plant(Beam(0.98, 4.7e-3, stiffness), damping)
-    own = ("zeta", "ln_density_over_stiffness")
-    bare = mode_poles(plant, 3, own)
-    loaded = mode_poles(plant, 3, (*own, "tip_mass_kg", "root_compliance_rad_per_nm"))
-    assert len(bare) == len(loaded) == 3
-    for one, other in zip(bare, loaded, strict=True):
-        np.testing.assert_allclose(other.derivative[:2], one.derivative, rtol=1e-6)
-        assert np.isfinite(other.derivative).all()
-        # Both make the mode slower.
-        assert (other.derivative[2:].imag < 0).all()
 
 
 @pytest.mark.parametrize(

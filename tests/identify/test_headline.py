@@ -1,48 +1,58 @@
-"""What another kind of rig, which explains the record as well, does to a number."""
+"""Flags of numbers, status of orders and structures: from fits of given likelihoods."""
 
-import math
+from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify._headline import Quantity
-from analysis.identify._verdict import NOT_DETERMINED, ORDER_ONE_ELSEWHERE
+from analysis.identify import Quantity
+from analysis.identify._candidates import CandidateSet
+from analysis.identify._headline import structures
+from analysis.identify._profile_likelihood import Profile
+from analysis.identify._verdict import NOT_DETERMINED, order_verdict
+from analysis.models import STRUCTURES
 
-ALPHA = Quantity(0.98, 0.01, (0.96, 1.0))
-FLAG = "another kind of rig fits the record equally well with another value"
-
-
-def test_a_rival_inside_the_interval_is_no_reason_for_doubt():
-    told = ALPHA.with_rival(0.97, 0.0, FLAG)
-    assert told.flag is None
-    assert told.std_any_rig == pytest.approx(0.01)
-
-
-def test_the_farthest_rival_counts_and_its_own_deviation_with_it():
-    told = ALPHA.with_rival(1.03, 0.0, FLAG).with_rival(0.99, 0.02, FLAG)
-    assert told.flag == FLAG
-    assert told.std_any_rig == pytest.approx(0.05)
-    assert told.std == ALPHA.std
-    assert told.with_rival(0.99, 0.2, FLAG).std_any_rig == pytest.approx(math.hypot(0.2, 0.01))
+ALPHA = Profile(
+    "alpha", "VI", (0.8, 0.9, 1.0), (9.0, 0.0, 12.0), 0.9, (0.9,), (0.85, 0.95), False, False, 0.0
+)
 
 
-def test_a_rival_that_does_not_tell_the_value_leaves_no_deviation():
-    told = ALPHA.with_rival(1.03, None, FLAG)
-    assert (told.flag, told.std_any_rig) == (FLAG, math.inf)
+@dataclass(frozen=True)
+class Fitted:
+    """What is asked of a candidate here."""
+
+    name: str
+    bic: float
+    deviance: float
+    parameters: int = 8
+    structure: object = field(init=False)
+    fit: object = field(default_factory=lambda: SimpleNamespace(parameters={"alpha": 0.9}))
+
+    def __post_init__(self):
+        object.__setattr__(self, "structure", STRUCTURES[self.name])
 
 
-def test_an_order_that_is_1_on_another_kind_of_rig_has_a_deviation_too():
-    told = ALPHA.flagged(ORDER_ONE_ELSEWHERE).with_rival(1.0, 0.0, FLAG)
-    assert told.flag == ORDER_ONE_ELSEWHERE
-    assert told.std_any_rig == pytest.approx(0.02)
+def field_of(*fitted):
+    ranked = tuple(sorted(fitted, key=lambda each: each.bic))
+    return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
 
 
-def test_no_deviation_covers_another_reason_for_doubt():
-    assert ALPHA.flagged(NOT_DETERMINED).with_rival(1.03, 0.0, FLAG).std_any_rig is None
-    told = ALPHA.with_rival(1.03, 0.0, FLAG).flagged("part of the record is unexplained")
-    assert (told.flag, told.std_any_rig) == (FLAG, None)
-    assert told.flagged(None) is told
+def test_the_first_flag_stays():
+    number = Quantity(0.98, 0.01, (0.96, 1.0))
+    assert number.flagged(None) is number
+    told = number.flagged(NOT_DETERMINED).flagged("part of the record is unexplained")
+    assert told.flag == NOT_DETERMINED
+    assert (told.value, told.std, told.interval_95) == (0.98, 0.01, (0.96, 1.0))
 
 
-def test_without_a_flag_to_give_a_rival_widens_only():
-    told = ALPHA.with_rival(1.03, 0.0, None)
-    assert (told.flag, told.std_any_rig) == (None, pytest.approx(0.05))
+@pytest.mark.parametrize(("doubt", "status"), [(None, "fractional"), ("it rains", "open")])
+def test_a_doubt_leaves_an_order_open(doubt, status):
+    found = order_verdict(field_of(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt=doubt)
+    assert (found.status, found.reason) == (status, doubt)
+
+
+def test_what_fixes_an_order_that_is_excluded_is_excluded_with_it():
+    """By all that it lacks, type III would still do: two orders at once may cost more than one."""
+    rig = field_of(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))
+    assert dict(structures(rig, frozenset()))["III"] == "compatible"
+    assert dict(structures(rig, frozenset({"alpha"})))["III"] == "excluded"

@@ -42,18 +42,6 @@ def test_derivatives(name, free):
         assert derivative == pytest.approx(numeric, abs=1e-8)
 
 
-def test_derivatives_with_offsets():
-    unknowns = Unknowns.of(STRUCTURES["VII"], NOMINAL, SETTINGS, modes=3)
-    x = start(unknowns)
-    x[-2:] = 0.03, -0.05
-    assert unknowns.names[-2:] == ("stiffness_offset_2", "stiffness_offset_3")
-    assert unknowns.plant(x).stiffness_offsets == (0.03, -0.05)
-    derivative = unknowns.plant_and_gradient(x)[1]
-    assert derivative[-2:, -2:] == pytest.approx(np.eye(2))
-    assert not derivative[-2:, :-2].any()
-    assert not derivative[:-2, -2:].any()
-
-
 def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
     plant = Plant(NOMINAL.beam, Damping(zeta=7e-5, alpha=0.9), 2e-4, 2e-5)
     unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)

@@ -42,18 +42,13 @@ def plant_of(values, length_m):
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
         stiffness_offsets=(values.get("stiffness_offset_2", 0.0),),
-        root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
-        tip_mass_kg=values.get("tip_mass_kg", 0.0),
         filter_time_constant_s=values.get("filter_time_constant_s", 0.0),
     )
 
 
 @pytest.mark.parametrize(
     "extras",
-    [
-        {"stiffness_offsets": (0.02,), "root_compliance_rad_per_nm": 0.3},
-        {"tip_mass_kg": 3e-4, "filter_time_constant_s": 1e-3},
-    ],
+    [{"stiffness_offsets": (0.02,)}, {"filter_time_constant_s": 1e-3}],
 )
 def test_every_parameter_goes_with_the_scales_as_stated(extras):
     """Exactly: no frequency response shows a wrong torque scale or length."""

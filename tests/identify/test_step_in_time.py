@@ -43,7 +43,7 @@ def slipped_torque(angle_rad, beam, damping):
 
 
 def score_of(session):
-    field = CandidateSet.of_uniform(session.measured(noise_nm=5e-3, seed=4), (), BAND_HZ)
+    field = CandidateSet.of(session.measured(noise_nm=5e-3, seed=4), (), BAND_HZ)
     starts = [(m.number, m.frequency_hz, m.damping_ratio) for m in field.likeliest.modes]
     fit = fit_modes(field.comparison, field.noise, starts, field.columns)
     assert fit.visible == (1, 2, 3)

@@ -141,7 +141,7 @@ def response(kind="response", reached_hz=30.0, shift=1.0, **members):
 
 def measured(value, std, flag=None):
     return {
-        "value": value, "std": std, "flag": flag, "std_any_rig": None,
+        "value": value, "std": std, "flag": flag,
         "interval_95": [value - 1.96 * std, value + 1.96 * std],
     }  # fmt: skip
 

@@ -3,7 +3,7 @@
 
 def quantity(value, std, flag=None):
     return {
-        "value": value, "std": std, "flag": flag, "std_any_rig": None,
+        "value": value, "std": std, "flag": flag,
         "interval_95": [value - 1.96 * std, value + 1.96 * std],
     }  # fmt: skip
 

@@ -36,7 +36,7 @@ def order(name, status="fractional", value=0.9, interval=(0.8, 1.0)):
 def verdict(*sentences, experiments=()):
     """Verdict on a record whose orders are both known."""
     return Verdict(
-        name="session", structure="VI", uniform=True, rivals=(), parameters={}, adequate=True,
+        name="session", structure="VI", rivals=(), parameters={}, adequate=True,
         alpha=order("alpha"), lambda_=order("lambda"), visible_modes=(1, 2, 3), findings=(),
         table=(), whiteness=None, input_relation=None, harmonics=(), sentences=sentences,
         experiments=experiments,
@@ -53,7 +53,7 @@ def record_result(make_signals, write_session, tmp_path_factory):
     )
     record = load_record(path)
     analysis = fit_record(Measurement.of_record(record), [STRUCTURES[name] for name in TYPES])
-    candidates = [Candidate(fit.structure, uniform=True, fit=fit) for fit in analysis.fits]
+    candidates = [Candidate(fit.structure, fit) for fit in analysis.fits]
     selection = Selection(
         verdict(
             "Both orders are fractional.", "Less than noise <b> remains.",

@@ -51,8 +51,6 @@ def test_the_terms_are_those_of_the_type(told, name, elastic, inertial):
 @pytest.mark.parametrize(
     ("extra", "tex", "words"),
     [
-        ("root_compliance_rad_per_nm", r"\frac{G ( s )}{1 + c G ( s )}", "compliance of the clamp"),
-        ("stiffness_offset_2", r"\sum_{i} G_{i}", "1 + δᵢ times"),
         ("filter_time_constant_s", r"\frac{1}{1 + T s}", "torque channel's filter"),
         (
             "second_order_filter_time_constant_s",
@@ -60,7 +58,6 @@ def test_the_terms_are_those_of_the_type(told, name, elastic, inertial):
             "Butterworth",
         ),
         ("tip_mass_kg", "G ( s )", "mass m at its tip"),
-        ("clock_rate_difference", "G ( s )", "t (1 + ε)"),
         ("drag", "G ( s )", "½ ρ_air C_D d"),
     ],
 )
@@ -73,7 +70,9 @@ def test_what_was_fitted_beside_the_beam_stands_in_it(told, extra, tex, words):
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_both_languages_can_be_read(told, name):
-    extras = dict.fromkeys(("root_compliance_rad_per_nm", "stiffness_offset_2"), 1e-3)
+    extras = dict.fromkeys(
+        ("filter_time_constant_s", "second_order_filter_time_constant_s", "tip_mass_kg"), 1e-3
+    )
     for whole in (told(name), told(name, **extras)):
         found = equations(whole)
         for formula in found:

@@ -16,7 +16,7 @@ NOT_REACHED = SearchEnded(False, "Not reached within 20 s (--at-most).", {})
 
 
 def of_whole_record(std: float, *, final: bool = True) -> FitTold:
-    damping = {"value": 0.01, "std": std, "flag": None, "std_any_rig": None}
+    damping = {"value": 0.01, "std": std, "flag": None}
     mode = {
         "mode": 1,
         "frequency_hz": damping | {"value": 2.5},
