@@ -431,6 +431,11 @@ def _with_effects(
         field = linear if linear.misread else with_air_drag(linear)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (field, ()) if field.misread else nonlinear_forces(field, visible)
+    if forces and field.drag is not None:
+        # A stiffness that depends on the deflection may have passed for a little drag.
+        without, alone = nonlinear_forces(linear, visible)
+        if alone and without.bic < field.bic:
+            field, forces = without, alone
     field, changes = along_time(field.with_orders_free())
     one_sweep = linear.comparison.measurement.one_sweep
     if not one_sweep and (forces or field.drag is not None):
