@@ -1,0 +1,42 @@
+"""Effects beside a linear antenna whose first order in their size suffices."""
+
+import numpy as np
+import pytest
+
+from analysis.identify import select
+
+RATE_HZ = 1000.0
+NOISE_NM = 5e-3
+
+
+def rubbed(made, friction_nm, sliding_rad_s):
+    """Return the session with dry friction between sensor and beam."""
+    speed_rad_s = np.gradient(made.angle_rad) * RATE_HZ
+    torque_nm = made.torque_nm + friction_nm * np.tanh(speed_rad_s / sliding_rad_s)
+    return type(made)(made.angle_rad, torque_nm)
+
+
+@pytest.mark.parametrize("sliding_rad_s", [0.003, 0.03])
+def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, sliding_rad_s):
+    """A torque of known sign that grows with nothing: no harmonic, no order, no stiffness."""
+    plain = select(sessions("III").measured(NOISE_NM, 3))
+    selection = select(rubbed(sessions("III"), 0.01, sliding_rad_s).measured(NOISE_NM, 3))
+    (finding,) = selection.verdict.findings
+    assert finding.kind == "friction"
+    assert (finding.value, finding.interval) == (None, None)
+    headline = selection.headline
+    assert headline.explained
+    assert headline.uniform_beam.status == "passed"
+    for mode, same in zip(headline.modes, plain.headline.modes, strict=True):
+        for found, expected in (
+            (mode.frequency_hz, same.frequency_hz),
+            (mode.damping_ratio, same.damping_ratio),
+        ):
+            assert found.flag is None
+            assert abs(found.value - expected.value) < 2 * expected.std
+    assert selection.verdict.alpha.status == "compatible"
+
+
+def test_without_friction_none_is_named(sessions):
+    kinds = {each.kind for each in select(sessions("III").measured(NOISE_NM, 4)).verdict.findings}
+    assert "friction" not in kinds
