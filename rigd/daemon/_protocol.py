@@ -58,40 +58,40 @@ class Request(BaseModel):
     id: Id | None = None
 
 
-class Status(Request):
+class StatusRequest(Request):
     """Report the status of daemon, rig and session."""
 
     command: Literal["status"]
 
 
-class Watch(Request):
+class WatchRequest(Request):
     """Send the events from now on."""
 
     command: Literal["watch"]
     signals: bool = False
 
 
-class Stop(Request):
+class StopSessionRequest(Request):
     """End the running session safely."""
 
     command: Literal["stop"]
 
 
-class Tare(Request):
+class TareRequest(Request):
     """Average the sensor at rest."""
 
     controlling = True
     command: Literal["tare"]
 
 
-class Zero(Request):
+class ZeroRequest(Request):
     """Make the present angle the zero."""
 
     controlling = True
     command: Literal["zero"]
 
 
-class Reset(Request):
+class ResetRequest(Request):
     """Leave the fault."""
 
     controlling = True
@@ -120,7 +120,7 @@ class Notes(BaseModel):
         return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
 
 
-class Check(Request):
+class CheckRequest(Request):
     """Check profile, control loop and computer, and what the connected devices said."""
 
     controlling = True
@@ -140,20 +140,30 @@ class SessionRequest(Request):
     tip_slope_rad: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
 
-class Start(SessionRequest):
+class StartRequest(SessionRequest):
     """Run it."""
 
     controlling = True
     command: Literal["start"]
 
 
-class Predict(SessionRequest):
+class PredictRequest(SessionRequest):
     """Predict what it would do."""
 
     command: Literal["predict"]
 
 
-AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Check | Start | Predict
+AnyRequest = (
+    StatusRequest
+    | WatchRequest
+    | StopSessionRequest
+    | TareRequest
+    | ZeroRequest
+    | ResetRequest
+    | CheckRequest
+    | StartRequest
+    | PredictRequest
+)
 _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
@@ -214,10 +224,10 @@ def _first_complaint(error: ValidationError) -> str:
     return f"{where}: {first['msg']}."
 
 
-SomeSession = TypeVar("SomeSession", bound=SessionRequest)
+AnySessionRequest = TypeVar("AnySessionRequest", bound=SessionRequest)
 
 
-def _checked(request: SomeSession) -> SomeSession:
+def _checked(request: AnySessionRequest) -> AnySessionRequest:
     """Check what depends on the excitation, by the signature of its function."""
     if request.excitation not in KINDS:
         raise RequestError(

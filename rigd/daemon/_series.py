@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
-from rigd.daemon._states import Document, State, fit_document
+from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import Event
 from rigd.runner import RigError, Series, result_line
 from rigd.runner.session import SessionProgress, SessionResult
@@ -32,7 +32,7 @@ class ServedSeries:
     """Sessions that one request asked for, and how far they came."""
 
     number: int
-    request: protocol.Start
+    request: protocol.StartRequest
     stop: StopRequest = field(default_factory=StopRequest)
     planned: Series | None = None
     session: int = 0
@@ -72,7 +72,7 @@ class ServedSeries:
             "sessions": [replace(result, fit=None).as_dict() for result in self.results],
         }
 
-    def state_after(self, fault: str) -> tuple[State, str]:
+    def state_after(self, fault: str) -> tuple[DaemonState, str]:
         """Return the state of the daemon after this series, and the reason.
 
         Parameters
@@ -81,12 +81,12 @@ class ServedSeries:
             What put the rig out of work; empty if it may go on.
         """
         if fault:
-            return State.FAULT, fault
+            return DaemonState.FAULT, fault
         if self.stop.requested:
-            return State.READY, f"{self.words} was stopped"
+            return DaemonState.READY, f"{self.words} was stopped"
         if self.reason:
-            return State.READY, self.reason
-        return State.READY, f"{self.words} is complete"
+            return DaemonState.READY, self.reason
+        return DaemonState.READY, f"{self.words} is complete"
 
 
 _WORDS: Final = {

@@ -26,8 +26,8 @@ from rigd.daemon._protocol import (
     CommandError,
     Id,
     RequestError,
-    Stop,
-    Watch,
+    StopSessionRequest,
+    WatchRequest,
     parse_request,
 )
 from rigd.daemon._service import Service
@@ -64,9 +64,9 @@ class Server:
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
         self._service: Service | None = None
-        self._clients: set[_Client] = set()
-        self._leaving: set[_Client] = set()
-        self._silent: dict[socket.socket, _Silent] = {}
+        self._clients: set[_ClientConnection] = set()
+        self._leaving: set[_ClientConnection] = set()
+        self._silent: dict[socket.socket, _PendingConnection] = {}
         """Silent connections, in the order in which they came."""
         self._answering: set[asyncio.Task[None]] = set()
         self._looked_up: set[int] = set()
@@ -102,12 +102,12 @@ class Server:
             await asyncio.sleep(0.01)
         self._give_the_spare()
 
-    def forget(self, client: "_Client") -> None:
+    def forget(self, client: "_ClientConnection") -> None:
         """Take note that a client is gone."""
         self._clients.discard(client)
         self._leaving.discard(client)
 
-    def _dismiss(self, client: "_Client") -> None:
+    def _dismiss(self, client: "_ClientConnection") -> None:
         self._clients.discard(client)
         self._leaving.add(client)
         client.leave()
@@ -147,13 +147,13 @@ class Server:
         else:
             self._hear(silent)
 
-    def _introduced(self, link: socket.socket) -> "_Silent":
+    def _introduced(self, link: socket.socket) -> "_PendingConnection":
         link.setblocking(False)
         pid, uid = peer_of(link)
         self._count += 1
-        return _Silent(link, Peer(self._count, pid, uid))
+        return _PendingConnection(link, Peer(self._count, pid, uid))
 
-    def _hear(self, silent: "_Silent") -> None:
+    def _hear(self, silent: "_PendingConnection") -> None:
         """Take what a connection says; once it is a line, it is a client's."""
         try:
             data = silent.link.recv(LONGEST_LINE)
@@ -172,7 +172,7 @@ class Server:
         else:
             silent.link.close()
 
-    def _wait_for(self, silent: "_Silent") -> None:
+    def _wait_for(self, silent: "_PendingConnection") -> None:
         """Wait until it says more; if too many are silent, one of them is let go."""
         if silent.link in self._silent:
             return
@@ -195,13 +195,13 @@ class Server:
         _say_full(oldest.link)
         return True
 
-    def _part_from(self, silent: "_Silent") -> None:
+    def _part_from(self, silent: "_PendingConnection") -> None:
         if self._silent.pop(silent.link, None) is not None:
             asyncio.get_running_loop().remove_reader(silent.link)
 
     # Clients
 
-    def _admit(self, silent: "_Silent") -> None:
+    def _admit(self, silent: "_PendingConnection") -> None:
         """Make a client of a connection that has said its first line."""
         assert self._service is not None
         if len(self._clients) >= MOST_CLIENTS and not self._make_room():
@@ -212,7 +212,7 @@ class Server:
             self._looked_up.add(uid)
             # Not waited for: the user data base may be on a network.
             threading.Thread(target=look_up_user, args=(uid,), daemon=True).start()
-        client = _Client(self, self._service, silent.peer, bytes(silent.said))
+        client = _ClientConnection(self, self._service, silent.peer, bytes(silent.said))
         self._clients.add(client)
         client.connecting = asyncio.create_task(_connect(silent.link, client))
 
@@ -227,19 +227,21 @@ class Server:
         self._dismiss(longest)
         return True
 
-    def _answer_if_stop(self, silent: "_Silent") -> None:
+    def _answer_if_stop(self, silent: "_PendingConnection") -> None:
         """Obey a `stop` from a client for which there is no room, and turn it away."""
         line = bytes(silent.said).partition(b"\n")[0]
         with suppress(RequestError):
             request = parse_request(line)
-            if isinstance(request, Stop):
+            if isinstance(request, StopSessionRequest):
                 task = asyncio.create_task(self._obey_and_part(request, silent))
                 self._answering.add(task)
                 task.add_done_callback(self._answering.discard)
                 return
         _say_full(silent.link)
 
-    async def _obey_and_part(self, request: Stop, silent: "_Silent") -> None:
+    async def _obey_and_part(
+        self, request: StopSessionRequest, silent: "_PendingConnection"
+    ) -> None:
         assert self._service is not None
         _say(silent.link, _line(await _reply(self._service, request, silent.peer)))
 
@@ -270,7 +272,7 @@ class Server:
 
 
 @dataclass(slots=True)
-class _Silent:
+class _PendingConnection:
     """A connection that has not said a whole line yet."""
 
     link: socket.socket
@@ -278,7 +280,7 @@ class _Silent:
     said: bytearray = field(default_factory=bytearray)
 
 
-class _Client(asyncio.Protocol):
+class _ClientConnection(asyncio.Protocol):
     """One connection."""
 
     def __init__(self, server: Server, service: Service, peer: Peer, said: bytes) -> None:
@@ -407,7 +409,7 @@ class _Client(asyncio.Protocol):
                 self.write(_line(_refusal(request.id, text, command="watch", wrong_use=False)))
                 return
             self.watching = True
-        if isinstance(request, Watch):
+        if isinstance(request, WatchRequest):
             self._wants_signals |= request.signals
         task = asyncio.create_task(self._answer(request))
         self._tasks.add(task)
@@ -439,7 +441,7 @@ async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
     return told if request.id is None else told | {"id": request.id}
 
 
-async def _connect(link: socket.socket, client: _Client) -> None:
+async def _connect(link: socket.socket, client: _ClientConnection) -> None:
     try:
         await asyncio.get_running_loop().connect_accepted_socket(lambda: client, link)
     except OSError:

@@ -23,10 +23,10 @@ from rigd.daemon._log import NAME
 from rigd.daemon._protocol import CommandError
 from rigd.daemon._series import Publish, SeriesTeller, ServedSeries
 from rigd.daemon._states import (
+    DaemonState,
+    DaemonStateMachine,
     Document,
     Peer,
-    State,
-    StateMachine,
     Transition,
     daemon_document,
     histories,
@@ -113,7 +113,7 @@ class Service:
         self._failed_checks = [asdict(each) for each in check_on_paper(profile).failed]
         self._fast = fast
         self._live = live
-        self._states = StateMachine(self._tell_transition)
+        self._states = DaemonStateMachine(self._tell_transition)
         self._began_utc_ns = time.time_ns()
         self._fault = ""
         """Why it went into fault last, but for what failed in resetting it."""
@@ -139,7 +139,7 @@ class Service:
         self._page: str | None = None
 
     @property
-    def state(self) -> State:
+    def state(self) -> DaemonState:
         """State of the daemon."""
         return self._states.state
 
@@ -169,7 +169,7 @@ class Service:
     async def tell_signals(self) -> None:
         """Publish the signals to those who want them, until cancelled."""
         while True:
-            at_work = self.state in (State.RUNNING, State.STOPPING)
+            at_work = self.state in (DaemonState.RUNNING, DaemonState.STOPPING)
             await asyncio.sleep(_SIGNALS_S if at_work else LOOK_S)
             self._publish_signals()
 
@@ -197,8 +197,8 @@ class Service:
         if self._looks is not None:
             self._looks.close()
         await self._call(self._rig.disconnect)
-        if self.state is State.READY:
-            self._states.move(State.IDLE, reason)
+        if self.state is DaemonState.READY:
+            self._states.move(DaemonState.IDLE, reason)
 
     def set_page(self, address: str | None) -> None:
         """Take note of where the operator's page is, without its token; from any thread."""
@@ -220,13 +220,13 @@ class Service:
             If it is refused, or fails.
         """
         match request:
-            case protocol.Status():
+            case protocol.StatusRequest():
                 return self.status()
-            case protocol.Watch():
+            case protocol.WatchRequest():
                 if request.signals:
                     self._signal_watchers.add(peer)
                 return {}
-            case protocol.Predict():
+            case protocol.PredictRequest():
                 return await self._predict(request)
         _log.info("%s: asked by %s", request.command, peer)
         try:
@@ -240,15 +240,15 @@ class Service:
         if request.controlling:
             self._take_control(peer)
             await self._wait_until_opened(peer)
-        if isinstance(request, protocol.Start):
+        if isinstance(request, protocol.StartRequest):
             return await self._start(request)
-        if isinstance(request, protocol.Stop):
+        if isinstance(request, protocol.StopSessionRequest):
             return self.stop(f"stop asked for by {peer}")
-        if isinstance(request, protocol.Check):
+        if isinstance(request, protocol.CheckRequest):
             return await self._check_rig()
-        if isinstance(request, protocol.Tare):
+        if isinstance(request, protocol.TareRequest):
             return await self._measure("tare", self._rig.tare)
-        if isinstance(request, protocol.Zero):
+        if isinstance(request, protocol.ZeroRequest):
             return await self._measure("zero", self._rig.zero)
         return await self._reset()
 
@@ -292,8 +292,8 @@ class Service:
             return {"stopping": False}
         if not series.stop.requested:
             series.stop.request()
-            if self.state is State.RUNNING:
-                self._states.move(State.STOPPING, reason)
+            if self.state is DaemonState.RUNNING:
+                self._states.move(DaemonState.STOPPING, reason)
         return {"stopping": True}
 
     def look(self) -> None:
@@ -311,13 +311,17 @@ class Service:
         """Check whether the rig is well between sessions."""
         # A check asks nothing of the rig, and the thread of its calls is free.
         busy = self._doing not in ("", "check")
-        if busy or not self._rig.connected or self.state not in (State.READY, State.FAULT):
+        if (
+            busy
+            or not self._rig.connected
+            or self.state not in (DaemonState.READY, DaemonState.FAULT)
+        ):
             return
         try:
             await self._call(self._rig.watch)
         except RigError as error:
-            if not self._closing and self.state is State.READY:
-                self._states.move(State.FAULT, str(error))
+            if not self._closing and self.state is DaemonState.READY:
+                self._states.move(DaemonState.FAULT, str(error))
 
     # Commands
 
@@ -352,7 +356,7 @@ class Service:
         if self._doing:
             raise CommandError(f"The rig is busy ({self._doing}); try again in a moment.")
 
-    async def _predict(self, request: protocol.Predict) -> Document:
+    async def _predict(self, request: protocol.PredictRequest) -> Document:
         """Predict a session, whatever else is being done."""
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are running; try again in a moment.")
@@ -374,7 +378,7 @@ class Service:
             self._predictions -= 1
 
     async def _check_rig(self) -> Document:
-        if self.state in (State.RUNNING, State.STOPPING):
+        if self.state in (DaemonState.RUNNING, DaemonState.STOPPING):
             raise CommandError(
                 "check needs a rig without a running session: wait for the session to end, or end "
                 "it with rigd stop."
@@ -390,7 +394,7 @@ class Service:
         self._last_check = {"utc_ns": time.time_ns(), "verdict": told["verdict"]}
         return told
 
-    async def _start(self, request: protocol.Start) -> Document:
+    async def _start(self, request: protocol.StartRequest) -> Document:
         self._check("start")
         if self._rig.zero_lost:
             raise CommandError(
@@ -418,7 +422,7 @@ class Service:
             _log.warning("series %d: %s", series.number, warning)
         series.planned = planned
         times = f", {request.repeat} sessions" if request.repeat > 1 else ""
-        self._states.move(State.RUNNING, f"{series.words} was started{times}")
+        self._states.move(DaemonState.RUNNING, f"{series.words} was started{times}")
         self._task = asyncio.create_task(self._follow(series, planned))
         return {"series": series.number, "plan": planned.plan_document()}
 
@@ -428,8 +432,8 @@ class Service:
         try:
             return await self._call(measure)
         except RigError as error:
-            if not self._rig.connected and self.state is State.READY:
-                self._states.move(State.FAULT, str(error))
+            if not self._rig.connected and self.state is DaemonState.READY:
+                self._states.move(DaemonState.FAULT, str(error))
             raise CommandError(str(error)) from None
         finally:
             self._doing = ""
@@ -444,12 +448,12 @@ class Service:
                 except RigError:
                     pass  # it is reconnected
                 else:
-                    self._states.move(State.READY, "reset by the operator")
+                    self._states.move(DaemonState.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
             if self._closing:
                 raise CommandError(_SHUTTING_DOWN)
             fault = self._fault
-            self._states.move(State.IDLE, "reset by the operator")
+            self._states.move(DaemonState.IDLE, "reset by the operator")
             await self._connect(reset_fault=True, fault=fault)
         finally:
             self._doing = ""
@@ -478,12 +482,12 @@ class Service:
         if self._closing:
             await self._call(self._rig.disconnect)
             raise CommandError(_SHUTTING_DOWN)
-        self._states.move(State.READY, f"{moving.value} is connected")
+        self._states.move(DaemonState.READY, f"{moving.value} is connected")
 
     def _fail_again(self, reason: str, fault: str) -> None:
         """Go into fault, with what came before it if that could not be reset."""
         same = not fault or fault == reason
-        self._states.move(State.FAULT, reason if same else f"{reason} Not reset: {fault}")
+        self._states.move(DaemonState.FAULT, reason if same else f"{reason} Not reset: {fault}")
         self._fault = fault or reason
 
     # Series
@@ -583,9 +587,9 @@ class Service:
         }
 
     def _tell_transition(self, transition: Transition) -> None:
-        if transition.after is State.FAULT:
+        if transition.after is DaemonState.FAULT:
             self._fault = transition.reason
-        level = logging.ERROR if transition.after is State.FAULT else logging.INFO
+        level = logging.ERROR if transition.after is DaemonState.FAULT else logging.INFO
         _log.log(
             level, "state: %s -> %s: %s", transition.before, transition.after, transition.reason
         )

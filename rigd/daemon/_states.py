@@ -21,7 +21,7 @@ from rigd.runner.status import ProcessStatus, RigStatus
 _REMEMBERED = 50
 
 
-class State(StrEnum):
+class DaemonState(StrEnum):
     """States of the daemon."""
 
     IDLE = "idle"
@@ -37,29 +37,29 @@ class State(StrEnum):
     showed."""
 
 
-_LEADS_TO: Mapping[State, frozenset[State]] = {
-    State.IDLE: frozenset({State.READY, State.FAULT}),
-    State.READY: frozenset({State.RUNNING, State.IDLE, State.FAULT}),
-    State.RUNNING: frozenset({State.STOPPING, State.READY, State.FAULT}),
-    State.STOPPING: frozenset({State.READY, State.FAULT}),
-    State.FAULT: frozenset({State.IDLE, State.READY}),
+_LEADS_TO: Mapping[DaemonState, frozenset[DaemonState]] = {
+    DaemonState.IDLE: frozenset({DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.READY: frozenset({DaemonState.RUNNING, DaemonState.IDLE, DaemonState.FAULT}),
+    DaemonState.RUNNING: frozenset({DaemonState.STOPPING, DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.STOPPING: frozenset({DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.FAULT: frozenset({DaemonState.IDLE, DaemonState.READY}),
 }
 
-_REMEDIES: Mapping[State, str] = {
-    State.IDLE: "its devices are being connected; try again in a moment",
-    State.READY: "there is nothing to reset",
-    State.RUNNING: "wait for the session to end, or end it with rigd stop",
-    State.STOPPING: "the session is being stopped; wait for its end",
-    State.FAULT: "remove the cause, then run rigd reset",
+_REMEDIES: Mapping[DaemonState, str] = {
+    DaemonState.IDLE: "its devices are being connected; try again in a moment",
+    DaemonState.READY: "there is nothing to reset",
+    DaemonState.RUNNING: "wait for the session to end, or end it with rigd stop",
+    DaemonState.STOPPING: "the session is being stopped; wait for its end",
+    DaemonState.FAULT: "remove the cause, then run rigd reset",
 }
-_ADJECTIVES: Mapping[State, str] = {state: state.value for state in State} | {
-    State.FAULT: "in fault"
+_ADJECTIVES: Mapping[DaemonState, str] = {state: state.value for state in DaemonState} | {
+    DaemonState.FAULT: "in fault"
 }
-_COMES_FROM: Mapping[str, State] = {
-    "start": State.READY,
-    "tare": State.READY,
-    "zero": State.READY,
-    "reset": State.FAULT,
+_COMES_FROM: Mapping[str, DaemonState] = {
+    "start": DaemonState.READY,
+    "tare": DaemonState.READY,
+    "zero": DaemonState.READY,
+    "reset": DaemonState.FAULT,
 }
 
 
@@ -72,12 +72,12 @@ class Transition:
     """One change of state."""
 
     utc_ns: int
-    before: State
-    after: State
+    before: DaemonState
+    after: DaemonState
     reason: str
 
 
-class StateMachine:
+class DaemonStateMachine:
     """The present state and how it came about.
 
     Parameters
@@ -103,7 +103,7 @@ class StateMachine:
         self._on_change = on_change
         self._utc_ns = utc_ns
         self._began_utc_ns = utc_ns()
-        self.state = State.IDLE
+        self.state = DaemonState.IDLE
         self.history: deque[Transition] = deque(maxlen=_REMEMBERED)
 
     @property
@@ -116,7 +116,7 @@ class StateMachine:
         """Reason of the present state."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
-    def move(self, after: State, reason: str) -> None:
+    def move(self, after: DaemonState, reason: str) -> None:
         """Go to another state.
 
         Raises
@@ -136,7 +136,7 @@ class StateMachine:
         wanted = _COMES_FROM.get(command, self.state)
         if wanted is self.state:
             return ""
-        why = f" ({self.reason.rstrip('.')})" if self.state is State.FAULT else ""
+        why = f" ({self.reason.rstrip('.')})" if self.state is DaemonState.FAULT else ""
         return (
             f"{command} needs a rig that is {_ADJECTIVES[wanted]}; this one is "
             f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from rigd.checks import check_on_paper
-from rigd.daemon._protocol import CommandError, Start
+from rigd.daemon._protocol import CommandError, StartRequest
 from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile, with_specimen
@@ -42,7 +42,7 @@ Done = TypeVar("Done")
 Done_co = TypeVar("Done_co", covariant=True)
 
 
-class Job(Protocol[Done_co]):
+class BackgroundJob(Protocol[Done_co]):
     """Something to be done."""
 
     beside_sessions: ClassVar[bool]
@@ -125,7 +125,7 @@ class PlanJob:
 
     profile: Profile
     """Rig of the sessions."""
-    request: Start
+    request: StartRequest
     """What was asked for."""
     folder: Path
     """Folder for the files."""
@@ -165,7 +165,7 @@ class PlanJob:
             raise CommandError("There is not enough memory to plan such a session.") from None
 
 
-async def perform(job: Job[Done]) -> Done:
+async def perform(job: BackgroundJob[Done]) -> Done:
     """Have a job done in its own process, without holding up the event loop.
 
     Parameters

@@ -16,7 +16,7 @@ _HARD_TICKS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
+class DetectedContact:
     """Contact that the loop has detected."""
 
     message: str
@@ -59,7 +59,7 @@ class TouchWatch:
         self._arms = self._pass.begins
         self._hard = 0
 
-    def step(self, tick: int, missed: int) -> Contact | None:
+    def step(self, tick: int, missed: int) -> DetectedContact | None:
         """Look at the tick that was just run.
 
         Parameters
@@ -95,11 +95,11 @@ class TouchWatch:
             return too_hard
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:
-            return Contact(
+            return DetectedContact(
                 "The beam met something on its way back. Find what stands in its way.", "stopped"
             )
         self._react(tick)
-        return Contact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
+        return DetectedContact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
 
     def _react(self, tick: int) -> None:
         """Write the rest of the pass anew."""
@@ -110,7 +110,7 @@ class TouchWatch:
         path = after_touch(self._approach, current.ends, tick, recent, start_rad)
         reference[tick + 1 : current.ends] = memoryview(path)  # type: ignore[arg-type] # numpy's stubs
 
-    def _too_hard(self, shear_n: float) -> Contact | None:
+    def _too_hard(self, shear_n: float) -> DetectedContact | None:
         if self._projection is None:
             return None
         force_n = abs(self._detector.contact_force_n(shear_n))
@@ -118,7 +118,7 @@ class TouchWatch:
         self._hard = self._hard + 1 if force_n > limit_n else 0
         if self._hard < _HARD_TICKS:
             return None
-        return Contact(
+        return DetectedContact(
             f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "
             "speed, or a higher limit.",
             "fault",

@@ -73,7 +73,7 @@ _AGAIN: Final = """
 """
 
 
-class PageServer:
+class ViewerPageServer:
     """Serves the page to browsers on this computer, in separate threads.
 
     Parameters
@@ -118,12 +118,12 @@ class PageServer:
 
 def serve_page(
     address: Callable[[], LiveAddress | None], upstream: Callable[[], int]
-) -> PageServer:
-    """Serve the page, on :data:`PAGE_PORT` unless that is taken; as for :class:`PageServer`."""
+) -> ViewerPageServer:
+    """Serve the page, on :data:`PAGE_PORT` or on a free port if that is taken."""
     try:
-        return PageServer(PAGE_PORT, address, upstream)
+        return ViewerPageServer(PAGE_PORT, address, upstream)
     except OSError:
-        return PageServer(0, address, upstream)
+        return ViewerPageServer(0, address, upstream)
 
 
 class _Server(ThreadingHTTPServer):

@@ -77,7 +77,7 @@ class Intake:
         self._rate_hz = session.subject.rate_hz
         self._seen = seen
         self._readers = {
-            topic: _Reader(ring, first, seen if topic is SAMPLE else 0)
+            topic: _RingReader(ring, first, seen if topic is SAMPLE else 0)
             for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
             if topic.live
         }
@@ -122,7 +122,7 @@ class Intake:
         return Harvest(notes, drawings, fresh)
 
 
-class _Reader:
+class _RingReader:
     """The part of one ring that a session wrote."""
 
     def __init__(self, ring: Ring, first: int, seen: int) -> None:

@@ -38,7 +38,7 @@ from rigd.view.banner import (
     SUPERVISOR_LOST_TORQUE_OFF,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    State,
+    BannerState,
     ended,
     preparing,
 )
@@ -95,7 +95,7 @@ class _Publisher:
         self._channels = channels
         self._outlet = outlet
         self._feed = Feed(outlet)
-        self._shown: _Shown | None = None
+        self._shown: _ShownSession | None = None
         self._last: LastResponse | None = None
         self._told: int | None = None
 
@@ -143,7 +143,7 @@ class _Publisher:
         self._finish(LiveEnd(session.begins))
         if self._shown is not None:
             self._last = self._shown.intake.picture.last_response or self._last
-        self._shown = _Shown(session, self._channels, last_response(session, self._last))
+        self._shown = _ShownSession(session, self._channels, last_response(session, self._last))
         self._outlet.begin_session()
         self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
         self._step()
@@ -185,7 +185,7 @@ class _Publisher:
             self._parent.send(address)
 
 
-class _Shown:
+class _ShownSession:
     """The session that is shown, or was last."""
 
     def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
@@ -422,7 +422,7 @@ class StateWatch:
         self._board = channels.board
         self._supervisor = Pulse()
 
-    def look(self, now_s: float) -> State:
+    def look(self, now_s: float) -> BannerState:
         """Return the state; to be called several times a second.
 
         Parameters

@@ -16,7 +16,7 @@ from rigd.session import Validity
 from rigd.session.online_fit import unseen_modes
 from rigd.units import suffix_of, unit_of, with_half_width, with_share
 from rigd.view._session_info import plain
-from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -79,17 +79,17 @@ def _plot(quantity: _Quantity, mode: int, *, asked: bool) -> Plot:
     # What is called the same has one entry in the legend.
     wanted, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
     wanted_ends = (
-        Curve(wanted, GREY, partial(values, column=_ASKED_LOW)),
-        Curve(wanted, GREY, partial(values, column=_ASKED_HIGH)),
+        PlotCurve(wanted, GREY, partial(values, column=_ASKED_LOW)),
+        PlotCurve(wanted, GREY, partial(values, column=_ASKED_HIGH)),
     )
     return Plot(
         f"{quantity.name}_{mode}_{quantity.suffix}",
         f"{quantity.title} of mode {mode} ({unit})",
         (
             *(wanted_ends if asked else ()),
-            Curve(interval, ORANGE, partial(values, column=_LOW)),
-            Curve(interval, ORANGE, partial(values, column=_HIGH)),
-            Curve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
+            PlotCurve(interval, ORANGE, partial(values, column=_LOW)),
+            PlotCurve(interval, ORANGE, partial(values, column=_HIGH)),
+            PlotCurve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
         ),
     )
 

@@ -23,7 +23,7 @@ from rigd.view._session_info import (
     send_recent,
     send_summary,
 )
-from rigd.view.banner import State, preparing
+from rigd.view.banner import BannerState, preparing
 from rigd.view.frequency_charts import (
     LAST_HZ,
     LastResponse,
@@ -161,7 +161,7 @@ class Scene:
         self._fits.append(fit_record(fit, self._subject.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
 
-    def state(self, t_ns: int, state: State) -> list[Drawing]:
+    def state(self, t_ns: int, state: BannerState) -> list[Drawing]:
         """Take the state of the session; nothing is drawn as long as it stays the same.
 
         Parameters

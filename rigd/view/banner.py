@@ -21,7 +21,7 @@ VALUES: Final = "/values"
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class BannerState:
     """State of a session, as the banner says it.
 
     Attributes
@@ -42,26 +42,26 @@ class State:
     over: bool = False
 
 
-RUNNING: Final = State("RUNNING", GREEN)
-STOPPING: Final = State("STOPPING", ORANGE)
-RETURNING: Final = State("RETURNING", ORANGE, "The record is over.")
-FINISHING: Final = State("FINISHING", ORANGE, "The record is over and the torque is off.")
-SUPERVISOR_SILENT: Final = State(
+RUNNING: Final = BannerState("RUNNING", GREEN)
+STOPPING: Final = BannerState("STOPPING", ORANGE)
+RETURNING: Final = BannerState("RETURNING", ORANGE, "The record is over.")
+FINISHING: Final = BannerState("FINISHING", ORANGE, "The record is over and the torque is off.")
+SUPERVISOR_SILENT: Final = BannerState(
     "SUPERVISOR NOT RESPONDING",
     RED,
     "The session cannot be stopped now; it is aborted after 2 s. Check CPU load.",
 )
-SUPERVISOR_SILENT_TORQUE_OFF: Final = State(
+SUPERVISOR_SILENT_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."
 )
-SUPERVISOR_LOST: Final = State(
+SUPERVISOR_LOST: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended. The control process ends the session and switches the torque "
     "off.",
     over=True,
 )
-SUPERVISOR_LOST_TORQUE_OFF: Final = State(
+SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended; the torque is off.",
@@ -71,7 +71,7 @@ SUPERVISOR_LOST_TORQUE_OFF: Final = State(
 _COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
 
 
-def preparing(doing: str = "") -> State:
+def preparing(doing: str = "") -> BannerState:
     """Return the state of a session before its record.
 
     Parameters
@@ -79,10 +79,10 @@ def preparing(doing: str = "") -> State:
     doing
         What is being done, in words.
     """
-    return State("PREPARING", ORANGE, doing)
+    return BannerState("PREPARING", ORANGE, doing)
 
 
-def ended(outcome: str, reason: str) -> State:
+def ended(outcome: str, reason: str) -> BannerState:
     """Return the state of a session that is over.
 
     Parameters
@@ -91,13 +91,13 @@ def ended(outcome: str, reason: str) -> State:
         How the session ended, and why; an empty outcome is not known.
     """
     word = outcome.upper() or "ENDED"
-    return State(word, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
+    return BannerState(word, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
 
 
 # State in words
 
 
-def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str:
+def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") -> str:
     """Return the banner as Markdown: state, time left, reason, and what is run.
 
     Parameters
@@ -138,7 +138,7 @@ def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str
 
 
 def send_banner(
-    stream: "RecordingStream", subject: "Subject", state: State, t_ns: int, health: "Health"
+    stream: "RecordingStream", subject: "Subject", state: BannerState, t_ns: int, health: "Health"
 ) -> None:
     """Show the banner of one moment.
 
@@ -241,7 +241,7 @@ def gauge_color(gauge: Gauge) -> Color:
 
 
 def send_values(
-    stream: "RecordingStream", state: State, t_ns: int, gauges: Mapping[str, Gauge]
+    stream: "RecordingStream", state: BannerState, t_ns: int, gauges: Mapping[str, Gauge]
 ) -> None:
     """Draw the band in the state's colour, and bars of the values up to their limits.
 

@@ -47,7 +47,7 @@ TIMELINE: Final = "session_time"
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class PlotCurve:
     """One curve of a plot.
 
     Attributes
@@ -89,7 +89,7 @@ class Plot:
 
     component: str
     title: str
-    curves: tuple[Curve, ...]
+    curves: tuple[PlotCurve, ...]
     span: tuple[float, float] | None = None
     least_span: float = 0.0
 
@@ -163,10 +163,10 @@ def _column(component: str, values: Values) -> "ComponentColumn":
     )
 
 
-def _axes(field: str, symbol: str, unit: str) -> tuple[Curve, ...]:
+def _axes(field: str, symbol: str, unit: str) -> tuple[PlotCurve, ...]:
     """Return the curves of the sensor's three axes, from fields named like ``f{}_n``."""
     return tuple(
-        Curve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
+        PlotCurve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
         for axis, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
     )
 
@@ -176,8 +176,8 @@ ANGLE = Plot(
     "Motor angle (mrad)",
     (
         # Wider, for it lies under the measured angle.
-        Curve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
-        Curve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
+        PlotCurve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
+        PlotCurve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
     ),
     least_span=4.0,
 )
@@ -185,7 +185,7 @@ TRACKING_ERROR = Plot(
     "tracking_error_mrad",
     "Tracking error, reference − measured (mrad)",
     (
-        Curve(
+        PlotCurve(
             "tracking error (mrad)",
             VERMILION,
             lambda r: 1e3 * (r["angle_reference_rad"] - r["angle_rad"]),
@@ -196,13 +196,13 @@ TRACKING_ERROR = Plot(
 COUPLING_TORQUE = Plot(
     "coupling_torque_nm",
     "Coupling torque, tared (N·m)",
-    (Curve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
+    (PlotCurve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
     least_span=0.1,
 )
 TORQUE_COMMAND = Plot(
     "torque_command_nm",
     "Torque command, after limits (N·m)",
-    (Curve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
+    (PlotCurve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
     least_span=0.1,
 )
 FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), least_span=1.0)
@@ -213,8 +213,8 @@ LOOP = Plot(
     "loop_us",
     "Wake-up latency and execution time of the loop (µs)",
     (
-        Curve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
-        Curve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
+        PlotCurve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
+        PlotCurve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
     ),
     least_span=100.0,
 )
@@ -228,8 +228,8 @@ AGES = Plot(
     "ages_ms",
     "Measurement latency (ms)",
     (
-        Curve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
-        Curve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
+        PlotCurve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
+        PlotCurve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
     ),
     least_span=1.0,
 )
@@ -240,9 +240,9 @@ FAULTY_TICKS = Plot(
     "faulty_ticks",
     "Missed, late and lost (ticks since the start)",
     (
-        Curve("missed (ticks)", VERMILION, lambda r: r["missed_ticks"]),
-        Curve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
-        Curve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
+        PlotCurve("missed (ticks)", VERMILION, lambda r: r["missed_ticks"]),
+        PlotCurve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
+        PlotCurve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
     ),
     least_span=10.0,
 )
@@ -250,32 +250,32 @@ BACKLOG = Plot(
     "backlog_samples",
     "Backlog of the recorder, dropped by the viewer (samples)",
     (
-        Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
-        Curve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
+        PlotCurve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
+        PlotCurve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
     ),
     least_span=100.0,
 )
 BUS_LOAD = Plot(
     "bus_load_percent",
     "Bus load (%)",
-    (Curve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
+    (PlotCurve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
     span=(0.0, 105.0),
 )
 BUS_ERRORS = Plot(
     "bus_errors",
     "Bus errors since the devices were connected (count)",
-    (Curve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
+    (PlotCurve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
     least_span=10.0,
 )
 SENSOR_STATUS = Plot(
     "sensor_status",
     "Status word of the sensor (0: OK)",
-    (Curve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
+    (PlotCurve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
 )
 DISK = Plot(
     "disk_free_gb",
     "Free on the disk (GB)",
-    (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
+    (PlotCurve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
     least_span=1.0,
 )
 OF_A_BUS: Final = frozenset(plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS))

@@ -70,7 +70,7 @@ _HEADERS: Final = {
 }
 
 
-class Access:
+class WebAccess:
     """Checks each request before anything else sees it.
 
     Parameters

@@ -41,7 +41,7 @@ class JobError(Exception):
 
 
 @dataclass(slots=True)
-class Job:
+class AnalysisJob:
     """Something that `analyze` makes."""
 
     number: int
@@ -92,8 +92,8 @@ class Jobs:
         self.paused = True  # until the daemon has said that no session runs
         self._folder = folder
         self._tell = tell
-        self._waiting: asyncio.Queue[Job] = asyncio.Queue(MOST_JOBS)
-        self._underway: dict[int, Job] = {}
+        self._waiting: asyncio.Queue[AnalysisJob] = asyncio.Queue(MOST_JOBS)
+        self._underway: dict[int, AnalysisJob] = {}
         self._count = 0
 
     @property
@@ -101,13 +101,15 @@ class Jobs:
         """Where results will be served of jobs that wait or run."""
         return {job.address for job in self._underway.values()}
 
-    def put(self, kind: str, arguments: Sequence[str], session: str = "", address: str = "") -> Job:
+    def put(
+        self, kind: str, arguments: Sequence[str], session: str = "", address: str = ""
+    ) -> AnalysisJob:
         """Queue a job.
 
         Parameters
         ----------
         kind, arguments, session, address
-            See `Job`.
+            See `AnalysisJob`.
 
         Raises
         ------
@@ -115,7 +117,7 @@ class Jobs:
             If too many wait already.
         """
         self._count += 1
-        job = Job(self._count, kind, arguments, session, address)
+        job = AnalysisJob(self._count, kind, arguments, session, address)
         try:
             self._waiting.put_nowait(job)
         except asyncio.QueueFull:
@@ -124,7 +126,7 @@ class Jobs:
         self._say(job)
         return job
 
-    async def await_or_drop(self, job: Job) -> None:
+    async def await_or_drop(self, job: AnalysisJob) -> None:
         """Wait for the end of a job; a session that begins ends it.
 
         Parameters
@@ -158,12 +160,12 @@ class Jobs:
                 self._say(job)
             del self._underway[job.number]
 
-    def _say(self, job: Job) -> None:
+    def _say(self, job: AnalysisJob) -> None:
         """Tell how a job stands; who waits for an export is answered."""
         if job.kind != "export":
             self._tell(job.document())
 
-    async def _perform(self, job: Job) -> None:
+    async def _perform(self, job: AnalysisJob) -> None:
         process = await asyncio.create_subprocess_exec(
             *(*OWN_PYTHON, "-c", _MORTAL, str(os.getpid())),
             *(*_PROGRAM, *job.arguments),

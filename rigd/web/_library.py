@@ -16,7 +16,7 @@ from aiohttp import web
 
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session.quick_look import LOOK_SUFFIX, last_look, read_look
-from rigd.web._access import REPORT_POLICY, Access, object_of, refused
+from rigd.web._access import REPORT_POLICY, WebAccess, object_of, refused
 from rigd.web._jobs import JobError, Jobs
 
 Document = dict[str, Any]
@@ -44,7 +44,7 @@ class Library:
         Makes reports and exports.
     """
 
-    def __init__(self, folder: Path, access: Access, jobs: Jobs) -> None:
+    def __init__(self, folder: Path, access: WebAccess, jobs: Jobs) -> None:
         self._folder = folder
         self._access = access
         self._jobs = jobs

@@ -20,7 +20,7 @@ _HEARTBEAT_S: Final = 10.0
 _MOST_EVENTS: Final = 200
 
 
-class Page:
+class OpenPage:
     """One open page.
 
     Parameters
@@ -77,7 +77,7 @@ class Pages:
     """All open pages, and what one that is opened now has to know."""
 
     def __init__(self) -> None:
-        self._pages: set[Page] = set()
+        self._pages: set[OpenPage] = set()
         self._events: deque[Document] = deque(maxlen=_MOST_EVENTS)
 
     def __len__(self) -> int:
@@ -119,7 +119,7 @@ class Pages:
             heartbeat=_HEARTBEAT_S, compress=False, max_msg_size=_MOST_SAID
         )
         await socket.prepare(request)
-        page = Page(socket, request.transport)
+        page = OpenPage(socket, request.transport)
         for document in (*first, *self._events):
             page.put(_text(document))
         self._pages.add(page)

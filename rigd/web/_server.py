@@ -24,7 +24,7 @@ from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject, sweep_of
-from rigd.web._access import ICON, LIVE, Access, Connections, object_of, refused
+from rigd.web._access import ICON, LIVE, Connections, WebAccess, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
@@ -47,7 +47,7 @@ _FAILED: Final = "The page's server has failed; the daemon starts it again."
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
 
-class PageServer:
+class OperatorPageServer:
     """The page of one rig.
 
     Parameters
@@ -64,7 +64,7 @@ class PageServer:
     def __init__(self, job: Document) -> None:
         self._job = job
         self._socket = Path(job["socket"])
-        self._access = Access(job["token"])
+        self._access = WebAccess(job["token"])
         self.pages = Pages()
         self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
@@ -364,13 +364,13 @@ def _say(**told: Any) -> None:  # noqa: ANN401 - what JSON has
     print(json.dumps(told), flush=True)  # noqa: T201
 
 
-async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.Server]:
+async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
     """Listen on the port of a job, or on another one if that may be.
 
     Parameters
     ----------
     job
-        As of :class:`PageServer`, with ``port`` and ``any_port``.
+        As of :class:`OperatorPageServer`, with ``port`` and ``any_port``.
 
     Returns
     -------
@@ -382,7 +382,7 @@ async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.S
     OSError
         If the port cannot be had.
     """
-    server, connections = PageServer(job), Connections()
+    server, connections = OperatorPageServer(job), Connections()
     application = server.application()
     application.middlewares.append(connections.heard)
     runner = web.AppRunner(

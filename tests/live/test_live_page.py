@@ -10,7 +10,7 @@ import threading
 import pytest
 from processes import sockets
 
-from rigd.live._page import PageServer, kept_here
+from rigd.live._page import ViewerPageServer, kept_here
 
 
 def get(port: int, path: str, host: str | None = None):
@@ -72,7 +72,7 @@ def test_links_to_other_computers_are_left_out():
 @pytest.fixture
 def page():
     """A page of nothing."""
-    server = PageServer(0, lambda: None, lambda: 0)
+    server = ViewerPageServer(0, lambda: None, lambda: 0)
     yield server
     server.close()
 
