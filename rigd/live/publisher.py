@@ -156,12 +156,12 @@ class _Publisher:
 
     def _outlive(self) -> None:
         """Show a session whose supervisor is gone until its torque is off."""
-        shown, board = self._shown, self._channels.board
+        shown, shared_state = self._shown, self._channels.board
         if shown is None or shown.over:
             return
         shown.lost = True
         end = time.monotonic() + _ORPHANED_S
-        while board[Word.PHASE] != Phase.OFF and time.monotonic() < end:
+        while shared_state[Word.PHASE] != Phase.OFF and time.monotonic() < end:
             _arm_watchdog()
             self._step()
             time.sleep(_PERIOD_S)
@@ -189,10 +189,10 @@ class _ShownSession:
     """The session that is shown, or was last."""
 
     def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
-        board = self._board = channels.board
-        begin, seen = session.begins[TOPICS.index(SAMPLE)], board[Word.LIVE_SEEN]
+        shared_state = self._shared_state = channels.board
+        begin, seen = session.begins[TOPICS.index(SAMPLE)], shared_state[Word.LIVE_SEEN]
         # A session that another publisher has shown up to there keeps its count.
-        self._dropped_before = board[Word.LIVE_DROPPED] if seen > begin else 0
+        self._dropped_before = shared_state[Word.LIVE_DROPPED] if seen > begin else 0
         self.intake = Intake(session, channels, seen, last)
         self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
         self.over = False
@@ -228,10 +228,10 @@ class _ShownSession:
 
     def _tell(self) -> None:
         """Write to the board what another publisher needs to know if it takes over."""
-        board = self._board
-        board[Word.LIVE_DROPPED] = self.dropped
+        shared_state = self._shared_state
+        shared_state[Word.LIVE_DROPPED] = self.dropped
         shown = self.intake.next - self.backlog.samples
-        board[Word.LIVE_SEEN] = max(board[Word.LIVE_SEEN], shown)
+        shared_state[Word.LIVE_SEEN] = max(shared_state[Word.LIVE_SEEN], shown)
 
     def touched(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Draw touches, with a line of each among the events."""
@@ -252,7 +252,7 @@ class _ShownSession:
         picture, t_ns = self.intake.picture, self.intake.t_ns
         state = ended(end.outcome, end.reason)
         if self.lost:
-            off = self._board[Word.PHASE] == Phase.OFF
+            off = self._shared_state[Word.PHASE] == Phase.OFF
             state = SUPERVISOR_LOST_TORQUE_OFF if off else SUPERVISOR_LOST
             self.backlog.owe(picture.events([Note(t_ns, "error", state.reason)]))
         elif end.outcome:
@@ -419,7 +419,7 @@ class StateWatch:
     """
 
     def __init__(self, channels: Channels) -> None:
-        self._board = channels.board
+        self._shared_state = channels.board
         self._supervisor = Pulse()
 
     def look(self, now_s: float) -> BannerState:
@@ -430,15 +430,15 @@ class StateWatch:
         now_s
             Time of a monotonic clock.
         """
-        board = self._board
-        phase = Phase(board[Word.PHASE])
-        still_s = self._supervisor.look(board[Word.SUPERVISOR_BEAT], now_s)
+        shared_state = self._shared_state
+        phase = Phase(shared_state[Word.PHASE])
+        still_s = self._supervisor.look(shared_state[Word.SUPERVISOR_BEAT], now_s)
         if still_s > _SILENT_S:
             if phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
-            if board[Word.GO] and phase is Phase.OFF:
+            if shared_state[Word.GO] and phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
-        now = activity(board)
+        now = activity(shared_state)
         if now is Activity.PREPARING:
             return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
         return _STATES[now]
@@ -460,7 +460,7 @@ class Vitals:
     """
 
     def __init__(self, channels: Channels) -> None:
-        self._board = channels.board
+        self._shared_state = channels.board
         self._samples = channels.samples
         self._ticks: collections.deque[tuple[float, int]] = collections.deque(
             maxlen=_RATE_LOOKS + 1
@@ -481,25 +481,25 @@ class Vitals:
         view_dropped
             Samples of the session that could not be shown.
         """
-        board = self._board
+        shared_state = self._shared_state
         self._due_s = now_s + LOOK_S
         # Until tick 0 the board has the counts of the session before.
-        began = bool(board[Word.GO])
+        began = bool(shared_state[Word.GO])
         scheduled, missed, late, lost = (
-            board[word] if began else 0
-            for word in (Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST)
+            shared_state[field] if began else 0
+            for field in (Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST)
         )
-        load_ppm = board.known(Word.BUS_LOAD_PPM)
+        load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
         return Health(
             missed_ticks=missed,
             late_ticks=late,
             lost_ticks=lost,
             recorder_lag_ticks=self._samples.waiting,
-            disk_free_mb=board[Word.DISK_FREE_MB] or None,
+            disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=board.known(Word.BUS_ERRORS),
-            sensor_status=board.known(Word.SENSOR_STATUS),
+            bus_errors=shared_state.known(Word.BUS_ERRORS),
+            sensor_status=shared_state.known(Word.SENSOR_STATUS),
             rate_hz=self._rate_hz(now_s, scheduled),
         )
 
