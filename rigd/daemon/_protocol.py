@@ -1,6 +1,6 @@
-"""Requests to the daemon: parsed from a line of bytes into a checked request, or refused.
+"""Requests to the daemon: a line of bytes is parsed into a checked request, or refused.
 
-Whatever comes in is untrusted. A refusal names what is wrong; docs/control_socket.md has the rules.
+The input is untrusted. A refusal names the error; docs/control_socket.md has the rules.
 """
 
 import inspect
@@ -16,7 +16,7 @@ from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
 LONGEST_LINE = 65_536
-"""Bytes of a request, its newline included."""
+"""Limit in bytes of a request with its newline."""
 MOST_SESSIONS = 1000
 _LONGEST_PATH = 4096
 _LONGEST_TEXT = 1000
@@ -30,7 +30,7 @@ Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
 class RequestError(Exception):
-    """A request cannot be understood; the message says why, `request_id` whose it was."""
+    """A request is invalid; the message says why, and `request_id` identifies the request."""
 
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
@@ -38,21 +38,21 @@ class RequestError(Exception):
 
 
 class CommandError(RigdError):
-    """A request is refused, or failed; the message is for the operator."""
+    """A request is refused or failed; the message is for the operator."""
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
         super().__init__(message)
         self.wrong_use = wrong_use
-        """The request itself has to be another."""
+        """Whether the request itself must change."""
 
 
 class Request(BaseModel):
-    """Fields that every request may have."""
+    """Base of all requests, with their common fields."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     controlling: ClassVar[bool] = False
-    """Only the client that holds control may ask for it."""
+    """Whether only the client that holds control may send it."""
 
     command: str
     id: Id | None = None
@@ -65,7 +65,7 @@ class StatusRequest(Request):
 
 
 class WatchRequest(Request):
-    """Send the events from now on."""
+    """Subscribe to the events."""
 
     command: Literal["watch"]
     signals: bool = False
@@ -99,7 +99,7 @@ class ResetRequest(Request):
 
 
 class Notes(BaseModel):
-    """What is to stand in the files, beside what the sessions themselves say."""
+    """Notes of the operator for the session files."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -109,7 +109,7 @@ class Notes(BaseModel):
     meta: dict[str, Any] = {}
 
     def as_metadata(self) -> dict[str, str]:
-        """Return what was given by the keys of the session file.
+        """Return the notes that are set, by their keys in the session file.
 
         Raises
         ------
@@ -121,14 +121,14 @@ class Notes(BaseModel):
 
 
 class CheckRequest(Request):
-    """Check profile, control loop and computer, and what the connected devices said."""
+    """Check profile, control loop, computer, and the data that the connected devices reported."""
 
     controlling = True
     command: Literal["check"]
 
 
 class SessionRequest(Request):
-    """A session, or a series of them."""
+    """A session or a series of sessions."""
 
     excitation: str
     parameters: dict[str, Any] = {}
@@ -141,14 +141,14 @@ class SessionRequest(Request):
 
 
 class StartRequest(SessionRequest):
-    """Run it."""
+    """Run the sessions."""
 
     controlling = True
     command: Literal["start"]
 
 
 class PredictRequest(SessionRequest):
-    """Predict what it would do."""
+    """Predict the sessions without running them."""
 
     command: Literal["predict"]
 
@@ -171,12 +171,12 @@ _COMMANDS = "status", "watch", "stop", "tare", "zero", "reset", "check", "start"
 
 
 def parse_request(line: bytes) -> AnyRequest:
-    """Understand one line.
+    """Return the request in a line.
 
     Raises
     ------
     RequestError
-        Naming what is wrong with it.
+        If it is invalid; the message names the error.
     """
     given = _parse_object(line)
     request_id = given.get("id")
@@ -218,7 +218,7 @@ def _no_constant(name: str) -> NoReturn:
 
 def _first_complaint(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
-    if first["loc"][1:2] == ("id",):  # one of two types, of which pydantic complains one by one
+    if first["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
         return f"id is a whole number or a text of at most {_LONGEST_ID} characters."
     where = ".".join(str(part)[:_SHOWN] for part in first["loc"][1:]) or "The request"
     return f"{where}: {first['msg']}."
@@ -228,7 +228,7 @@ AnySessionRequest = TypeVar("AnySessionRequest", bound=SessionRequest)
 
 
 def _checked(request: AnySessionRequest) -> AnySessionRequest:
-    """Check what depends on the excitation, by the signature of its function."""
+    """Return a session request whose parameters fit the excitation's function."""
     if request.excitation not in KINDS:
         raise RequestError(
             f"excitation = {_shown(request.excitation)} is unknown; choose {', '.join(KINDS)}."
@@ -242,7 +242,7 @@ def _checked(request: AnySessionRequest) -> AnySessionRequest:
         raise RequestError(f"notes.meta: {error}") from None
     update: dict[str, Any] = {}
     given_parameters = dict(request.parameters)
-    # Older clients have it among the parameters of `until`.
+    # Older clients send it among the parameters of `until`.
     if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
         slope_rad = _number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
         if slope_rad <= 0.0:
@@ -303,7 +303,7 @@ def _number(name: str, given: object) -> float:
 
 
 def _shown(value: object) -> str:
-    """Return a value as JSON, cut to what a message can bear."""
+    """Return a value as JSON, shortened for a message."""
     try:
         text = json.dumps(value)
     except (ValueError, RecursionError):

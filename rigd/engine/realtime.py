@@ -124,8 +124,8 @@ class Precedence:
         Returns
         -------
         dict
-            ``scheduling`` and ``cores``: the granted values, or "refused: " and the reason; empty if
-            nothing was requested.
+            ``scheduling`` and ``cores``: the granted values, or "refused: " and the reason; empty
+            if nothing was requested.
         """
         if self._priority == 0:
             return {}
