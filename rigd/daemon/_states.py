@@ -33,7 +33,7 @@ class DaemonState(StrEnum):
     STOPPING = "stopping"
     """A stop was requested, and the session has not ended yet."""
     FAULT = "fault"
-    """No torque is commanded until an operator resets the rig; the reason has the drive's report."""
+    """No torque is commanded until an operator resets the rig; the reason has the drive report."""
 
 
 _LEADS_TO: Mapping[DaemonState, frozenset[DaemonState]] = {
