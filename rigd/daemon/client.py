@@ -367,7 +367,7 @@ def stop_session(path: Path) -> Document:
         raise DaemonGoneError(failure, seen)
     raise DaemonGoneError(
         f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
-        f"has said nothing for {waited_s:.0f} s. {UNKNOWN_STATE}"
+        f"has not replied for {waited_s:.0f} s. {UNKNOWN_STATE}"
     )
 
 
