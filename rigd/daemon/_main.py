@@ -118,7 +118,7 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     opening = asyncio.create_task(service.open())
     polling = asyncio.create_task(service.run())
     streaming = asyncio.create_task(service.stream_signals())
-    streaming.add_done_callback(_note_end)
+    streaming.add_done_callback(_log_stream_failure)
     # Polling ends only by a bug, which must not leave the rig unsupervised.
     polling.add_done_callback(lambda _: end(signal.SIGABRT))
     await ending_signal
@@ -132,7 +132,7 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     return ending_signal.result()
 
 
-def _note_end(streaming: "asyncio.Task[None]") -> None:
+def _log_stream_failure(streaming: "asyncio.Task[None]") -> None:
     """Log the failure of the signal stream, on which the rig does not depend."""
     if not streaming.cancelled():
         _log.error("the signals are no longer published", exc_info=streaming.exception())

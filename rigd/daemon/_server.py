@@ -131,7 +131,7 @@ class Server:
             except OSError as error:
                 if error.errno not in (errno.EMFILE, errno.ENFILE):
                     return
-                self._turn_away()
+                self._refuse_without_fd()
                 break
             self._welcome(link)
         loop = asyncio.get_running_loop()
@@ -244,7 +244,7 @@ class Server:
         assert self._service is not None
         _send_last(silent.link, _line(await _reply(self._service, request, silent.peer)))
 
-    def _turn_away(self) -> None:
+    def _refuse_without_fd(self) -> None:
         """Accept and refuse a client although no descriptor is free."""
         if self._drop_oldest_pending():
             return  # its descriptor is free now

@@ -471,20 +471,20 @@ class Service:
                 )
             await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
         except RigError as error:
-            self._fail_again(str(error), fault)
+            self._enter_fault(str(error), fault)
             raise CommandError(str(error)) from None
         except Exception as error:
             _log.exception("unexpected error while the rig was being connected")
-            await self._let_go()
+            await self._disconnect_safely()
             reason = f"The rig could not be connected: unexpected error ({error!r})."
-            self._fail_again(reason, fault)
+            self._enter_fault(reason, fault)
             raise CommandError(reason) from None
         if self._closing:
             await self._call(self._rig.disconnect)
             raise CommandError(_SHUTTING_DOWN)
         self._states.move(DaemonState.READY, f"{moving.value} is connected")
 
-    def _fail_again(self, reason: str, fault: str) -> None:
+    def _enter_fault(self, reason: str, fault: str) -> None:
         """Enter the fault state, with the earlier fault if that could not be reset."""
         same = not fault or fault == reason
         self._states.move(DaemonState.FAULT, reason if same else f"{reason} Not reset: {fault}")
@@ -512,7 +512,7 @@ class Service:
             # After an unexpected error everything is switched off, because nothing else may do so.
             _log.exception("unexpected error in a session")
             fault = series.reason = f"The session failed: unexpected error ({error!r})."
-            await self._let_go()
+            await self._disconnect_safely()
         else:
             last = series.results[-1] if series.results else None
             if last is not None and not last.went_well:
@@ -530,7 +530,7 @@ class Service:
         self._states.move(*series.state_after(fault))
         self._publish({"event": "series", **series.as_document()})
 
-    async def _let_go(self) -> None:
+    async def _disconnect_safely(self) -> None:
         """Disconnect the rig, whatever errors occur."""
         try:
             await self._call(self._rig.disconnect)

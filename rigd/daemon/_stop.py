@@ -153,7 +153,7 @@ class _Stop:
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except PermissionError as error:
-                if folder == COMMON or _may_be_of(folder, self._uid):
+                if folder == COMMON or _may_belong_to(folder, self._uid):
                     report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
             except OSError as error:
@@ -521,7 +521,7 @@ def _option(arguments: Sequence[str], name: str) -> str | None:
     return None
 
 
-def _may_be_of(folder: Path, uid: int) -> bool:
+def _may_belong_to(folder: Path, uid: int) -> bool:
     """Return whether a user may own files in a folder that this user cannot read."""
     for path in (folder, *folder.parents):
         with suppress(OSError):

@@ -121,11 +121,11 @@ def find(rig: str | None) -> Path:
             if answers(path):
                 return path
         raise AddressError(
-            f"No daemon of the rig {rig} {_elsewhere(file_name(rig))}rigd serve --profile {rig}."
+            f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}rigd serve --profile {rig}."
         )
     found = running()
     if not found:
-        raise AddressError(f"No daemon {_elsewhere(None)}rigd serve --profile NAME.")
+        raise AddressError(f"No daemon {_not_found_reason(None)}rigd serve --profile NAME.")
     if len(found) > 1:
         rigs = ", ".join(path.name.removesuffix(SUFFIX) for path in found)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
@@ -137,7 +137,7 @@ def _folders() -> list[Path]:
     return [runtime_folder()] if folder_fault(COMMON, shared=True) else [runtime_folder(), COMMON]
 
 
-def _elsewhere(rig: str | None) -> str:
+def _not_found_reason(rig: str | None) -> str:
     """Return part of a sentence: why no daemon of `rig` (as in file names; None: any) is found."""
     fault = folder_fault(COMMON, shared=True)
     unsafe = address_files(f"*{SUFFIX}", COMMON) if fault else []

@@ -472,7 +472,7 @@ class SessionSequence:
         try:
             violation = self._cycle.step(self._metronome.due_ns, reference_rad)
         except (DeviceError, OSError) as error:
-            self._cycle.lose_readings()
+            self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
             reason = f"{error} {self._cycle.watch.after_missed}".strip()
             return SessionEnd("fault", reason, device_failed=True)
@@ -487,7 +487,7 @@ class SessionSequence:
 
     def _against_torque(self) -> bool:
         rig = self._profile.rig
-        return self._cycle.turns_against_torque(
+        return self._cycle.accelerates_against_torque(
             rig.motor.inertia_kg_m2, rig.rate_hz, rig.encoder.resolution_rad
         )
 
@@ -497,7 +497,7 @@ class SessionSequence:
         try:
             self._cycle.observe(self._metronome.due_ns)
         except (DeviceError, OSError):
-            self._cycle.lose_readings()
+            self._cycle.mark_readings_stale()
 
     def _rest(self, duration_s: float) -> Rest:
         """Return readings without torque."""

@@ -239,7 +239,7 @@ class _ControlServer:
             self._silent = self._silent + 1 if cycle.stale else 0
         if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; check that the device "
+                f"{cycle.stale_names} has not come for {_SILENCE_S:g} s; check that the device "
                 "is on and connected."
             )
 
@@ -482,13 +482,13 @@ class _ControlServer:
 
     def _warn_of_refusals(self, job: SessionJob) -> None:
         own = {name: text for name, text in self._obtained.items() if text.startswith(REFUSED)}
-        for refused, what_follows in (
+        for refused, consequence in (
             (own, "more ticks will be late"),
             (job.refused, "a computer that is busy with other programs may end the session"),
         ):
             if refused:
                 names = ", ".join(f"{name} ({text})" for name, text in refused.items())
-                message = f"The system did not grant {names}: {what_follows}."
+                message = f"The system did not grant {names}: {consequence}."
                 write_event(self._channels.events, Event(0, "warning", message))
 
     def _log_accepted(self, job: SessionJob) -> None:

@@ -299,7 +299,7 @@ class Cycle:
         if self.encoder_watch is not None:
             self.encoder_watch.skip(missed, self.angle_rad)
 
-    def turns_against_torque(
+    def accelerates_against_torque(
         self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
     ) -> bool:
         """Return whether the shaft has just accelerated against the torque on it.
@@ -341,7 +341,7 @@ class Cycle:
         return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
-    def what_is_stale(self) -> str:
+    def stale_names(self) -> str:
         """Names of the stale readings of the last tick."""
         names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
@@ -429,7 +429,7 @@ class Cycle:
         self.torque_command_nm = 0.0
         self.flags |= _TORQUE_OFF
 
-    def lose_readings(self) -> None:
+    def mark_readings_stale(self) -> None:
         """Switch off after a device failure, and mark the last readings as stale."""
         self.torque_off()
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
@@ -616,7 +616,7 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
 
 
 def recalled_heat_nm2(profile: Profile) -> float:
-    """Return the motor's heat since the last connection, in (N·m)²; 0 if unknown.
+    """Return the motor's remaining heat from the last connection, in (N·m)²; 0 if unknown.
 
     The motor cools with its thermal time constant.
     """

@@ -1,8 +1,8 @@
 """Real-time settings of a rig's processes: each is requested, and the result is recorded.
 
-The control process gets all settings for a 1 kHz loop (:func:`obtain`). Supervisor and recorder get
-a priority below the loop's and above that of every ordinary program (:class:`Precedence`), so that
-a session can be stopped even if a viewer occupies the processor.
+The control process gets all settings for a 1 kHz loop (:func:`obtain`). Supervisor and
+recorder get a priority below the loop's and above that of every ordinary program
+(:class:`Precedence`), so that a session can be stopped even if a viewer occupies the processor.
 """
 
 import contextlib
@@ -65,7 +65,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
         "cpu": lambda: _pin(cpu, root),
-        "idle_states": lambda: _keep_awake(root),
+        "idle_states": lambda: _limit_idle_states(root),
     }
     if priority > 0:
         wanted["scheduling"] = lambda: _schedule(priority)
@@ -116,7 +116,7 @@ class Precedence:
         self.cores_before = frozenset(os.sched_getaffinity(0))
         core, _ = _core_of_loop(loop_cpu, root)
         self._others = self.cores_before - {core}
-        self._put: Callable[[int], None] | None = None
+        self._apply: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
         """Request the priority and return what was granted.
@@ -139,33 +139,33 @@ class Precedence:
 
     def cover(self) -> None:
         """Extend the priority to new threads, which hold the same interpreter lock."""
-        if self._put is None:
+        if self._apply is None:
             return
         for thread in Path("/proc/self/task").iterdir():
             with contextlib.suppress(OSError):  # one that has just ended
-                self._put(int(thread.name))
+                self._apply(int(thread.name))
 
     def release(self) -> None:
         """Return to ordinary priority; repeatable."""
-        if self._put is None:
+        if self._apply is None:
             return
-        self._put = self._put_back
+        self._apply = self._restore
         self.cover()
-        self._put = None
+        self._apply = None
 
     def _try_realtime(self) -> str:
-        self._put_first(0)
-        self._put = self._put_first
+        self._set_realtime(0)
+        self._apply = self._set_realtime
         self.cover()
         return f"SCHED_RR {self._priority}"
 
     def _try_nice(self) -> str:
-        self._put_nicely(0)
-        self._put = self._put_nicely
+        self._set_nice(0)
+        self._apply = self._set_nice
         self.cover()
         return f"nice {NICE}"
 
-    def _put_first(self, thread: int) -> None:
+    def _set_realtime(self, thread: int) -> None:
         # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
@@ -174,20 +174,20 @@ class Precedence:
         try:
             os.sched_setaffinity(thread, self._others)
         except OSError:  # the set of usable cores has changed meanwhile
-            _be_ordinary(thread)
+            _set_ordinary(thread)
             raise
 
-    def _put_nicely(self, thread: int) -> None:
+    def _set_nice(self, thread: int) -> None:
         os.setpriority(os.PRIO_PROCESS, thread, NICE)
-        _be_ordinary(thread)
+        _set_ordinary(thread)
 
-    def _put_back(self, thread: int) -> None:
-        _be_ordinary(thread)
+    def _restore(self, thread: int) -> None:
+        _set_ordinary(thread)
         os.setpriority(os.PRIO_PROCESS, thread, max(0, os.getpriority(os.PRIO_PROCESS, thread)))
         os.sched_setaffinity(thread, self.cores_before)
 
 
-def _be_ordinary(thread: int) -> None:
+def _set_ordinary(thread: int) -> None:
     # The flag stays: removing it needs a privilege, and it is harmless.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(thread, policy, os.sched_param(0))
@@ -270,7 +270,7 @@ def _pin(cpu: int, root: Path) -> str:
     return f"{core}, isolated" if isolated else str(core)
 
 
-def _keep_awake(root: Path) -> str:
+def _limit_idle_states(root: Path) -> str:
     states = (root / _IDLE_STATES).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
     if all(int(state.read_text()) <= WAKE_UP_US for state in states):
         return f"none slower than {WAKE_UP_US} µs"

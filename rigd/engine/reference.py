@@ -3,9 +3,9 @@
 It is in shared memory so that the control process does not pause to receive it. However long the
 session is, a drive that monitors the loop's heartbeat sees no gap.
 
-One process appends segments, and another follows them. As in a ring, the angles are written before
-the field that announces them (`Word.PLANNED`). The follower never waits for a segment: it holds the
-last angle until the next segment arrives.
+One process appends segments, and another follows them. As in a ring, the angles are written
+before the field that announces them (`Word.PLANNED`). The follower never waits for a segment: it
+holds the last angle until the next segment arrives.
 """
 
 import mmap
@@ -153,9 +153,10 @@ class PieceReader:
     planned
         Ticks that are planned at the start.
     shared_state
-        `Word.PLANNED` announces the planned ticks, and `Word.LAST_PIECE` the last segment. The
-        reader writes the number of held ticks to `Word.HELD`, the number before the segment that
-        began last to `Word.HELD_BEFORE`, and the end of that segment to `Word.BEGUN`.
+        `Word.PLANNED` announces the planned ticks, and `Word.LAST_PIECE` the last
+        segment. The reader writes the number of held ticks to `Word.HELD`, the number before
+        the segment that began last to `Word.HELD_BEFORE`, and the end of that segment to
+        `Word.BEGUN`.
     """
 
     def __init__(

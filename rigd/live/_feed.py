@@ -123,7 +123,7 @@ class Feed:
         assert self._stream is not None
         # The clean-up of a stream waits for all others that are closing, and they for it.
         forget = not any(thread.is_alive() for thread in self._breaking)
-        _in_background(_let_go, [self._stream], forget)
+        _in_background(_close_stream, [self._stream], forget)
         self._stream = None
 
     def _discard(self) -> None:
@@ -131,7 +131,7 @@ class Feed:
         if self._stream is not None:
             # In the background, because it tries to reach its server for up to 10 s.
             self._breaking = [thread for thread in self._breaking if thread.is_alive()]
-            self._breaking.append(_in_background(_let_go, [self._stream], False))
+            self._breaking.append(_in_background(_close_stream, [self._stream], False))
         self._stream = None
         self.stalled = False
         self._stalled_polls = 0
@@ -177,7 +177,7 @@ def _in_background(function: Callable[..., None], *arguments: object) -> threadi
     return thread
 
 
-def _let_go(streams: "list[RecordingStream]", forget: bool) -> None:
+def _close_stream(streams: "list[RecordingStream]", forget: bool) -> None:
     """Close the only reference to a stream; `forget`: release its resources in the SDK."""
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 

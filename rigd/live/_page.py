@@ -196,7 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
         if name not in _FILES:
             self._say(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
-            self._come_again()
+            self._send_retry()
         elif name == _STATE:
             self._send(json.dumps({"server": address.server}).encode(), "application/json")
         elif not name and "url" not in urllib.parse.parse_qs(split.query):
@@ -205,9 +205,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Location", f"/?{urllib.parse.urlsplit(address.viewer_url).query}")
             self.end_headers()
         else:
-            self._pass_on(name)
+            self._forward(name)
 
-    def _pass_on(self, name: str) -> None:
+    def _forward(self, name: str) -> None:
         """Send one of Rerun's files."""
         link = http.client.HTTPConnection(LOOPBACK, self.server.upstream(), timeout=_PATIENCE_S)
         try:
@@ -228,11 +228,11 @@ class _Handler(BaseHTTPRequestHandler):
         except (OSError, http.client.HTTPException):
             # The server is being replaced, or the browser is gone.
             with suppress(OSError):
-                self._come_again()
+                self._send_retry()
         finally:
             link.close()
 
-    def _come_again(self) -> None:
+    def _send_retry(self) -> None:
         """Make the browser try again."""
         self._say(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", again=True)
 

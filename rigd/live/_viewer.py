@@ -241,7 +241,7 @@ class Viewer(_Window):
         done: list[bool] = []
         # In a thread, because a frozen window never responds, and the wait would block Ctrl-C.
         self._connecting = threading.Thread(
-            target=_have_it_connect, args=(self.control_url, url, done), daemon=True
+            target=_switch_server, args=(self.control_url, url, done), daemon=True
         )
         self._connecting.start()
         self._connecting.join(_ANSWER_S)
@@ -251,7 +251,7 @@ class Viewer(_Window):
         return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)
 
 
-def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
+def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
     """Switch a viewer to another server; append to `done` on success."""
     from rerun.experimental import ViewerClient
 

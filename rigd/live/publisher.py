@@ -119,7 +119,7 @@ class _Publisher:
                         self._shown.fitted(fit)
                 case LiveEnd():
                     self._finish(message)
-        self._outlive()
+        self._show_orphaned()
 
     def linger(self, linger_s: float) -> None:
         """Keep the view open for a while after the last session."""
@@ -154,7 +154,7 @@ class _Publisher:
             self._shown.finish(end)
             self._step()
 
-    def _outlive(self) -> None:
+    def _show_orphaned(self) -> None:
         """Show a session without supervisor until its torque is off."""
         shown, shared_state = self._shown, self._channels.board
         if shown is None or shown.over:

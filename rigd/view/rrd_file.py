@@ -129,11 +129,11 @@ def _write_errors(path: Path, part: Path) -> Iterator[None]:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
         number = _OS_ERROR.search(str(error))
-        cause = os.strerror(int(number[1])) if number else _why_not(part)
+        cause = os.strerror(int(number[1])) if number else _write_failure(part)
         raise RrdFileError(f"{path} cannot be written: {cause}.") from None
 
 
-def _why_not(part: Path) -> str:
+def _write_failure(part: Path) -> str:
     """Return the reason why a file cannot grow, by a trial; the SDK may not report it."""
     try:
         with part.open("ab") as file:

@@ -71,7 +71,7 @@ class DaemonLink:
             try:
                 await self._follow()
             except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
-                self._note_end(math.inf)
+                self._register_end(math.inf)
                 self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
             await asyncio.sleep(_RETRY_S)
 
@@ -109,7 +109,7 @@ class DaemonLink:
         async with self._commanding:
             held = self._held
             if held is not None and (held[0].at_eof() or held[1].is_closing()):
-                self._let_go()
+                self._release_control()
             try:
                 if self._held is None:
                     reply = await self._ask_on_new_connection(request)
@@ -119,11 +119,11 @@ class DaemonLink:
                     self._held_series = reply["series"]
             except DaemonError:
                 # Not sent again, because it may have been executed.
-                self._let_go()
+                self._release_control()
                 raise
             finally:
                 if self._held_series <= self._ended:
-                    self._let_go()
+                    self._release_control()
             return reply
 
     async def _ask_on_new_connection(self, request: Document) -> Document:
@@ -162,7 +162,7 @@ class DaemonLink:
         )  # a new daemon numbers its series from 0
         tasks = [
             asyncio.create_task(self._poll_status(writer)),
-            asyncio.create_task(self._note_silence()),
+            asyncio.create_task(self._report_silence()),
         ]
         try:
             writer.write(b'{"command": "watch", "signals": true}\n')
@@ -183,11 +183,11 @@ class DaemonLink:
         if message.get("event") == "signals":
             self._signals_received = True
         elif message.get("event") == "series":
-            self._note_end(message["series"])
+            self._register_end(message["series"])
         if "event" in message or message.get("reply") == "status":
             self._on_message(message)
 
-    async def _note_silence(self) -> None:
+    async def _report_silence(self) -> None:
         """Report a daemon that has been silent for a while."""
         while True:
             left_s = self._last_received_s + _SILENT_S - time.monotonic()
@@ -206,13 +206,13 @@ class DaemonLink:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._status_requested.wait(), pause_s)
 
-    def _note_end(self, series: float) -> None:
+    def _register_end(self, series: float) -> None:
         """Release control after a series, unless a request is pending."""
         self._ended = series
         if not self._commanding.locked():
-            self._let_go()
+            self._release_control()
 
-    def _let_go(self) -> None:
+    def _release_control(self) -> None:
         """Release control, by closing its connection."""
         held, self._held = self._held, None
         if held is not None:

@@ -69,7 +69,7 @@ class OperatorPageServer:
         self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
         self._stopping = ThreadPoolExecutor(_STOPS, "stop")
-        self._link = DaemonLink(self._socket, self._take, self._lose)
+        self._link = DaemonLink(self._socket, self._take, self._report_loss)
         self._excitations = dict(_excitations())
         self._nominal = self._nominal_of(job)
         self._specimens: list[str] = []
@@ -81,7 +81,7 @@ class OperatorPageServer:
         self._response: SessionResponse | None = None
         self._shown: Document | None = None
         self._last: Document | None = None
-        self._finding: set[asyncio.Task[None]] = set()
+        self._searches: set[asyncio.Task[None]] = set()
 
     def application(self) -> web.Application:
         """Return the application with its routes."""
@@ -109,7 +109,7 @@ class OperatorPageServer:
 
     def end(self, reason: str) -> None:
         """Report the end of this server to the pages."""
-        self._lose(reason)
+        self._report_loss(reason)
 
     # Requests
 
@@ -203,7 +203,7 @@ class OperatorPageServer:
             if event != "progress":
                 self._link.ask_for_status()
             if event == "session":
-                self._begin_finding(self._find_specimens())
+                self._start_search(self._find_specimens())
             elif event == "quick_look":
                 self.pages.note("info", "\n".join(QuickLook.of_event(message).lines))
 
@@ -240,7 +240,7 @@ class OperatorPageServer:
             )
         self.pages.send(self._nominal)  # the pages then clear the other responses
         specimen = str(series["notes"].get("specimen", ""))
-        self._begin_finding(self._find_last(specimen, Path(path).stem))
+        self._start_search(self._find_last(specimen, Path(path).stem))
 
     def _nominal_of(self, specimen: Document) -> Document:
         """Return the message with the nominal model of the beam of a job or plan."""
@@ -258,7 +258,7 @@ class OperatorPageServer:
             self._gauges = {"type": "gauges", **event["gauges"], "frequency_hz": frequency_hz}
             self.pages.send(self._gauges)
 
-    def _lose(self, reason: str) -> None:
+    def _report_loss(self, reason: str) -> None:
         """Report to the pages that the daemon is lost."""
         if self._lost is None or self._lost["reason"] != reason:
             self._lost = {"type": "lost", "reason": reason}
@@ -274,11 +274,11 @@ class OperatorPageServer:
                 self._shown = shown or self._shown
                 self.pages.send(shown)
 
-    def _begin_finding(self, finding: Awaitable[None]) -> None:
+    def _start_search(self, finding: Awaitable[None]) -> None:
         """Start a search in the library without waiting for it."""
         task = asyncio.ensure_future(finding)
-        self._finding.add(task)
-        task.add_done_callback(self._finding.discard)
+        self._searches.add(task)
+        task.add_done_callback(self._searches.discard)
 
     async def _find_specimens(self) -> None:
         with suppress(OSError, ValueError):
