@@ -121,7 +121,8 @@ def find(rig: str | None) -> Path:
             if answers(path):
                 return path
         raise AddressError(
-            f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}rigd serve --profile {rig}."
+            f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}"
+            f"rigd serve --profile {rig}."
         )
     found = running()
     if not found:
