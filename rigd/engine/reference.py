@@ -4,8 +4,8 @@ It is in shared memory so that the control process does not pause to receive it.
 session is, a drive that monitors the loop's heartbeat sees no gap.
 
 One process appends segments, and another follows them. As in a ring, the angles are written
-before the field that announces them (`Word.PLANNED`). The follower never waits for a segment: it
-holds the last angle until the next segment arrives.
+before the field that announces them (`Word.PLANNED`). The follower never waits for a
+segment: it holds the last angle until the next segment arrives.
 """
 
 import mmap
