@@ -1,9 +1,10 @@
 """The daemon: a rig that stays connected, and the socket over which it is operated.
 
-Offers the daemon itself (`run_daemon`), its clients (module `client`), where its socket is (module
-`address`), and the stop of all that runs for a user, without a daemon too (`stop_all`). The states
-and what leads from one to another are in `_states`, requests in `_protocol`, sockets in `_server`;
-`_service` owns the rig. Sessions are run by `rigd.runner`, as in the foreground.
+The public interface is the daemon itself (`run_daemon`), its clients (module `client`), the address
+of its socket (module `address`), and the stop of everything that runs for a user, with or without a
+daemon (`stop_all`). `_states` has the states and their transitions, `_protocol` the requests,
+`_server` the sockets, and `_service` owns the rig. `rigd.runner` runs the sessions, as in the
+foreground.
 """
 
 import lazy_loader as lazy

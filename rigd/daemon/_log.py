@@ -1,6 +1,6 @@
 """The daemon's log: on standard error, written by a separate thread.
 
-A terminal that was stopped, or a journal that hangs, must not keep the daemon from hearing a stop.
+A stopped terminal or a hanging journal must not prevent the daemon from receiving a stop.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _FLUSH_S: Final = 1.0
 
 
 class _Dropping(logging.handlers.QueueHandler):
-    """Passes records on; if they are not read, the oldest are kept and the rest counted."""
+    """Queue of log records; when it is full, further records are dropped and counted."""
 
     def __init__(self, waiting: "queue.Queue[logging.LogRecord]") -> None:
         super().__init__(waiting)
@@ -41,18 +41,18 @@ class _Dropping(logging.handlers.QueueHandler):
 
 
 class Log:
-    """The log for as long as its context lasts."""
+    """Log of the daemon, active inside its context."""
 
     def __init__(self) -> None:
         self._waiting: queue.Queue[logging.LogRecord] = queue.Queue(_MOST_WAITING)
         self._handler = _Dropping(self._waiting)
 
     def __enter__(self) -> None:
-        logging.raiseExceptions = False  # a terminal that is gone must not end anything
+        logging.raiseExceptions = False  # a closed terminal must not end the daemon
         logger = logging.getLogger(NAME)
         logger.setLevel(logging.INFO)
         logger.addHandler(self._handler)
-        # A daemonic thread: it may be stuck when the program ends.
+        # A daemon thread: it may hang when the program ends.
         threading.Thread(target=self._write, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
@@ -62,16 +62,16 @@ class Log:
             time.sleep(0.01)
 
     def _write(self) -> None:
-        """Write line by line, for as long as that takes.
+        """Write the log line by line, however long that takes.
 
-        Past the interpreter's buffer and logging's handlers: both have locks, which one that is
-        stuck would hold, and for which the end of the program would wait.
+        It bypasses the interpreter's buffer and the handlers of `logging`: a hanging write would
+        hold their locks, and the end of the program would wait for these.
         """
         formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
         while True:
             line = formatter.format(self._waiting.get()) + "\n"
-            rest = line.encode(errors="backslashreplace")
+            data = line.encode(errors="backslashreplace")
             with contextlib.suppress(OSError):
-                while rest:
-                    rest = rest[os.write(_STANDARD_ERROR, rest) :]
+                while data:
+                    data = data[os.write(_STANDARD_ERROR, data) :]
             self._waiting.task_done()

@@ -1,4 +1,4 @@
-"""Main program of ``rigd serve``: lock, socket, rig and signals, from start to end."""
+"""Main program of ``rigd serve``: lock, socket, rig and signals."""
 
 import asyncio
 import logging
@@ -12,7 +12,7 @@ from pathlib import Path
 from rigd.daemon._log import NAME, Log
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
-from rigd.daemon._states import look_up_user
+from rigd.daemon._states import resolve_user
 from rigd.daemon.address import COMMON, bind, socket_path
 from rigd.devices import WhatMoves, reality, simulated_differently, what_moves
 from rigd.profile import Profile
@@ -44,32 +44,32 @@ def run_daemon(
     folder
         Folder for session files.
     group
-        Group whose members may command it, as well as this user.
+        Group whose members may command the daemon, in addition to this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
     look
-        Take a quick look at each session.
+        Whether to make a quick look of each session.
     page
-        Serve the operator's page.
+        Whether to serve the operator's page.
     page_port
         Port of the page on loopback; None: 8720, or another one if that is taken.
 
     Returns
     -------
     Signals
-        The one that ended it.
+        Signal that ended the daemon.
 
     Raises
     ------
     RigBusyError
         If another program runs the rig.
     AddressError
-        If there can be no socket.
+        If the socket cannot be created.
     """
     moving = reality(profile.rig)
     with ExitStack() as ending:
         ending.enter_context(Log())
-        look_up_user(os.getuid())
+        resolve_user(os.getuid())
         ending.enter_context(
             RigLock(profile.name, "rigd serve", hardware=moving is WhatMoves.HARDWARE)
         )
@@ -87,7 +87,7 @@ def run_daemon(
             partial(reality, profile.rig),
             fast=fast,
             live=live,
-            look=look,
+            quick_looks=look,
         )
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):
@@ -102,41 +102,42 @@ def run_daemon(
 
 async def _run(server: Server, service: Service) -> signal.Signals:
     loop = asyncio.get_running_loop()
-    asked: asyncio.Future[signal.Signals] = loop.create_future()
+    ending_signal: asyncio.Future[signal.Signals] = loop.create_future()
 
     def end(number: signal.Signals) -> None:
-        if not asked.done():
-            asked.set_result(number)
+        if not ending_signal.done():
+            ending_signal.set_result(number)
 
     for number in _ENDING:
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup
             loop.add_signal_handler(number, end, number)
-    # For those whom a crowd keeps from the socket; `server.serve` is what makes it findable.
+    # A stop by signal works even if other clients block the socket. Register it before the socket
+    # accepts clients.
     loop.add_signal_handler(STOP_SIGNAL, _stop, service)
     server.serve(service)
     opening = asyncio.create_task(service.open())
-    attending = asyncio.create_task(service.attend())
-    telling = asyncio.create_task(service.tell_signals())
-    telling.add_done_callback(_note_end)
-    # Attending ends only by a mistake in the program, which must not leave a rig unattended.
-    attending.add_done_callback(lambda _: end(signal.SIGABRT))
-    await asked
-    why = f"the daemon got {asked.result().name}"
+    polling = asyncio.create_task(service.run())
+    streaming = asyncio.create_task(service.stream_signals())
+    streaming.add_done_callback(_log_stream_failure)
+    # Polling ends only by a bug, which must not leave the rig unsupervised.
+    polling.add_done_callback(lambda _: end(signal.SIGABRT))
+    await ending_signal
+    why = f"the daemon got {ending_signal.result().name}"
     _log.info("%s and ends", why)
     await service.close(why)
-    attending.cancel()
-    telling.cancel()
-    await asyncio.gather(opening, attending, telling, return_exceptions=True)
+    polling.cancel()
+    streaming.cancel()
+    await asyncio.gather(opening, polling, streaming, return_exceptions=True)
     await server.close()
-    return asked.result()
+    return ending_signal.result()
 
 
-def _note_end(telling: "asyncio.Task[None]") -> None:
-    """Log why no signals are told any more; the rig does not depend on them."""
-    if not telling.cancelled():
-        _log.error("the signals are not told any more", exc_info=telling.exception())
+def _log_stream_failure(streaming: "asyncio.Task[None]") -> None:
+    """Log the failure of the signal stream, on which the rig does not depend."""
+    if not streaming.cancelled():
+        _log.error("the signals are no longer published", exc_info=streaming.exception())
 
 
 def _stop(service: Service) -> None:
-    _log.info("stop: asked for by %s", STOP_SIGNAL.name)
+    _log.info("stop: requested by %s", STOP_SIGNAL.name)
     service.stop(f"the daemon got {STOP_SIGNAL.name}")

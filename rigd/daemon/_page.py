@@ -1,7 +1,7 @@
-"""Process of the operator's page: started by the daemon, started again, and never waited for.
+"""Process of the operator's page: the daemon starts and restarts it, and never waits for it.
 
-It is given a token that is needed to act on the page. Address and token stand in a
-file of this user's runtime folder as long as the daemon runs.
+The page accepts commands only with a token from the daemon. While the daemon runs, a file in this
+user's runtime folder holds address and token.
 """
 
 import json
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from rigd.profile import Profile
 
 PAGE_PORT: Final = 8720
-"""Port of the page unless another is asked for."""
+"""Default port of the page."""
 _PROGRAM: Final = ("-m", "rigd.web")
 _MOST_STARTS: Final = 5
-"""Starts in a row of which none has lasted."""
+"""Consecutive short-lived starts after which no further start follows."""
 _LASTING_S: Final = 60.0
 _PAUSE_S: Final = 1.0
 _GRACE_S: Final = 3.0
@@ -38,20 +38,20 @@ _log = logging.getLogger(NAME)
 
 
 class PageProcess:
-    """The server of the page, in a process that the daemon does without.
+    """The page's server, in a process on which the daemon does not depend.
 
     Parameters
     ----------
     profile
-        Rig that is shown.
+        Profile of the rig.
     folder
         Folder of the session files.
     socket
         The daemon's socket.
     port
-        Port on loopback; None: the usual one, or another if that is taken.
+        Port on loopback; None: the default one, or a free one if that is taken.
     on_address
-        Called with the address, without its token, or None while there is none; from a thread.
+        Called from a thread with the address without its token, or None while there is none.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class PageProcess:
         self._on_address = on_address
         self._closing = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
-        self._thread = threading.Thread(target=self._attend, name="page", daemon=True)
+        self._thread = threading.Thread(target=self._keep_running, name="page", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End it; one that does not end by itself is killed."""
+        """End the process; kill it if it does not end by itself."""
         self._closing.set()
         process = self._process
         if process is not None:
@@ -89,8 +89,8 @@ class PageProcess:
         self._thread.join(_GRACE_S)
         self._file.unlink(missing_ok=True)
 
-    def _attend(self) -> None:
-        """Keep it running; in its own thread."""
+    def _keep_running(self) -> None:
+        """Restart the process whenever it ends; runs in its own thread."""
         starts = 0
         while starts < _MOST_STARTS:
             starts += 1
@@ -107,7 +107,7 @@ class PageProcess:
         _log.error("page: it is not started again; the rig does not need it")
 
     def _run(self) -> None:
-        """Start one and wait for its end."""
+        """Start the process and wait for its end."""
         with held_back():
             process = subprocess.Popen(
                 [*OWN_PYTHON, *_PROGRAM],
@@ -120,21 +120,21 @@ class PageProcess:
             process.kill()
         assert process.stdin is not None
         assert process.stdout is not None
-        told = {}
+        report = {}
         with process:
             with suppress(OSError, ValueError):
                 process.stdin.write(json.dumps(self._job).encode() + b"\n")
                 process.stdin.flush()
                 for line in process.stdout:
-                    told = json.loads(line)
-                    if "port" in told:
-                        self._tell(told["port"])
+                    report = json.loads(line)
+                    if "port" in report:
+                        self._announce(report["port"])
             code = process.wait()
         if not self._closing.is_set():
-            _log.warning("page: its process ended with code %s: %s", code, told.get("error", ""))
+            _log.warning("page: its process ended with code %s: %s", code, report.get("error", ""))
 
-    def _tell(self, port: int) -> None:
-        """Announce where it is; the next one takes the same port, for the pages that are open."""
+    def _announce(self, port: int) -> None:
+        """Announce the address; a restarted process takes the same port, for open pages."""
         self._job["port"] = port
         url = f"http://127.0.0.1:{port}/"
         pid = os.getpid()
@@ -142,13 +142,13 @@ class PageProcess:
             self._file, {"pid": pid, "born": started_at(pid), "url": url, "token": self._token}
         )
         self._on_address(url)
-        # The journal has other readers than a terminal.
+        # Other users may read the journal, so the token is shown on a terminal only.
         shown = f"{url}#token={self._token}" if sys.stderr.isatty() else url
         _log.info("page: %s (rigd status shows the address with its token)", shown)
 
 
 def page_address(rig: str) -> str | None:
-    """Return the address of a daemon's page with the token, for the user who started the daemon.
+    """Return the address of a daemon's page with its token; None if there is none.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _file(rig: str) -> Path:
 
 
 def _job(profile: "Profile", folder: Path, socket: Path) -> dict[str, Any]:
-    """Return what the page shows of a rig beside what the socket tells."""
+    """Return the data of a rig that the page shows in addition to those from the socket."""
     rig = profile.rig
     return {
         "socket": str(socket),

@@ -1,6 +1,6 @@
-"""Requests to the daemon: parsed from a line of bytes into a checked request, or refused.
+"""Requests to the daemon: a line of bytes is parsed into a checked request, or refused.
 
-Whatever comes in is untrusted. A refusal names what is wrong; docs/control_socket.md has the rules.
+The input is untrusted. A refusal names the error; docs/control_socket.md has the rules.
 """
 
 import inspect
@@ -16,7 +16,7 @@ from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
 LONGEST_LINE = 65_536
-"""Bytes of a request, its newline included."""
+"""Limit in bytes of a request with its newline."""
 MOST_SESSIONS = 1000
 _LONGEST_PATH = 4096
 _LONGEST_TEXT = 1000
@@ -30,7 +30,7 @@ Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
 class RequestError(Exception):
-    """A request cannot be understood; the message says why, `request_id` whose it was."""
+    """A request is invalid; the message says why, and `request_id` identifies the request."""
 
     def __init__(self, message: str, request_id: Id | None = None) -> None:
         super().__init__(message)
@@ -38,60 +38,60 @@ class RequestError(Exception):
 
 
 class CommandError(RigdError):
-    """A request is refused, or failed; the message is for the operator."""
+    """A request is refused or failed; the message is for the operator."""
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
         super().__init__(message)
         self.wrong_use = wrong_use
-        """The request itself has to be another."""
+        """Whether the request itself must change."""
 
 
 class Request(BaseModel):
-    """Fields that every request may have."""
+    """Base of all requests, with their common fields."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     controlling: ClassVar[bool] = False
-    """Only the client that holds control may ask for it."""
+    """Whether only the client that holds control may send it."""
 
     command: str
     id: Id | None = None
 
 
-class Status(Request):
+class StatusRequest(Request):
     """Report the status of daemon, rig and session."""
 
     command: Literal["status"]
 
 
-class Watch(Request):
-    """Send the events from now on."""
+class WatchRequest(Request):
+    """Subscribe to the events."""
 
     command: Literal["watch"]
     signals: bool = False
 
 
-class Stop(Request):
+class StopSessionRequest(Request):
     """End the running session safely."""
 
     command: Literal["stop"]
 
 
-class Tare(Request):
+class TareRequest(Request):
     """Average the sensor at rest."""
 
     controlling = True
     command: Literal["tare"]
 
 
-class Zero(Request):
+class ZeroRequest(Request):
     """Make the present angle the zero."""
 
     controlling = True
     command: Literal["zero"]
 
 
-class Reset(Request):
+class ResetRequest(Request):
     """Leave the fault."""
 
     controlling = True
@@ -99,7 +99,7 @@ class Reset(Request):
 
 
 class Notes(BaseModel):
-    """What is to stand in the files, beside what the sessions themselves say."""
+    """Notes of the operator for the session files."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -109,7 +109,7 @@ class Notes(BaseModel):
     meta: dict[str, Any] = {}
 
     def as_metadata(self) -> dict[str, str]:
-        """Return what was given by the keys of the session file.
+        """Return the notes that are set, by their keys in the session file.
 
         Raises
         ------
@@ -120,15 +120,15 @@ class Notes(BaseModel):
         return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
 
 
-class Check(Request):
-    """Check profile, control loop and computer, and what the connected devices said."""
+class CheckRequest(Request):
+    """Check profile, control loop, computer, and the data that the connected devices reported."""
 
     controlling = True
     command: Literal["check"]
 
 
 class SessionRequest(Request):
-    """A session, or a series of them."""
+    """A session or a series of sessions."""
 
     excitation: str
     parameters: dict[str, Any] = {}
@@ -140,20 +140,30 @@ class SessionRequest(Request):
     tip_slope_rad: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
 
 
-class Start(SessionRequest):
-    """Run it."""
+class StartRequest(SessionRequest):
+    """Run the sessions."""
 
     controlling = True
     command: Literal["start"]
 
 
-class Predict(SessionRequest):
-    """Predict what it would do."""
+class PredictRequest(SessionRequest):
+    """Predict the sessions without running them."""
 
     command: Literal["predict"]
 
 
-AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Check | Start | Predict
+AnyRequest = (
+    StatusRequest
+    | WatchRequest
+    | StopSessionRequest
+    | TareRequest
+    | ZeroRequest
+    | ResetRequest
+    | CheckRequest
+    | StartRequest
+    | PredictRequest
+)
 _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
@@ -161,12 +171,12 @@ _COMMANDS = "status", "watch", "stop", "tare", "zero", "reset", "check", "start"
 
 
 def parse_request(line: bytes) -> AnyRequest:
-    """Understand one line.
+    """Return the request in a line.
 
     Raises
     ------
     RequestError
-        Naming what is wrong with it.
+        If it is invalid; the message names the error.
     """
     given = _parse_object(line)
     request_id = given.get("id")
@@ -208,17 +218,17 @@ def _no_constant(name: str) -> NoReturn:
 
 def _first_complaint(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
-    if first["loc"][1:2] == ("id",):  # one of two types, of which pydantic complains one by one
+    if first["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
         return f"id is a whole number or a text of at most {_LONGEST_ID} characters."
     where = ".".join(str(part)[:_SHOWN] for part in first["loc"][1:]) or "The request"
     return f"{where}: {first['msg']}."
 
 
-SomeSession = TypeVar("SomeSession", bound=SessionRequest)
+AnySessionRequest = TypeVar("AnySessionRequest", bound=SessionRequest)
 
 
-def _checked(request: SomeSession) -> SomeSession:
-    """Check what depends on the excitation, by the signature of its function."""
+def _checked(request: AnySessionRequest) -> AnySessionRequest:
+    """Return a session request whose parameters fit the excitation's function."""
     if request.excitation not in KINDS:
         raise RequestError(
             f"excitation = {_shown(request.excitation)} is unknown; choose {', '.join(KINDS)}."
@@ -232,7 +242,7 @@ def _checked(request: SomeSession) -> SomeSession:
         raise RequestError(f"notes.meta: {error}") from None
     update: dict[str, Any] = {}
     given_parameters = dict(request.parameters)
-    # Older clients have it among the parameters of `until`.
+    # Older clients send it among the parameters of `until`.
     if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
         slope_rad = _number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
         if slope_rad <= 0.0:
@@ -293,7 +303,7 @@ def _number(name: str, given: object) -> float:
 
 
 def _shown(value: object) -> str:
-    """Return a value as JSON, cut to what a message can bear."""
+    """Return a value as JSON, shortened for a message."""
     try:
         text = json.dumps(value)
     except (ValueError, RecursionError):

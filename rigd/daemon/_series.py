@@ -1,4 +1,4 @@
-"""Series of sessions that the daemon runs: how far one has come, and who is told of it."""
+"""Series of sessions that the daemon runs: its progress, and the reports on it."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
-from rigd.daemon._states import Document, State, fit_document
+from rigd.daemon._states import DaemonState, Document, fit_document
 from rigd.engine.shared_state import Event
 from rigd.runner import RigError, Series, result_line
 from rigd.runner.session import SessionProgress, SessionResult
@@ -20,7 +20,7 @@ _LOGGED = {
     "error": logging.ERROR,
     "fatal": logging.CRITICAL,
 }
-"""Levels of events that are told, and as what they are logged."""
+"""Log level of each level of reported events."""
 
 Publish = Callable[[Document], None]
 
@@ -29,32 +29,32 @@ _log = logging.getLogger(NAME)
 
 @dataclass(slots=True)
 class ServedSeries:
-    """Sessions that one request asked for, and how far they came."""
+    """Sessions of one request, and their progress."""
 
     number: int
-    request: protocol.Start
+    request: protocol.StartRequest
     stop: StopRequest = field(default_factory=StopRequest)
     planned: Series | None = None
     session: int = 0
-    """The one that is run, from 1 on."""
+    """Number of the present session, from 1."""
     path: Path | None = None
     fit: Document | None = None
-    """The last one of the record of that session."""
+    """Last fit of that session's record."""
     results: list[SessionResult] = field(default_factory=list)
-    """Also of one that failed."""
+    """Results of the sessions so far, including a failed one."""
     reason: str = ""
-    """Why it ended before its time."""
+    """Reason for an early end."""
     running: bool = False
     failed: bool = False
-    """Something went wrong: the sessions are fewer, or not what was asked for."""
+    """Whether something failed, so that sessions are missing or incomplete."""
 
     @property
     def words(self) -> str:
-        """What runs, for the operator."""
+        """Description for the operator."""
         return _WORDS.get(self.request.excitation, self.request.excitation)
 
     def as_document(self) -> Document:
-        """Tell what it is and how far it came."""
+        """Return the series and its progress as a JSON document."""
         return {
             "series": self.number,
             "excitation": self.request.excitation,
@@ -68,25 +68,25 @@ class ServedSeries:
             "failed": self.failed,
             "reason": self.reason,
             "fit": self.fit,
-            # Without their fits, each of which is as long as everything else together.
+            # Without their fits, which would double the size of the document.
             "sessions": [replace(result, fit=None).as_dict() for result in self.results],
         }
 
-    def state_after(self, fault: str) -> tuple[State, str]:
+    def state_after(self, fault: str) -> tuple[DaemonState, str]:
         """Return the state of the daemon after this series, and the reason.
 
         Parameters
         ----------
         fault
-            What put the rig out of work; empty if it may go on.
+            Fault of the rig; empty if the rig is ready.
         """
         if fault:
-            return State.FAULT, fault
+            return DaemonState.FAULT, fault
         if self.stop.requested:
-            return State.READY, f"{self.words} was stopped"
+            return DaemonState.READY, f"{self.words} was stopped"
         if self.reason:
-            return State.READY, self.reason
-        return State.READY, f"{self.words} is complete"
+            return DaemonState.READY, self.reason
+        return DaemonState.READY, f"{self.words} is complete"
 
 
 _WORDS: Final = {
@@ -95,14 +95,14 @@ _WORDS: Final = {
     "touch": "search for an obstacle",
     "until": "search for a precision",
 }
-"""Excitations whose name is no word for what runs."""
+"""Descriptions of excitations whose names do not explain themselves."""
 
 _LEVELS: Final = {"complete": "info", "stopped": "warning"}
-"""Levels of events that tell how a session ended."""
+"""Event levels of the outcomes; ``error`` for all others."""
 
 
-class SeriesTeller:
-    """Notes, logs and publishes what becomes of a series; called in the second thread."""
+class SeriesReporter:
+    """Reporter that stores, logs and publishes the events of a series, in the worker thread."""
 
     def __init__(self, series: ServedSeries, publish: Publish, listens: Callable[[], bool]) -> None:
         self._series = series
@@ -118,24 +118,24 @@ class SeriesTeller:
         self._series.fit = None
 
     def says(self, level: str, text: str) -> None:
-        self._tell(level, text, notable=True)
+        self._report(level, text, notable=True)
 
     def shown(self, where: str) -> None:
-        self._tell("info", where)
+        self._report("info", where)
 
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
         for event in events:
             if event.level in _LOGGED:
-                self._tell(event.level, event.message, notable=event.notable)
+                self._report(event.level, event.message, notable=event.notable)
         for fit in progress.fits:
-            self._tell_fit(fit)
+            self._report_fit(fit)
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
         fit = {}
         if result.fit is not None:
-            # What is for the moment, such as the lines for people, is not in the result.
+            # The result lacks temporary data, such as the text for the operator.
             series.fit = (series.fit or {}) | fit_document(result.fit)
             fit = {"fit": series.fit}
         line = result_line(result.as_dict())
@@ -148,18 +148,18 @@ class SeriesTeller:
             result.path or result.part or "no file",
             line,
         )
-        # For lists of events, in the words of the terminal.
+        # For event lists, with the text of the terminal.
         level = _LEVELS.get(result.outcome, "error")
         message = {"level": level, "text": line, "session": series.session}
         self._publish({"event": "message", **message})
         document = result.as_dict() | fit | {"look_follows": look_follows}
         self._publish({"event": "session", "number": series.session, **document})
 
-    def _tell(self, level: str, text: str, *, notable: bool = False) -> None:
+    def _report(self, level: str, text: str, *, notable: bool = False) -> None:
         _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
-        told = {"level": level, "text": text, "notable": notable}
-        self._publish({"event": "message", **told})
+        message = {"level": level, "text": text, "notable": notable}
+        self._publish({"event": "message", **message})
 
-    def _tell_fit(self, fit: Mapping[str, Any]) -> None:
+    def _report_fit(self, fit: Mapping[str, Any]) -> None:
         document = self._series.fit = fit_document(fit)
         self._publish({"event": "fit", "session": self._series.session, **document})

@@ -1,9 +1,9 @@
-"""Server on the daemon's socket: lines in, lines out, for many clients, slow and rude ones too.
+"""Server of the daemon's socket, which exchanges lines with many, even slow or hostile, clients.
 
-Nothing that a client does may cost the supervisor of a running session more than a moment: lines
-are short, taken one at a time, and at a bounded pace; what a client does not read is kept up to a
-limit, beyond which it is dropped. A connection counts as a client once it has said a whole line,
-and a `stop` is always obeyed, with any number of clients.
+No client can delay the supervisor of a running session noticeably. Lines are short and are handled
+one at a time at a bounded rate. Unread output is buffered up to a limit, beyond which the client is
+dropped. A connection counts as a client after its first complete line. A `stop` is always obeyed,
+with any number of clients.
 """
 
 import asyncio
@@ -26,23 +26,23 @@ from rigd.daemon._protocol import (
     CommandError,
     Id,
     RequestError,
-    Stop,
-    Watch,
+    StopSessionRequest,
+    WatchRequest,
     parse_request,
 )
 from rigd.daemon._service import Service
-from rigd.daemon._states import Document, Peer, look_up_user
+from rigd.daemon._states import Document, Peer, resolve_user
 from rigd.daemon.address import peer_of
 
 MOST_CLIENTS = 32
 MOST_WATCHERS = 24
-"""So that there is room for those who ask and go."""
+"""Limit below `MOST_CLIENTS`, so that short requests always find room."""
 MOST_SILENT = 64
-"""Connections that have not said a whole line yet."""
+"""Limit of the connections that have not sent a complete line yet."""
 _BACKLOG = 128
 _ACCEPTS_AT_ONCE = 64
 _ACCEPT_PAUSE_S = 0.001
-"""Pause after that many at once: a crowd that keeps connecting leaves time for the rest."""
+"""Pause after so many accepts, so that a flood of connections leaves time for other work."""
 _PACE_S = 0.005
 """Least time between two requests of a client."""
 _MOST_UNREAD = 262_144
@@ -53,7 +53,7 @@ _log = logging.getLogger(NAME)
 
 
 class Server:
-    """Lets clients command a service.
+    """Server through which clients command a service.
 
     Parameters
     ----------
@@ -64,59 +64,59 @@ class Server:
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
         self._service: Service | None = None
-        self._clients: set[_Client] = set()
-        self._leaving: set[_Client] = set()
-        self._silent: dict[socket.socket, _Silent] = {}
-        """Silent connections, in the order in which they came."""
+        self._clients: set[_ClientConnection] = set()
+        self._leaving: set[_ClientConnection] = set()
+        self._silent: dict[socket.socket, _PendingConnection] = {}
+        """Connections without a complete line, oldest first."""
         self._answering: set[asyncio.Task[None]] = set()
-        self._looked_up: set[int] = set()
+        self._resolved_uids: set[int] = set()
         self._count = 0
         self._closed = False
-        self._spare: int | None = None
-        self._hold_a_spare()
+        self._spare_fd: int | None = None
+        self._reserve_fd()
 
     def serve(self, service: Service) -> None:
-        """Accept clients from now on, from the running event loop."""
+        """Start to accept clients in the running event loop."""
         self._service = service
         self._listener.listen(_BACKLOG)
         self._accept_again()
 
     def publish(self, event: Document) -> None:
-        """Send an event to all who watch."""
+        """Send an event to all clients that watch."""
         watching = [client for client in self._clients if client.wants(event)]
         data = _line(event) if watching else b""
         for client in watching:
             client.write(data)
 
     async def close(self) -> None:
-        """Send what is still to be sent, and let everybody go."""
+        """Send the pending output and close all connections."""
         self._closed = True
         asyncio.get_running_loop().remove_reader(self._listener)
         self._listener.close()
         for silent in list(self._silent.values()):
-            self._part_from(silent)
+            self._forget_pending(silent)
             silent.link.close()
         for client in list(self._clients):
             self._dismiss(client)
-        while self._leaving:  # which takes no longer than `_FAREWELL_S`
+        while self._leaving:  # takes at most `_FAREWELL_S`
             await asyncio.sleep(0.01)
-        self._give_the_spare()
+        self._release_fd()
 
-    def forget(self, client: "_Client") -> None:
-        """Take note that a client is gone."""
+    def forget(self, client: "_ClientConnection") -> None:
+        """Remove a client that is gone."""
         self._clients.discard(client)
         self._leaving.discard(client)
 
-    def _dismiss(self, client: "_Client") -> None:
+    def _dismiss(self, client: "_ClientConnection") -> None:
         self._clients.discard(client)
         self._leaving.add(client)
         client.leave()
 
     def may_watch(self) -> bool:
-        """Whether there is room for one more who watches."""
+        """Return whether another client may watch."""
         return sum(client.watching for client in self._clients) < MOST_WATCHERS
 
-    # Connections that have not said anything yet
+    # Connections without a complete line
 
     def _accept_again(self) -> None:
         if not self._closed:
@@ -131,7 +131,7 @@ class Server:
             except OSError as error:
                 if error.errno not in (errno.EMFILE, errno.ENFILE):
                     return
-                self._turn_away()
+                self._refuse_without_fd()
                 break
             self._welcome(link)
         loop = asyncio.get_running_loop()
@@ -139,154 +139,155 @@ class Server:
         loop.call_later(_ACCEPT_PAUSE_S, self._accept_again)
 
     def _welcome(self, link: socket.socket) -> None:
-        """Take a new connection, and at once what it has said: most have, or are gone again."""
+        """Accept a new connection and read at once: most have sent their line already."""
         try:
             silent = self._introduced(link)
         except OSError:
             link.close()
         else:
-            self._hear(silent)
+            self._receive(silent)
 
-    def _introduced(self, link: socket.socket) -> "_Silent":
+    def _introduced(self, link: socket.socket) -> "_PendingConnection":
         link.setblocking(False)
         pid, uid = peer_of(link)
         self._count += 1
-        return _Silent(link, Peer(self._count, pid, uid))
+        return _PendingConnection(link, Peer(self._count, pid, uid))
 
-    def _hear(self, silent: "_Silent") -> None:
-        """Take what a connection says; once it is a line, it is a client's."""
+    def _receive(self, silent: "_PendingConnection") -> None:
+        """Read from a connection, and make it a client once its first line is complete."""
         try:
             data = silent.link.recv(LONGEST_LINE)
         except BlockingIOError:
-            self._wait_for(silent)
+            self._await_line(silent)
             return
         except OSError:
             data = b""
-        silent.said += data
-        if data and b"\n" not in silent.said and len(silent.said) < LONGEST_LINE:
-            self._wait_for(silent)
+        silent.received += data
+        if data and b"\n" not in silent.received and len(silent.received) < LONGEST_LINE:
+            self._await_line(silent)
             return
-        self._part_from(silent)
+        self._forget_pending(silent)
         if data:
             self._admit(silent)
         else:
             silent.link.close()
 
-    def _wait_for(self, silent: "_Silent") -> None:
-        """Wait until it says more; if too many are silent, one of them is let go."""
+    def _await_line(self, silent: "_PendingConnection") -> None:
+        """Wait for more data; if too many connections wait, drop one."""
         if silent.link in self._silent:
             return
         if len(self._silent) >= MOST_SILENT:
-            self._let_a_silent_one_go()
+            self._drop_oldest_pending()
         self._silent[silent.link] = silent
-        asyncio.get_running_loop().add_reader(silent.link, self._hear, silent)
+        asyncio.get_running_loop().add_reader(silent.link, self._receive, silent)
 
-    def _let_a_silent_one_go(self) -> bool:
-        """Let go the oldest connection of the process that has most of them.
+    def _drop_oldest_pending(self) -> bool:
+        """Drop the oldest waiting connection of the process that has most of them.
 
-        One that has just connected, and whose line is on its way, is never pushed out by the
-        crowd of another process.
+        Thus many connections of one process never displace a new connection of another.
         """
         if not self._silent:
             return False
         (pid, _), *_ = Counter(silent.peer.pid for silent in self._silent.values()).most_common(1)
         oldest = next(silent for silent in self._silent.values() if silent.peer.pid == pid)
-        self._part_from(oldest)
-        _say_full(oldest.link)
+        self._forget_pending(oldest)
+        _send_full(oldest.link)
         return True
 
-    def _part_from(self, silent: "_Silent") -> None:
+    def _forget_pending(self, silent: "_PendingConnection") -> None:
         if self._silent.pop(silent.link, None) is not None:
             asyncio.get_running_loop().remove_reader(silent.link)
 
     # Clients
 
-    def _admit(self, silent: "_Silent") -> None:
-        """Make a client of a connection that has said its first line."""
+    def _admit(self, silent: "_PendingConnection") -> None:
+        """Make a connection that has sent its first line a client."""
         assert self._service is not None
         if len(self._clients) >= MOST_CLIENTS and not self._make_room():
             self._answer_if_stop(silent)
             return
         uid = silent.peer.uid
-        if uid not in self._looked_up:
-            self._looked_up.add(uid)
-            # Not waited for: the user data base may be on a network.
-            threading.Thread(target=look_up_user, args=(uid,), daemon=True).start()
-        client = _Client(self, self._service, silent.peer, bytes(silent.said))
+        if uid not in self._resolved_uids:
+            self._resolved_uids.add(uid)
+            # In a thread, because the user database may be on a network.
+            threading.Thread(target=resolve_user, args=(uid,), daemon=True).start()
+        client = _ClientConnection(self, self._service, silent.peer, bytes(silent.received))
         self._clients.add(client)
         client.connecting = asyncio.create_task(_connect(silent.link, client))
 
     def _make_room(self) -> bool:
-        """Let a client go that only sits there, if any: of the process that has most of them."""
-        idle = [client for client in self._clients if client.only_sits_there]
+        """Dismiss an idle client, of the process that has most of them; return whether one was."""
+        idle = [client for client in self._clients if client.is_idle]
         if not idle:
             return False
         count = Counter(client.pid for client in idle)
-        longest = min(idle, key=lambda client: (-count[client.pid], client.heard_s))
+        longest = min(idle, key=lambda client: (-count[client.pid], client.last_received_s))
         longest.write(_FULL)
         self._dismiss(longest)
         return True
 
-    def _answer_if_stop(self, silent: "_Silent") -> None:
-        """Obey a `stop` from a client for which there is no room, and turn it away."""
-        line = bytes(silent.said).partition(b"\n")[0]
+    def _answer_if_stop(self, silent: "_PendingConnection") -> None:
+        """Refuse a client for which there is no room, but obey its `stop`."""
+        line = bytes(silent.received).partition(b"\n")[0]
         with suppress(RequestError):
             request = parse_request(line)
-            if isinstance(request, Stop):
-                task = asyncio.create_task(self._obey_and_part(request, silent))
+            if isinstance(request, StopSessionRequest):
+                task = asyncio.create_task(self._stop_and_close(request, silent))
                 self._answering.add(task)
                 task.add_done_callback(self._answering.discard)
                 return
-        _say_full(silent.link)
+        _send_full(silent.link)
 
-    async def _obey_and_part(self, request: Stop, silent: "_Silent") -> None:
+    async def _stop_and_close(
+        self, request: StopSessionRequest, silent: "_PendingConnection"
+    ) -> None:
         assert self._service is not None
-        _say(silent.link, _line(await _reply(self._service, request, silent.peer)))
+        _send_last(silent.link, _line(await _reply(self._service, request, silent.peer)))
 
-    def _turn_away(self) -> None:
-        """Take a client off the queue although there is no descriptor for it."""
-        if self._let_a_silent_one_go():
+    def _refuse_without_fd(self) -> None:
+        """Accept and refuse a client although no descriptor is free."""
+        if self._drop_oldest_pending():
             return  # its descriptor is free now
-        if self._spare is None:
-            self._hold_a_spare()
-        self._give_the_spare()
+        if self._spare_fd is None:
+            self._reserve_fd()
+        self._release_fd()
         with suppress(OSError):
             link, _ = self._listener.accept()
             silent = self._introduced(link)
             with suppress(BlockingIOError):
-                silent.said += link.recv(LONGEST_LINE)
+                silent.received += link.recv(LONGEST_LINE)
             self._answer_if_stop(silent)
-        self._hold_a_spare()
+        self._reserve_fd()
 
-    def _hold_a_spare(self) -> None:
-        """Keep a descriptor with which somebody can be accepted when there are no others left."""
+    def _reserve_fd(self) -> None:
+        """Reserve a descriptor, with which a client can be accepted when no other is free."""
         with suppress(OSError):
-            self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+            self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
-    def _give_the_spare(self) -> None:
-        spare, self._spare = self._spare, None
+    def _release_fd(self) -> None:
+        spare, self._spare_fd = self._spare_fd, None
         if spare is not None:
             os.close(spare)
 
 
 @dataclass(slots=True)
-class _Silent:
-    """A connection that has not said a whole line yet."""
+class _PendingConnection:
+    """A connection that has not sent a complete line yet."""
 
     link: socket.socket
     peer: Peer
-    said: bytearray = field(default_factory=bytearray)
+    received: bytearray = field(default_factory=bytearray)
 
 
-class _Client(asyncio.Protocol):
-    """One connection."""
+class _ClientConnection(asyncio.Protocol):
+    """Connection of one client."""
 
-    def __init__(self, server: Server, service: Service, peer: Peer, said: bytes) -> None:
+    def __init__(self, server: Server, service: Service, peer: Peer, received: bytes) -> None:
         self._server = server
         self._service = service
         self._peer = peer
-        self._said = said
-        """Bytes received before it became a client."""
+        self._received = received
+        """Bytes received before the connection became a client."""
         self._transport: asyncio.Transport | None = None
         self._pending = bytearray()
         self._lines: deque[bytes] = deque()
@@ -297,13 +298,13 @@ class _Client(asyncio.Protocol):
         self.connecting: asyncio.Task[None] | None = None
         self.watching = False
         self._wants_signals = False
-        self.heard_s = time.monotonic()
+        self.last_received_s = time.monotonic()
 
     @property
-    def only_sits_there(self) -> bool:
-        """It neither watches nor controls nor waits for an answer."""
+    def is_idle(self) -> bool:
+        """Whether the client neither watches nor controls nor waits for a reply."""
         return not (
-            self._said
+            self._received
             or self.watching
             or self._tasks
             or self._lines
@@ -312,26 +313,26 @@ class _Client(asyncio.Protocol):
 
     @property
     def pid(self) -> int:
-        """Number of its process."""
+        """Process id of the client."""
         return self._peer.pid
 
     def wants(self, event: Document) -> bool:
-        """Whether it is to be told of an event."""
+        """Return whether the client subscribed to an event."""
         return self.watching and (self._wants_signals or event["event"] != "signals")
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin."""
+        """Handle the lines received so far."""
         self._transport = cast("asyncio.Transport", transport)
-        # Beyond, the client is dropped; pausing the writer would be of no use here.
+        # Beyond this limit the client is dropped; pausing the writer would not help.
         self._transport.set_write_buffer_limits(high=_MOST_UNREAD)
-        if self._leaving:  # there was no time to begin
+        if self._leaving:  # it was dismissed before it began
             self.drop()
             return
-        said, self._said = self._said, b""
-        self.data_received(said)
+        received, self._received = self._received, b""
+        self.data_received(received)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes, in whatever pieces they come."""
+        """Handle received bytes, split at any position."""
         self._pending += data
         *lines, rest = self._pending.split(b"\n")
         self._pending = rest
@@ -340,18 +341,18 @@ class _Client(asyncio.Protocol):
             self.write(_line(_refusal(None, f"A line has at most {LONGEST_LINE} bytes.")))
             self.leave()
         elif self._pump is None and self._lines:
-            self._obey_next()
+            self._handle_next()
         if len(self._lines) > _MOST_WAITING_LINES and self._transport is not None:
             self._transport.pause_reading()
 
     def eof_received(self) -> bool:
-        """Answer what was asked, and let go: who is gone altogether looks no different."""
+        """Answer the pending requests and close; a disconnected client is the same."""
         self._ended = True
         self._leave_if_done()
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's
-        """Forget it; whatever it started goes on."""
+        """Forget the client; its sessions continue."""
         if self._pump is not None:
             self._pump.cancel()
         self._lines.clear()
@@ -360,7 +361,7 @@ class _Client(asyncio.Protocol):
         self._server.forget(self)
 
     def write(self, data: bytes) -> None:
-        """Send, unless too much of what was sent before has not been read."""
+        """Send data; drop the client if too much output is unread."""
         if self._transport is None or self._transport.is_closing():
             return
         self._transport.write(data)
@@ -368,7 +369,7 @@ class _Client(asyncio.Protocol):
             self.drop()
 
     def leave(self) -> None:
-        """Close once all is sent, or soon."""
+        """Close once all output is sent, or after a short time."""
         self._leaving = True
         self._lines.clear()
         if self._transport is not None and not self._transport.is_closing():
@@ -376,26 +377,26 @@ class _Client(asyncio.Protocol):
             asyncio.get_running_loop().call_later(_FAREWELL_S, self.drop)
 
     def drop(self) -> None:
-        """Close now."""
+        """Close the connection at once."""
         if self._transport is not None:
             self._transport.abort()
 
-    def _obey_next(self) -> None:
-        """Take one request, and the next one a moment later."""
+    def _handle_next(self) -> None:
+        """Handle one request, and schedule the next one."""
         self._pump = None
         if not self._lines:
             self._leave_if_done()
             return
         line = self._lines.popleft()
-        self.heard_s = time.monotonic()
-        self._obey(line)
+        self.last_received_s = time.monotonic()
+        self._handle(line)
         if self._transport is None or self._transport.is_closing():
             return
-        self._pump = asyncio.get_running_loop().call_later(_PACE_S, self._obey_next)
+        self._pump = asyncio.get_running_loop().call_later(_PACE_S, self._handle_next)
         if not self._lines:
             self._transport.resume_reading()
 
-    def _obey(self, line: bytes) -> None:
+    def _handle(self, line: bytes) -> None:
         try:
             request = parse_request(line)
         except RequestError as error:
@@ -407,7 +408,7 @@ class _Client(asyncio.Protocol):
                 self.write(_line(_refusal(request.id, text, command="watch", wrong_use=False)))
                 return
             self.watching = True
-        if isinstance(request, Watch):
+        if isinstance(request, WatchRequest):
             self._wants_signals |= request.signals
         task = asyncio.create_task(self._answer(request))
         self._tasks.add(task)
@@ -426,20 +427,20 @@ class _Client(asyncio.Protocol):
 
 
 async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
-    """Have a request obeyed, and return what is said of it."""
+    """Execute a request and return the reply."""
     try:
-        told = await service.handle(request, peer)
+        reply = await service.handle(request, peer)
     except CommandError as error:
         return _refusal(request.id, str(error), command=request.command, wrong_use=error.wrong_use)
     except Exception as error:
         _log.exception("unexpected error in a request")
         text = f"Unexpected error in the daemon ({error!r}); its log says more."
         return _refusal(request.id, text, command=request.command, wrong_use=False)
-    told = {"reply": request.command, "ok": True, **told}
-    return told if request.id is None else told | {"id": request.id}
+    reply = {"reply": request.command, "ok": True, **reply}
+    return reply if request.id is None else reply | {"id": request.id}
 
 
-async def _connect(link: socket.socket, client: _Client) -> None:
+async def _connect(link: socket.socket, client: _ClientConnection) -> None:
     try:
         await asyncio.get_running_loop().connect_accepted_socket(lambda: client, link)
     except OSError:
@@ -457,8 +458,8 @@ def _line(document: Document) -> bytes:
 def _refusal(
     request_id: Id | None, text: str, *, command: str | None = None, wrong_use: bool = True
 ) -> Document:
-    told = {"reply": command, "ok": False, "error": text, "wrong_use": wrong_use}
-    return told if request_id is None else told | {"id": request_id}
+    reply = {"reply": command, "ok": False, "error": text, "wrong_use": wrong_use}
+    return reply if request_id is None else reply | {"id": request_id}
 
 
 _FULL = _line(
@@ -467,12 +468,12 @@ _FULL = _line(
 )
 
 
-def _say(link: socket.socket, line: bytes) -> None:
-    """Send a last line without waiting for a reader."""
+def _send_last(link: socket.socket, line: bytes) -> None:
+    """Send a last line without waiting, and close."""
     with link, suppress(OSError):
         link.send(line)
 
 
-def _say_full(link: socket.socket) -> None:
-    """Turn a connection away."""
-    _say(link, _FULL)
+def _send_full(link: socket.socket) -> None:
+    """Refuse a connection because there are too many."""
+    _send_last(link, _FULL)

@@ -21,7 +21,7 @@ from rigd.runner.status import ProcessStatus, RigStatus
 _REMEMBERED = 50
 
 
-class State(StrEnum):
+class DaemonState(StrEnum):
     """States of the daemon."""
 
     IDLE = "idle"
@@ -29,42 +29,41 @@ class State(StrEnum):
     READY = "ready"
     """The devices are connected, the torque is off."""
     RUNNING = "running"
-    """A session, or the pause between two of a series."""
+    """A session runs, or a pause between two sessions of a series."""
     STOPPING = "stopping"
-    """A stop was asked for, and the session has not ended yet."""
+    """A stop was requested, and the session has not ended yet."""
     FAULT = "fault"
-    """Nothing commands a torque until an operator resets the rig; the reason says what the drive
-    showed."""
+    """No torque is commanded until an operator resets the rig; the reason has the drive report."""
 
 
-_LEADS_TO: Mapping[State, frozenset[State]] = {
-    State.IDLE: frozenset({State.READY, State.FAULT}),
-    State.READY: frozenset({State.RUNNING, State.IDLE, State.FAULT}),
-    State.RUNNING: frozenset({State.STOPPING, State.READY, State.FAULT}),
-    State.STOPPING: frozenset({State.READY, State.FAULT}),
-    State.FAULT: frozenset({State.IDLE, State.READY}),
+_LEADS_TO: Mapping[DaemonState, frozenset[DaemonState]] = {
+    DaemonState.IDLE: frozenset({DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.READY: frozenset({DaemonState.RUNNING, DaemonState.IDLE, DaemonState.FAULT}),
+    DaemonState.RUNNING: frozenset({DaemonState.STOPPING, DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.STOPPING: frozenset({DaemonState.READY, DaemonState.FAULT}),
+    DaemonState.FAULT: frozenset({DaemonState.IDLE, DaemonState.READY}),
 }
 
-_REMEDIES: Mapping[State, str] = {
-    State.IDLE: "its devices are being connected; try again in a moment",
-    State.READY: "there is nothing to reset",
-    State.RUNNING: "wait for the session to end, or end it with rigd stop",
-    State.STOPPING: "the session is being stopped; wait for its end",
-    State.FAULT: "remove the cause, then run rigd reset",
+_REMEDIES: Mapping[DaemonState, str] = {
+    DaemonState.IDLE: "its devices are being connected; try again in a moment",
+    DaemonState.READY: "there is nothing to reset",
+    DaemonState.RUNNING: "wait for the session to end, or end it with rigd stop",
+    DaemonState.STOPPING: "the session is being stopped; wait for its end",
+    DaemonState.FAULT: "remove the cause, then run rigd reset",
 }
-_ADJECTIVES: Mapping[State, str] = {state: state.value for state in State} | {
-    State.FAULT: "in fault"
+_ADJECTIVES: Mapping[DaemonState, str] = {state: state.value for state in DaemonState} | {
+    DaemonState.FAULT: "in fault"
 }
-_COMES_FROM: Mapping[str, State] = {
-    "start": State.READY,
-    "tare": State.READY,
-    "zero": State.READY,
-    "reset": State.FAULT,
+_COMES_FROM: Mapping[str, DaemonState] = {
+    "start": DaemonState.READY,
+    "tare": DaemonState.READY,
+    "zero": DaemonState.READY,
+    "reset": DaemonState.FAULT,
 }
 
 
 class IllegalTransitionError(Exception):
-    """A transition that does not exist: an error in the program."""
+    """A transition is not in the table, which is a bug."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,27 +71,27 @@ class Transition:
     """One change of state."""
 
     utc_ns: int
-    before: State
-    after: State
+    before: DaemonState
+    after: DaemonState
     reason: str
 
 
-class StateMachine:
-    """The present state and how it came about.
+class DaemonStateMachine:
+    """State machine of the daemon, with its last transitions.
 
     Parameters
     ----------
     on_change
         Called with each transition, after it.
     utc_ns
-        The wall clock, for tests.
+        Wall clock, which tests replace.
 
     Attributes
     ----------
     state
-        The present one.
+        Present state.
     history
-        The last transitions, oldest first.
+        Last transitions, oldest first.
     """
 
     def __init__(
@@ -103,7 +102,7 @@ class StateMachine:
         self._on_change = on_change
         self._utc_ns = utc_ns
         self._began_utc_ns = utc_ns()
-        self.state = State.IDLE
+        self.state = DaemonState.IDLE
         self.history: deque[Transition] = deque(maxlen=_REMEMBERED)
 
     @property
@@ -116,13 +115,13 @@ class StateMachine:
         """Reason of the present state."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
-    def move(self, after: State, reason: str) -> None:
-        """Go to another state.
+    def move(self, after: DaemonState, reason: str) -> None:
+        """Change to another state.
 
         Raises
         ------
         IllegalTransitionError
-            If nothing leads there from the present one.
+            If there is no such transition.
         """
         if after not in _LEADS_TO[self.state]:
             raise IllegalTransitionError(f"{self.state} does not lead to {after} ({reason}).")
@@ -132,11 +131,11 @@ class StateMachine:
         self._on_change(transition)
 
     def refusal(self, command: str) -> str:
-        """Say why a command cannot be obeyed in the present state; empty if it can."""
+        """Return why a command is refused in the present state; empty if it is not."""
         wanted = _COMES_FROM.get(command, self.state)
         if wanted is self.state:
             return ""
-        why = f" ({self.reason.rstrip('.')})" if self.state is State.FAULT else ""
+        why = f" ({self.reason.rstrip('.')})" if self.state is DaemonState.FAULT else ""
         return (
             f"{command} needs a rig that is {_ADJECTIVES[wanted]}; this one is "
             f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."
@@ -149,11 +148,11 @@ Document = dict[str, Any]
 
 
 _USERS: dict[int, str] = {}
-"""Names by number."""
+"""Names of users by their numbers."""
 
 
-def look_up_user(uid: int) -> None:
-    """Find out the name of a user, which may take its time, for :class:`Peer`."""
+def resolve_user(uid: int) -> None:
+    """Find the name of a user for :class:`Peer`, which may take long."""
     if uid not in _USERS:
         with suppress(KeyError):
             _USERS[uid] = pwd.getpwuid(uid).pw_name
@@ -161,7 +160,7 @@ def look_up_user(uid: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A client, as the kernel knows it."""
+    """A client, as the kernel identifies it."""
 
     number: int
     """Number of its connection."""
@@ -170,7 +169,7 @@ class Peer:
 
     @property
     def user(self) -> str:
-        """Its user's name, as far as that was looked up."""
+        """Name of its user, or the number while the name is unknown."""
         return _USERS.get(self.uid, str(self.uid))
 
     def __str__(self) -> str:
@@ -178,12 +177,12 @@ class Peer:
 
 
 def peer_document(peer: Peer | None) -> Document | None:
-    """Tell who controls."""
+    """Return the client that holds control as a JSON document."""
     return None if peer is None else {"pid": peer.pid, "uid": peer.uid, "user": peer.user}
 
 
 def transition_document(transition: Transition) -> Document:
-    """Tell of one change of state."""
+    """Return a transition as a JSON document."""
     return {
         "utc_ns": transition.utc_ns,
         "from": transition.before.value,
@@ -192,35 +191,36 @@ def transition_document(transition: Transition) -> Document:
     }
 
 
-def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document:
-    """Tell how the rig and its processes are.
+def rig_document(status: RigStatus, rates: Mapping[str, float | None]) -> Document:
+    """Return the status of the rig and its processes as a JSON document.
 
     Parameters
     ----------
-    look
+    status
         Status of the rig.
     rates
-        Measured records a second, by topic.
+        Measured records per second, by topic.
     """
     return {
-        "phase": look.phase.name.lower(),
-        "angle_rad": look.angle_rad,
-        "coupling_torque_nm": look.coupling_torque_nm,
-        "torque_command_nm": look.torque_command_nm,
-        "signals": None if look.signals is None else _finite(asdict(look.signals())),
+        "phase": status.phase.name.lower(),
+        "angle_rad": status.angle_rad,
+        "coupling_torque_nm": status.coupling_torque_nm,
+        "torque_command_nm": status.torque_command_nm,
+        "signals": None if status.signals is None else _finite(asdict(status.signals())),
         "health": {
-            "missed": look.missed,
-            "late": look.late,
-            "lost": look.lost,
-            "bus_load_percent": look.bus_load_percent,
-            "bus_errors": look.bus_errors,
-            "sensor_status": look.sensor_status,
-            "disk_free_mb": look.disk_free_mb,
-            "view_dropped": look.view_dropped,
+            "missed": status.missed,
+            "late": status.late,
+            "lost": status.lost,
+            "bus_load_percent": status.bus_load_percent,
+            "bus_errors": status.bus_errors,
+            "sensor_status": status.sensor_status,
+            "disk_free_mb": status.disk_free_mb,
+            "view_dropped": status.view_dropped,
         },
-        "live_view": _view_document(look.live_view),
+        "live_view": _view_document(status.live_view),
         "processes": [
-            asdict(process) | {"state": _state(process, look.phase)} for process in look.processes
+            asdict(process) | {"state": _state(process, status.phase)}
+            for process in status.processes
         ],
         "topics": [
             {
@@ -230,22 +230,22 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
                 "rate_hz": rates.get(topic.name),
                 "expected_hz": topic.expected_hz,
             }
-            for topic in look.topics
+            for topic in status.topics
         ],
     }
 
 
 def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | None) -> Document:
-    """Tell what the signals were over some ticks.
+    """Return a block of signals as a JSON document.
 
     Parameters
     ----------
     block
         Signals and gauges.
     rate_hz
-        Ticks a second.
+        Ticks per second.
     frequency_hz
-        Frequency of the excitation at the last of them.
+        Frequency of the excitation at the last tick.
     """
     return {
         "event": "signals",
@@ -273,17 +273,17 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
 
 
 def _finite(values: Mapping[str, float]) -> Document:
-    """Return numbers as JSON can have them."""
+    """Return numbers for JSON, with null for values that are not finite."""
     return {name: value if isfinite(value) else None for name, value in values.items()}
 
 
 def _view_document(view: LiveAddress | None) -> Document | None:
-    """Tell where the live view is."""
+    """Return the address of the live view as a JSON document."""
     return None if view is None else {"url": view.page_url, **asdict(view)}
 
 
 def _state(process: ProcessStatus, phase: Phase) -> str:
-    """Return a process's state; of one that is started for each session its end is normal."""
+    """Return the state of a process; one that lasts for one session ends as ``done``."""
     passing = any(p.for_one_session and p.name == process.name for p in PROCESSES)
     return "done" if process.state == "ended" and passing and phase is Phase.OFF else process.state
 
@@ -292,15 +292,15 @@ _OF_A_FIT = (
     *("tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings"),
     *("type", "validity", "modes", "parameters", "search", "text"),
 )
-"""Members of a fit that clients are told; those for computing, such as its covariance, are long."""
+"""Members of a fit that clients receive; others, such as the covariance, are too long."""
 _MOST_ITEMS, _LONGEST_TEXT = 16, 400
 _LONG = frozenset({"pieces", "constants"})
-"""Members within them that are left out: pieces of a search (the file has them), and the modal
-constants of the test of uniformity."""
+"""Omitted members of these: segments of a search (they are in the file), and the modal constants of
+the test of uniformity."""
 
 
 def fit_document(fit: Mapping[str, Any]) -> Document:
-    """Tell what a fit of the record found, in a bounded number of bytes.
+    """Return a fit of the record as a JSON document of bounded size.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ def fit_document(fit: Mapping[str, Any]) -> Document:
 
 
 def _bounded(value: Any) -> Any:  # noqa: ANN401 - what JSON has
-    """Return lists and texts cut to what a client can bear."""
+    """Return lists and texts shortened to a bounded size."""
     if isinstance(value, str):
         return value[:_LONGEST_TEXT]
     if isinstance(value, Mapping):
@@ -321,30 +321,30 @@ def _bounded(value: Any) -> Any:  # noqa: ANN401 - what JSON has
     return value
 
 
-def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Document:
-    """Tell how far a session is.
+def progress_document(status: RigStatus, total: int, rate_hz: float | None) -> Document:
+    """Return the progress of a session as a JSON document.
 
     Parameters
     ----------
-    look
+    status
         Status of the rig.
     total
         Ticks of the record.
     rate_hz
-        Ticks a second of real time; None where time is skipped.
+        Ticks per second of real time; None with the virtual clock.
     """
-    # Until tick 0 the board may still have the counts of the session before.
-    left = max(0, total - look.tick)
+    # Until tick 0 the shared state may have the counts of the session before.
+    left = max(0, total - status.tick)
     return {
-        "phase": look.phase.name.lower(),
-        "activity": look.activity.value,
-        "tick": look.tick,
+        "phase": status.phase.name.lower(),
+        "activity": status.activity.value,
+        "tick": status.tick,
         "total": total,
-        "percent": round(100.0 * look.tick / total, 1) if total else 100.0,
+        "percent": round(100.0 * status.tick / total, 1) if total else 100.0,
         "time_left_s": None if rate_hz is None else round(left / rate_hz, 1),
-        "missed": look.missed,
-        "late": look.late,
-        "lost": look.lost,
+        "missed": status.missed,
+        "late": status.late,
+        "lost": status.lost,
     }
 
 
@@ -354,7 +354,7 @@ def daemon_document(
     *,
     moving: str,
     hardware: bool,
-    told: str,
+    moving_text: str,
     fast: bool,
     live: bool,
     web: str | None,
@@ -363,7 +363,7 @@ def daemon_document(
     failed_checks: list[Document],
     began_utc_ns: int,
 ) -> Document:
-    """Tell which daemon this is."""
+    """Return the description of the daemon as a JSON document."""
     from rigd import __version__
 
     return {
@@ -372,7 +372,7 @@ def daemon_document(
         "profile": profile,
         "moving": moving,
         "hardware": hardware,
-        "what_moves": told,
+        "what_moves": moving_text,
         "output": output,
         "fast": fast,
         "live": live,
@@ -390,5 +390,5 @@ def daemon_document(
 
 
 def histories(transitions: Iterable[Transition]) -> list[Document]:
-    """Tell of the last changes of state."""
+    """Return the last transitions as JSON documents."""
     return [transition_document(transition) for transition in transitions]

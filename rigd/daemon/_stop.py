@@ -1,10 +1,9 @@
-"""Stop of all that runs for a user: found by the kernel's tables, stopped, and seen to have ended.
+"""Stop of all sessions of a user: find them in the kernel's tables, stop them, verify their end.
 
-Two ways lead to what runs, and neither relies on the other. A daemon is reached by its socket, as
-long as the process that listens there holds the lock of the rig; it says itself when its session
-has ended. Every other process that runs sessions is found in the process table, and gets
-`STOP_SIGNAL`; the table shows when it has ended, or when its control process has disabled the
-drive.
+There are two independent ways to find sessions. A daemon is reached by its socket, provided that
+the listening process holds the lock of the rig; it reports the end of its session itself. Every
+other process that runs sessions is found in the process table and gets `STOP_SIGNAL`. The table
+shows when that process has ended, or when its control process has disabled the drive.
 """
 
 import os
@@ -30,9 +29,9 @@ from rigd.runtime.processes import RunningProcess, read_processes, send_signal
 
 _END_PATIENCE_S: Final = 10.0
 _CONTROL_AFTER_S: Final = 3.0
-"""Time after which the control process of a supervisor that does not obey is stopped itself."""
+"""Time after which the control process of a supervisor that does not obey is stopped directly."""
 _DOUBTED_PATIENCE_S: Final = 2.0
-"""Time for a process whose reply is not believed."""
+"""Time for a process whose reply is not trusted."""
 _AGAIN_S: Final = 0.5
 _SETTLED_S: Final = 0.05
 _POLL_S: Final = 0.02
@@ -43,24 +42,24 @@ _SESSIONS: Final = ("run", "identify")
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """What a stop found, and what became of it; each text is a phrase or a sentence.
+    """Results of a stop; each text is a phrase or a sentence.
 
     Attributes
     ----------
     stopped
-        Sessions that have ended by it: what ran, on which rig, in which process.
+        Sessions that ended: excitation or command, rig and process.
     stopping
-        Sessions that were asked to stop, without waiting for their end.
+        Sessions that were requested to stop, without waiting for their end.
     quiet
-        Rigs that run no session.
+        Rigs without a session.
     running
-        Sessions that were asked to stop, and whose end was not seen.
+        Sessions that were requested to stop, and whose end was not observed.
     doubts
-        What could not be examined, or is not to be believed.
+        Folders and tables that could not be examined, and replies that are not trusted.
     others
         Sessions of other users, which this user cannot stop.
     places
-        Where it looked.
+        Tables and folders that were searched.
     """
 
     stopped: list[str] = field(default_factory=list)
@@ -83,28 +82,20 @@ class StopReport:
 
 
 def stop_all(rig: str | None, *, wait: bool = True) -> StopReport:
-    """Stop every session of this user, of any user for root, and see that it has ended.
+    """Stop every session of this user (for root, of all users), and verify its end.
 
     Parameters
     ----------
     rig
         Name of the only rig to stop; None: all.
     wait
-        Wait until the sessions have ended, at most 10 s.
+        Whether to wait until the sessions have ended, at most 10 s.
     """
     return _Stop(None if rig is None else file_name(rig), wait=wait).run()
 
 
 class _Stop:
-    """One stop.
-
-    Parameters
-    ----------
-    rig
-        Name of the only rig to stop as file names have it; None: all.
-    wait
-        Wait for the ends.
-    """
+    """One stop; `rig` is the rig's name as in file names, or None for all."""
 
     def __init__(self, rig: str | None, *, wait: bool) -> None:
         self._rig = rig
@@ -113,7 +104,7 @@ class _Stop:
         self._report = StopReport()
         self._supervisors: dict[tuple[int, int], _Supervisor] = {}
         self._others: list[_Supervisor] = []
-        """Those of other users."""
+        """Supervisors of other users."""
         self._began_s = time.monotonic()
 
     def run(self) -> StopReport:
@@ -143,7 +134,7 @@ class _Stop:
     # Daemons, by their sockets
 
     def _find_daemons(self) -> "list[_Daemon]":
-        """Return the daemons that listen, in order of their sockets."""
+        """Return the listening daemons, in the order of their sockets."""
         report = self._report
         report.places.append("the listening sockets (/proc/net/unix)")
         report.places.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
@@ -162,7 +153,7 @@ class _Stop:
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except PermissionError as error:
-                if folder == COMMON or _may_be_of(folder, self._uid):
+                if folder == COMMON or _may_belong_to(folder, self._uid):
                     report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
             except OSError as error:
@@ -183,13 +174,7 @@ class _Stop:
     # Other processes, by the process table
 
     def _follow(self, daemons: "list[_Daemon]") -> "list[_Supervisor]":
-        """Stop what has no socket, until all has ended or the patience is over.
-
-        Returns
-        -------
-        list of _Supervisor
-            Those whose session has not been seen to end.
-        """
+        """Stop supervisors without a socket; return those whose session did not end in time."""
         self._report.places.insert(0, "the process table (/proc)")
         while True:
             try:
@@ -222,11 +207,11 @@ class _Stop:
                 waiting[0].join(_REREAD_S)
 
     def _is_reached(self, daemon: "_Daemon") -> bool:
-        """Whether a daemon's own word is enough: it is the rig's, and has answered in time."""
+        """Return whether a daemon's own report suffices: it is trusted and responds in time."""
         return daemon.doubt == "" and (daemon.done or self._passed_s < _CONTROL_AFTER_S)
 
     def _is_awaited(self, daemon: "_Daemon") -> bool:
-        """Whether a daemon may still report the end of its session."""
+        """Return whether a daemon may still report the end of its session."""
         if daemon.done:
             return False
         known = self._supervisors.values()
@@ -236,7 +221,7 @@ class _Stop:
         return self._passed_s < patience_s
 
     def _update(self, table: Sequence[RunningProcess]) -> "list[_Supervisor]":
-        """Return the supervisors of this user in a process table; remember those of others."""
+        """Return the supervisors of this user in a process table, and store those of others."""
         self._others.clear()
         found = []
         for process, controls in _supervisors(table):
@@ -257,17 +242,7 @@ class _Stop:
 
 
 class _Daemon:
-    """A process that listens on a daemon's socket, and its stop in a thread of its own.
-
-    Parameters
-    ----------
-    path
-        Path of the socket.
-    peer
-        Process and user that listen there; None: not known.
-    wait
-        Wait for the end.
-    """
+    """Stop of a daemon through its socket, in its own thread; `peer` is its process and user."""
 
     def __init__(self, path: Path, peer: tuple[int, int] | None, *, wait: bool) -> None:
         self._path = path
@@ -278,19 +253,19 @@ class _Daemon:
         self._thread = threading.Thread(target=self._stop, daemon=True)
         self.pid = 0 if peer is None else peer[0]
         self.doubt = "It takes no connection." if peer is None else self._doubt_of(*peer)
-        """Reason why its replies are not believed; empty if they are."""
+        """Reason why its replies are not trusted; empty if they are."""
 
     def begin(self) -> None:
-        """Begin to stop it."""
+        """Start the stop."""
         self._thread.start()
 
     def join(self, patience_s: float) -> None:
-        """Wait until it has ended its session, or could not."""
+        """Wait until the stop has succeeded or failed."""
         self._thread.join(patience_s)
 
     @property
     def done(self) -> bool:
-        """Whether it has ended its session, or could not."""
+        """Whether the stop has succeeded or failed."""
         return not self._thread.is_alive()
 
     def _stop(self) -> None:
@@ -313,8 +288,8 @@ class _Daemon:
             holds = holds_rig(pid, rig, folder)
         except OSError as error:
             return f"The table of locks cannot be read ({error.strerror})."
-        # A simulated rig's lock is in a folder that only its user can look into. But only that
-        # user can make a socket in the group's folder.
+        # Only its user can read the folder with a simulated rig's lock, but also only that user can
+        # create a socket in the group's folder.
         with suppress(OSError):
             if shared and uid in (0, folder.stat().st_uid) and uid != os.getuid():
                 return ""
@@ -323,15 +298,7 @@ class _Daemon:
         return f"It does not hold the lock of the rig {rig}, and may be no daemon."
 
     def report_to(self, report: StopReport, *, disabled: bool) -> None:
-        """Report what became of it.
-
-        Parameters
-        ----------
-        report
-            Takes it.
-        disabled
-            By the process table, its control process has disabled the drive.
-        """
+        """Add the result; `disabled`: the process table shows that the drive is disabled."""
         rig = self._path.name.removesuffix(SUFFIX)
         if self.doubt:
             who = f"process {self.pid}" if self.pid else "the process"
@@ -383,15 +350,7 @@ class _Daemon:
 
 
 class _Supervisor:
-    """A process that runs sessions, with its control processes.
-
-    Parameters
-    ----------
-    process
-        Its row of the process table; of a control process without a supervisor, that one's own.
-    controls
-        Rows of its control processes.
-    """
+    """A process that runs sessions, or an orphaned control process, with its control processes."""
 
     def __init__(self, process: RunningProcess, controls: list[RunningProcess]) -> None:
         self.process = process
@@ -401,7 +360,7 @@ class _Supervisor:
         self._rig = held_rig(process.pid) or self._named_rig
         self._had_session = self.has_session
         self.suspended = False
-        """It was sent the signal, and cannot take it."""
+        """Whether it was sent the signal but is suspended and cannot receive it."""
         self._signalled_s = -_AGAIN_S
         self._sent = False
         self._seen = False
@@ -409,12 +368,12 @@ class _Supervisor:
 
     @property
     def key(self) -> tuple[int, int]:
-        """Number and start of the process, which no other process has."""
+        """Process id and start time, which identify the process uniquely."""
         return self.process.pid, self._born
 
     @property
     def words(self) -> str:
-        """What runs, on which rig, in which process."""
+        """Command, rig and process for the operator."""
         words = takewhile(lambda argument: not argument.startswith("-"), self._arguments[:2])
         name = " ".join(["rigd", *words]) if self._arguments else "a session"
         given = self._rig or _option(self._arguments, "--profile")
@@ -424,7 +383,7 @@ class _Supervisor:
 
     @property
     def _named_rig(self) -> str | None:
-        """Name of the rig by the command line; None if that names a file."""
+        """Name of the rig from the command line; None if that names a file."""
         given = _option(self._arguments, "--profile")
         if given is None:
             return "sim" if self._in_foreground else None
@@ -436,45 +395,39 @@ class _Supervisor:
 
     @property
     def has_session(self) -> bool:
-        """Whether a session may run, or a torque be on."""
+        """Whether a session may run or the torque be on."""
         if any(control.name != IDLE_NAME for control in self.controls):
             return True
         return self._in_foreground and not self.process.ignores(STOP_SIGNAL)
 
     @property
     def _recorded(self) -> bool:
-        """Whether a session was seen, whose file may be being closed."""
+        """Whether a session was observed, whose file may still be open."""
         self._seen |= any(control.name == SESSION_NAME for control in self.controls)
         return self._seen
 
     @property
     def is_over(self) -> bool:
-        """Whether no session runs, nor can begin before the request to stop is obeyed."""
+        """Whether no session runs, and none can begin before the stop is obeyed."""
         if self.process.suspended and self.process.awaits(STOP_SIGNAL):
             self.suspended = True
             return all(control.name == IDLE_NAME for control in self.controls)
         settled = time.monotonic() - self._signalled_s > _SETTLED_S
         obeyed = self._sent and settled and not self.process.awaits(STOP_SIGNAL)
         if self._in_foreground and self.process.handles(STOP_SIGNAL):
-            # Its control process ends once the file is closed. Where no session was begun, none
-            # will be, and it may plan for a while.
+            # Its control process ends once the file is closed. Without a session it may still be
+            # planning, but will not begin one.
             return obeyed and not (self._recorded and self.controls)
         return not self.has_session and (obeyed or not self._sent)
 
     def is_for(self, rig: str) -> bool:
-        """Whether it may be for a rig, by its name as file names have it."""
+        """Return whether it may run a rig, given by its name in file names."""
         return self._rig is None or file_name(self._rig) == rig
 
     def drive(self, passed_s: float) -> None:
-        """Do what stops it next.
-
-        Parameters
-        ----------
-        passed_s
-            Time since the stop began.
-        """
+        """Take the next step of the stop, `passed_s` after its beginning."""
         for control in self.controls:
-            if control.suspended:  # it would leave its last torque on
+            if control.suspended:  # it would hold its last torque
                 self._send(control, signal.SIGCONT)
         now_s = time.monotonic()
         if now_s - self._signalled_s > _AGAIN_S and (self.has_session or not self._sent):
@@ -490,7 +443,7 @@ class _Supervisor:
             self._sent = send_signal(process, self._born, STOP_SIGNAL)
         elif not self._in_foreground:
             self._stop_control()
-        elif not process.ignores(STOP_SIGNAL):  # it has not begun, or is of before an update
+        elif not process.ignores(STOP_SIGNAL):  # it is starting, or an older version
             number = signal.SIGINT if process.handles(signal.SIGINT) else signal.SIGTERM
             self._sent = send_signal(process, self._born, number)
 
@@ -505,7 +458,7 @@ class _Supervisor:
             send_signal(process, born, number)
 
     def report_to(self, report: StopReport, *, ended: bool, waited: bool) -> None:
-        """Report what became of it."""
+        """Add the result to a report."""
         if not waited and self._had_session:
             report.stopping.append(self.words)
         elif not ended:
@@ -532,9 +485,9 @@ def _supervisors(
         if number is None or process.uid < 0:
             continue
         owner = rows.get(number)
-        # Anybody can write a command line: only its parent, of the same user, is its supervisor.
-        lone = owner is None or (owner.uid, number) != (process.uid, process.parent)
-        found.setdefault(process.pid if lone else number, []).append(process)
+        # Any process can have this command line: only the parent, of the same user, is trusted.
+        orphaned = owner is None or (owner.uid, number) != (process.uid, process.parent)
+        found.setdefault(process.pid if orphaned else number, []).append(process)
     for process in table:
         arguments = _rigd_arguments(process.command)
         if process.uid < 0 or arguments[:1] not in [(name,) for name in _SESSIONS]:
@@ -548,7 +501,7 @@ def _supervisors(
 
 
 def _rigd_arguments(command: Sequence[str]) -> tuple[str, ...]:
-    """Return the arguments of ``rigd`` in a command line of Python; empty if it is none."""
+    """Return the arguments of ``rigd`` in a Python command line; empty without ``rigd``."""
     if not command or not Path(command[0]).name.startswith("python"):
         return ()
     for index, argument in enumerate(command[1:], start=1):
@@ -568,8 +521,8 @@ def _option(arguments: Sequence[str], name: str) -> str | None:
     return None
 
 
-def _may_be_of(folder: Path, uid: int) -> bool:
-    """Whether a user can have made something in a folder that this user cannot read."""
+def _may_belong_to(folder: Path, uid: int) -> bool:
+    """Return whether a user may own files in a folder that this user cannot read."""
     for path in (folder, *folder.parents):
         with suppress(OSError):
             return path.stat().st_uid == uid
@@ -577,7 +530,7 @@ def _may_be_of(folder: Path, uid: int) -> bool:
 
 
 def _user(uid: int) -> str:
-    """Return the name of a user, or the number where there is none."""
+    """Return the name of a user, or the number if there is no name."""
     with suppress(KeyError):
         return pwd.getpwuid(uid).pw_name
     return str(uid)

@@ -1,4 +1,4 @@
-"""Address of a rig's daemon: its socket, how it is made and found."""
+"""Address of a rig's daemon: creation of its socket, and search for it."""
 
 import errno
 import grp
@@ -14,18 +14,18 @@ from rigd.runtime.addresses import address_files, answers, file_name, folder_fau
 from rigd.runtime.processes import listening_sockets
 
 COMMON = Path("/run/rigd")
-"""Folder of daemons that a group may use: a user's own runtime folder is closed to others."""
+"""Folder of daemons for a group: a user's own runtime folder is closed to others."""
 SUFFIX = ".daemon"
-"""Ends the name of each daemon's socket."""
+"""Suffix of the name of each daemon's socket."""
 _CREDENTIALS = struct.Struct("3i")
 
 
 class AddressError(FailureError):
-    """There can be no socket, or no daemon is found; the message is for the operator."""
+    """A socket cannot be created, or no daemon is found; the message is for the operator."""
 
 
 class UnknownGroupError(UserError):
-    """There is no group of that name."""
+    """A group does not exist."""
 
 
 def socket_path(rig: str, folder: Path | None = None) -> Path:
@@ -42,37 +42,37 @@ def socket_path(rig: str, folder: Path | None = None) -> Path:
 
 
 def peer_of(link: socket.socket) -> tuple[int, int]:
-    """Return process and user at the other end of a connection, as the kernel knows them.
+    """Return process id and user id of a connection's peer, from the kernel.
 
     Raises
     ------
     OSError
-        If the kernel does not tell.
+        If the kernel does not report them.
     """
-    told = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    pid, uid, _ = _CREDENTIALS.unpack(told)
+    credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(credentials)
     return pid, uid
 
 
 def bind(path: Path, group: str | None) -> socket.socket:
-    """Make the socket; no client can connect before it listens, and then only its users.
+    """Create the socket, which only its users can connect to, once it listens.
 
-    Call it only while holding the rig: what a dead daemon left is replaced.
+    Call it only while holding the lock of the rig: it replaces the socket of a dead daemon.
 
     Parameters
     ----------
     path
         Path of the socket. The user's own folder is created; a group's folder has to exist.
     group
-        Group whose members may use it too.
+        Group whose members may also connect.
 
     Raises
     ------
     UnknownGroupError
         If there is no such group.
     AddressError
-        If the socket cannot be made, its folder is closed to the group or writable by others, or a
-        living daemon has it.
+        If the socket cannot be created, its folder is closed to the group or writable by others,
+        or a running daemon uses it.
     """
     number = None if group is None else _group_number(group)
     fault = folder_fault(path.parent, shared=group is not None)
@@ -108,12 +108,12 @@ def running() -> list[Path]:
 
 
 def find(rig: str | None) -> Path:
-    """Return the socket of the daemon of a rig, or of the only one there is.
+    """Return the socket of a rig's daemon, or of the only daemon.
 
     Raises
     ------
     AddressError
-        Naming the remedy.
+        If there is none, or several; the message names the remedy.
     """
     if rig is not None:
         for folder in _folders():
@@ -121,11 +121,12 @@ def find(rig: str | None) -> Path:
             if answers(path):
                 return path
         raise AddressError(
-            f"No daemon of the rig {rig} {_elsewhere(file_name(rig))}rigd serve --profile {rig}."
+            f"No daemon of the rig {rig} {_not_found_reason(file_name(rig))}"
+            f"rigd serve --profile {rig}."
         )
     found = running()
     if not found:
-        raise AddressError(f"No daemon {_elsewhere(None)}rigd serve --profile NAME.")
+        raise AddressError(f"No daemon {_not_found_reason(None)}rigd serve --profile NAME.")
     if len(found) > 1:
         rigs = ", ".join(path.name.removesuffix(SUFFIX) for path in found)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
@@ -133,18 +134,12 @@ def find(rig: str | None) -> Path:
 
 
 def _folders() -> list[Path]:
-    """Return the folders in which a daemon is found, without that of groups if it is unsafe."""
+    """Return the folders to search for daemons, without that of groups if it is unsafe."""
     return [runtime_folder()] if folder_fault(COMMON, shared=True) else [runtime_folder(), COMMON]
 
 
-def _elsewhere(rig: str | None) -> str:
-    """Return the reason why no daemon is found, up to the command that starts one.
-
-    Parameters
-    ----------
-    rig
-        Name of the rig as file names have it; None: any.
-    """
+def _not_found_reason(rig: str | None) -> str:
+    """Return part of a sentence: why no daemon of `rig` (as in file names; None: any) is found."""
     fault = folder_fault(COMMON, shared=True)
     unsafe = address_files(f"*{SUFFIX}", COMMON) if fault else []
     others = []
@@ -162,9 +157,9 @@ def _elsewhere(rig: str | None) -> str:
 
 
 def own_sockets() -> list[Path]:
-    """Return the sockets on which this user's daemons listen, by the kernel's list.
+    """Return the listening sockets of this user's daemons from the kernel's list.
 
-    For root they are those of all users.
+    For root these are the sockets of all users.
 
     Raises
     ------
@@ -183,7 +178,7 @@ def own_sockets() -> list[Path]:
 
 
 def peer_at(path: Path) -> tuple[int, int] | None:
-    """Return process and user that listen on a socket; None if its queue is full.
+    """Return process id and user id that listen on a socket; None if its queue is full.
 
     Parameters
     ----------
@@ -193,7 +188,7 @@ def peer_at(path: Path) -> tuple[int, int] | None:
     Raises
     ------
     OSError
-        If nobody listens there, or this user may not connect.
+        If no process listens there, or this user may not connect.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as link:
         try:
@@ -214,7 +209,7 @@ def _group_number(group: str) -> int:
 
 
 def _open_to(group: int, folder: Path) -> bool:
-    """Whether the members of a group can reach what is in a folder."""
+    """Return whether the members of a group can enter a folder."""
     status = folder.stat()
     return bool(
         status.st_mode & stat.S_IXOTH or (status.st_gid == group and status.st_mode & stat.S_IXGRP)

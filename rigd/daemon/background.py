@@ -1,8 +1,8 @@
 """Background jobs of the daemon: predictions, checks and heavy plans, each in its own process.
 
-They take processor time and memory, and any client may ask for a prediction while a session runs.
-In the daemon's own process they would block the interpreter that supervises the session; theirs has
-the lowest priority of an ordinary program, and a part of the free memory.
+They take processor time and memory, and any client may request a prediction while a session runs.
+In the daemon's own process they would block the interpreter that supervises the session. Their own
+process has the lowest priority of an ordinary program, and a limited fraction of the free memory.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from rigd.checks import check_on_paper
-from rigd.daemon._protocol import CommandError, Start
+from rigd.daemon._protocol import CommandError, StartRequest
 from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile, with_specimen
@@ -28,35 +28,35 @@ from rigd.runner.request import NoRoomError
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, killed_first
 
 _PATIENCE_S: Final = 50.0
-"""Shorter than that of a client, which could not say what has become of its request."""
+"""Less than the client's timeout, so that the client gets a reply."""
 _MOST_BYTES: Final = 4 << 30
 _LEAST_BYTES: Final = 256 << 20
-"""A session of two minutes takes 180 MiB, of which 120 MiB are the program."""
-_SHARE: Final = 0.25
-"""Part of the available memory: of the processes of a session only control locks its own."""
+"""A session of two minutes needs 180 MiB, of which 120 MiB are the program."""
+_MEMORY_FRACTION: Final = 0.25
+"""Fraction of the available memory: only the control process of a session locks its memory."""
 _LOWEST_PRIORITY: Final = 19
 _LIGHT_S: Final = 300.0
-"""Record that is planned in half a second, in 100 MB."""
+"""Longest record that is planned in half a second and 100 MB."""
 
 Done = TypeVar("Done")
 Done_co = TypeVar("Done_co", covariant=True)
 
 
-class Job(Protocol[Done_co]):
-    """Something to be done."""
+class BackgroundJob(Protocol[Done_co]):
+    """A job that runs in its own process."""
 
-    beside_sessions: ClassVar[bool]
-    """Whether it may be done while a session runs, and gives way to it."""
+    during_sessions: ClassVar[bool]
+    """Whether it may run during a session, with lower priority."""
 
     def perform(self) -> Done_co:
-        """Do it; an error of the rig is for the client."""
+        """Return the result; an error of the rig goes to the client."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionJob:
-    """A session to predict: see `rigd.runner.planning.predict_session`."""
+    """Prediction of a session, by `rigd.runner.planning.predict_session`."""
 
-    beside_sessions: ClassVar[bool] = True
+    during_sessions: ClassVar[bool] = True
 
     profile: Profile
     """Rig of the session."""
@@ -65,18 +65,18 @@ class PredictionJob:
     parameters: Mapping[str, Value]
     """Its options."""
     force: bool
-    """Let torques be clipped."""
+    """Whether torques may be clipped."""
     specimen: str
     """Name of the specimen; empty: the profile's."""
     start_rad: float = 0.0
-    """Where the motor stands, from the rig's zero."""
+    """Angle of the motor from the rig's zero."""
     accept: tuple[str, ...] = ()
     """Names of rows of `rigd check` that may fail."""
     tip_slope_rad: float | None = None
     """Largest slope of the tip in an identification; None: the profile's."""
 
     def perform(self) -> dict[str, Any]:
-        """Return the prediction as the reply has it."""
+        """Return the prediction for the reply."""
         profile = with_specimen(self.profile, self.specimen)
         profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
@@ -89,16 +89,16 @@ class PredictionJob:
 
 @dataclass(frozen=True, slots=True)
 class CheckJob:
-    """A rig to check whose devices are the daemon's: see `rigd.checks.check_beside`."""
+    """Check of a rig whose devices the daemon owns, by `rigd.checks.check_beside`."""
 
-    beside_sessions: ClassVar[bool] = True
+    during_sessions: ClassVar[bool] = True
     profile: Profile
     """Rig to check."""
     calibration: Mapping[str, Any] | None
-    """What the connected sensor told of itself; None: the devices are not connected."""
+    """Calibration that the connected sensor reported; None: the devices are not connected."""
 
     def perform(self) -> dict[str, Any]:
-        """Return the rows and the verdict as the reply has them."""
+        """Return the rows and the verdict for the reply."""
         from rigd.checks import check_beside
         from rigd.checks.rows import overall
 
@@ -119,28 +119,28 @@ class CheckJob:
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """Sessions to plan: see `rigd.runner.Series`."""
+    """Plan of sessions, a `rigd.runner.Series`."""
 
-    beside_sessions: ClassVar[bool] = False
+    during_sessions: ClassVar[bool] = False
 
     profile: Profile
     """Rig of the sessions."""
-    request: Start
-    """What was asked for."""
+    request: StartRequest
+    """Request of the client."""
     folder: Path
     """Folder for the files."""
     start_rad: float
-    """Where the motor stands, from the rig's zero."""
+    """Angle of the motor from the rig's zero."""
 
     @property
     def is_heavy(self) -> bool:
-        """Whether it may take more than a second, or much memory: a file, or a long record."""
+        """Whether it may need over a second or much memory, as for a file or a long record."""
         values = self.request.parameters.items()
         long_s = sum(value for name, value in values if name.endswith("_s"))
         return long_s > _LIGHT_S or any(isinstance(value, Path) for _, value in values)
 
     def perform(self) -> Series:
-        """Make the excitation, and check that it may be run."""
+        """Return the series, after checking that it may run."""
         request = self.request
         notes = request.notes.as_metadata()
         try:
@@ -165,13 +165,13 @@ class PlanJob:
             raise CommandError("There is not enough memory to plan such a session.") from None
 
 
-async def perform(job: Job[Done]) -> Done:
-    """Have a job done in its own process, without holding up the event loop.
+async def perform(job: BackgroundJob[Done]) -> Done:
+    """Run a job in its own process and return its result, without blocking the event loop.
 
     Parameters
     ----------
     job
-        What to do.
+        Job to run.
 
     Raises
     ------
@@ -189,8 +189,8 @@ async def perform(job: Job[Done]) -> Done:
     except OSError as error:
         raise CommandError(f"No process can be started for it ({error.strerror}).") from None
     try:
-        told, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
-        answer = pickle.loads(told)
+        output, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
+        answer = pickle.loads(output)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
     except (EOFError, pickle.UnpicklingError):
@@ -206,15 +206,15 @@ async def perform(job: Job[Done]) -> Done:
 
 
 def main() -> None:
-    """Do the job that standard input brings; the result, or why there is none, goes to its output.
+    """Run the job from standard input, and write the result or the error to standard output.
 
-    Both ends are this program's own.
+    Unpickling is safe, because this program writes both ends.
     """
     killed_first()
     most_bytes = _memory_limit()
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
     job = pickle.load(sys.stdin.buffer)
-    if job.beside_sessions:
+    if job.during_sessions:
         os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     try:
         answer = job.perform()
@@ -227,15 +227,15 @@ def main() -> None:
             wrong_use=True,
         )
     if isinstance(answer, dict):
-        json.dumps(answer, allow_nan=False)  # a reply that is not JSON is none
+        json.dumps(answer, allow_nan=False)  # raises if the reply is not JSON
     pickle.dump(answer, sys.stdout.buffer)
 
 
 def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:
-    """Return how many bytes of address space a job may have."""
+    """Return the limit of a job's address space in bytes."""
     text = meminfo.read_text()
     available = int(text.partition("MemAvailable:")[2].split()[0]) * 1024
-    return int(min(max(_SHARE * available, _LEAST_BYTES), _MOST_BYTES))
+    return int(min(max(_MEMORY_FRACTION * available, _LEAST_BYTES), _MOST_BYTES))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Client of the daemon: one blocking connection, and a stop that does not give up."""
+"""Client of the daemon: a blocking connection, and a persistent stop."""
 
 import json
 import os
@@ -23,17 +23,17 @@ from rigd.runtime.processes import read_process, read_processes, send_signal
 Document = dict[str, Any]
 
 _ANSWER_PATIENCE_S = 60.0
-"""Reconnecting the devices takes up to half of it."""
+"""Timeout of a reply; reconnecting the devices takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
-"""Time for which a daemon that refuses or does not accept clients is tried again."""
+"""Time of repeated attempts to reach a daemon that has too many clients."""
 _STOP_PATIENCE_S = 10.0
 _STOP_ANSWER_S = 0.5
 _SIGNAL_AFTER_S = 0.3
 _END_PATIENCE_S = 3.0
-"""Time in which what a dead daemon has left ends by itself."""
+"""Time in which the other processes of a dead daemon end by themselves."""
 _PAUSE_S = 0.02
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _TIME = struct.Struct("@ll")
 UNKNOWN_STATE = (
     "A session may still be running: check the rig, and press the wired stop (STO) if "
@@ -50,9 +50,9 @@ class DaemonGoneError(FailureError):
     Parameters
     ----------
     message
-        Message as far as it is known without looking.
+        Message that needs no further examination.
     lost
-        Process and user of a daemon whose connection was lost.
+        Process and user of a daemon whose connection was lost; None: the message is complete.
     """
 
     def __init__(self, message: str, lost: tuple[int, int] | None = None) -> None:
@@ -60,20 +60,19 @@ class DaemonGoneError(FailureError):
         self._lost = lost
 
     def told(self) -> str:
-        """Say what there still is of a daemon that was lost, which takes up to 3 s to see."""
-        return str(self) if self._lost is None else what_is_left(*self._lost)
+        """Return the message; for a lost daemon, after up to 3 s, with what still runs."""
+        return str(self) if self._lost is None else describe_remains(*self._lost)
 
 
 class RefusedByDaemonError(RigdError):
-    """The daemon refuses a request, or it failed; the message is the daemon's.
+    """The daemon refused a request, or the request failed; the message is the daemon's.
 
     Parameters
     ----------
     message
         Reason that the daemon gives, for the operator.
     wrong_use
-        The request itself has to be another (exit code 2); otherwise the same one may succeed
-        later.
+        Whether the request itself must change (exit code 2); otherwise it may succeed later.
     """
 
     def __init__(self, message: str, *, wrong_use: bool) -> None:
@@ -89,9 +88,9 @@ class Client:
     path
         Path of the socket.
     connect_s
-        Time for a daemon that takes no connections, being suspended or overloaded by other clients.
+        Time to connect: the daemon may be suspended, or overloaded by other clients.
     answer_s
-        Time for a reply.
+        Time to receive a reply.
 
     Attributes
     ----------
@@ -149,14 +148,14 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Let the daemon go; what was started goes on."""
+        """Close the connection; sessions continue."""
         self._link.close()
 
     def ask(self, command: str, **fields: object) -> Document:
-        """Send a request and wait for its reply; events that come meanwhile are kept.
+        """Send a request and return its reply; events that arrive meanwhile are stored.
 
-        A daemon that has turned this client away, because there were too many, is asked again: it
-        has not obeyed then.
+        If the daemon refuses the client because there are too many, the request was not executed,
+        and is repeated.
 
         Parameters
         ----------
@@ -175,17 +174,17 @@ class Client:
         RefusedByDaemonError
             If the reply is a refusal.
         DaemonGoneError
-            If there is none.
+            If there is no reply.
         """
         return self.ask_unless(lambda: False, command, **fields)
 
     def ask_unless(self, stopped: Callable[[], bool], command: str, **fields: object) -> Document:
-        """Ask as :meth:`ask` does, and cancel the request once a stop is wanted.
+        """Send a request as :meth:`ask` does, and cancel it if a stop is requested.
 
         Parameters
         ----------
         stopped
-            Whether a stop is wanted; asked some times a second until there is a reply.
+            Returns whether a stop is requested; polled until there is a reply.
         command
             A request of docs/control_socket.md that a `stop` cancels.
         **fields
@@ -194,7 +193,7 @@ class Client:
         Returns
         -------
         dict
-            The reply, or that to the `stop` (``reply`` says which): the request is cancelled then.
+            Reply to the request, or to the `stop` that cancelled it (``reply`` says which).
 
         Raises
         ------
@@ -222,11 +221,11 @@ class Client:
         deadline_s = time.monotonic() + self._answer_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             if stopped() and not stopping:
-                # On this connection: on another one it might be obeyed before the request.
+                # On this connection: on another one the stop might be executed before the request.
                 self.send("stop")
                 stopping = True
                 deadline_s = min(deadline_s, time.monotonic() + _STOP_PATIENCE_S)
-            message = self._next(min(left_s, _LOOK_S))
+            message = self._next(min(left_s, _POLL_S))
             if message is None:
                 continue
             if "event" in message:
@@ -260,8 +259,8 @@ class Client:
             self._link.settimeout(_ANSWER_PATIENCE_S)
             self._link.sendall(line)
         except OSError:
-            # It may have said why before it left.
-            self._raise_what_was_said()
+            # The daemon may have sent the reason before it closed.
+            self._raise_refusal()
             raise self._gone() from None
 
     def event(self, timeout_s: float) -> Document | None:
@@ -296,7 +295,7 @@ class Client:
             raise DaemonGoneError("The process on the socket is not a daemon of this version.")
         return message
 
-    def _raise_what_was_said(self) -> None:
+    def _raise_refusal(self) -> None:
         try:
             while (message := self._next(0.1)) is not None:
                 if "error" in message:
@@ -311,7 +310,7 @@ class Client:
 
 
 class _CrowdedError(RefusedByDaemonError):
-    """The daemon has not obeyed, because there were too many clients."""
+    """The daemon did not execute the request, because there were too many clients."""
 
 
 def _refusal(message: Document) -> RefusedByDaemonError:
@@ -323,7 +322,7 @@ def _refusal(message: Document) -> RefusedByDaemonError:
 
 
 def stop_session(path: Path) -> Document:
-    """Have a daemon stop what it runs; asks again and again, then sends its process a signal.
+    """Stop the session of a daemon: repeat the request, then send its process a signal.
 
     Parameters
     ----------
@@ -333,15 +332,15 @@ def stop_session(path: Path) -> Document:
     Returns
     -------
     dict
-        Its reply; ``signalled``: whether its process was sent the signal before, so that what ran
-        may have ended before it replied; ``peer``: process and user that replied.
+        The reply, with ``signalled``: whether the signal was sent before, so that the session may
+        have ended before the reply; and ``peer``: process and user that replied.
 
     Raises
     ------
     RefusedByDaemonError
         If it refuses.
     DaemonGoneError
-        If it has not said for 10 s that it stops; the message tells what was done and seen.
+        If it has not confirmed the stop for 10 s; the message states what was done and found.
     """
     began_s = time.monotonic()
     seen: tuple[int, int] | None = None
@@ -368,14 +367,14 @@ def stop_session(path: Path) -> Document:
         raise DaemonGoneError(failure, seen)
     raise DaemonGoneError(
         f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
-        f"has said nothing for {waited_s:.0f} s. {UNKNOWN_STATE}"
+        f"has not replied for {waited_s:.0f} s. {UNKNOWN_STATE}"
     )
 
 
 def await_end(
     path: Path, patience_s: float, peer: tuple[int, int] | None = None
 ) -> Document | None:
-    """Wait until a daemon says that no session runs.
+    """Wait until a daemon reports that no session runs.
 
     Parameters
     ----------
@@ -384,18 +383,17 @@ def await_end(
     patience_s
         Longest wait.
     peer
-        Process and user that have to answer there; None: any.
+        Process and user that must reply; None: any.
 
     Returns
     -------
     dict or None
-        Its status then; None if it has not said so in that time: it still stops one, or a crowd
-        keeps this client out.
+        Final status; None if the session has not ended in time, or too many clients block this one.
 
     Raises
     ------
     RefusedByDaemonError, DaemonGoneError
-        If it cannot be asked any more.
+        If the daemon no longer replies.
     """
     deadline_s = time.monotonic() + patience_s
     with Client(path, answer_s=patience_s) as client:
@@ -407,7 +405,7 @@ def await_end(
             except _CrowdedError:
                 return None
             series = status["series"]
-            # A stop that comes while a session is planned is obeyed after that, before it begins.
+            # A stop during planning takes effect after it, before the session begins.
             if status["state"] not in ("running", "stopping") and (
                 series is None
                 or not series["running"]
@@ -419,13 +417,13 @@ def await_end(
             time.sleep(_PAUSE_S)
 
 
-def what_is_left(pid: int, uid: int) -> str:
-    """Say what there still is of a daemon that does not answer, after looking for some seconds.
+def describe_remains(pid: int, uid: int) -> str:
+    """Return which processes of an unresponsive daemon still run, after some seconds.
 
     Parameters
     ----------
     pid, uid
-        Process and user of the daemon.
+        Process id and user id of the daemon.
     """
     deadline_s = time.monotonic() + _END_PATIENCE_S
     while True:
@@ -454,20 +452,20 @@ def what_is_left(pid: int, uid: int) -> str:
 
 
 def _is_there(pid: int) -> bool:
-    """Whether a process of that number runs, be it another user's."""
+    """Return whether a process with that id runs, of any user."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    with suppress(OSError, IndexError):  # dead, and not yet buried by its parent
+    with suppress(OSError, IndexError):  # a zombie, which its parent has not reaped yet
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True
 
 
 def _sees_other_users() -> bool:
-    """Whether the system shows the processes of other users (mount option hidepid of /proc)."""
+    """Return whether /proc shows the processes of other users (mount option hidepid)."""
     try:
         return bool(Path("/proc/1/cmdline").read_bytes())
     except OSError:
@@ -475,7 +473,7 @@ def _sees_other_users() -> bool:
 
 
 def _control_processes(pid: int) -> list[int]:
-    """Return the control processes of a supervisor: its number is their only argument."""
+    """Return the control processes of a supervisor, whose only argument is its process id."""
     from rigd.engine import supervisor_of_control
 
     with suppress(OSError):
@@ -488,7 +486,7 @@ def _control_processes(pid: int) -> list[int]:
 
 
 def _signal_stop(pid: int) -> bool:
-    """Send the daemon its signal, if it is one that handles it: others would die of it."""
+    """Send the stop signal to a process that handles it; it would kill others."""
     process = read_process(pid)
     if process is None or not process.handles(STOP_SIGNAL):
         return False
@@ -510,18 +508,18 @@ def find_views(rig: str | None) -> list[LiveAddress]:
     own = running_views()
     views = [view for view in own if rig in (None, view.rig)]
     if not views:
-        # The runtime folder of a daemon that belongs to somebody else cannot be looked into.
-        told = (_of_daemon(path) for path in running())
-        views = [view for view in told if view is not None and rig in (None, view.rig)]
+        # The runtime folder of another user's daemon is not readable.
+        found = (_of_daemon(path) for path in running())
+        views = [view for view in found if view is not None and rig in (None, view.rig)]
     return views
 
 
 def daemons() -> dict[str, bool]:
-    """Return the rigs that a daemon owns, and whether it was asked for a live view."""
-    told = (_status(path) for path in running())
+    """Return the rigs with a daemon, and for each whether the daemon has a live view."""
+    found = (_status(path) for path in running())
     return {
         status["daemon"]["profile"]: status["daemon"]["live"]
-        for status in told
+        for status in found
         if status is not None
     }
 

@@ -1,10 +1,10 @@
-"""Names by which the process table shows a control process, and what it does; quick to import."""
+"""Names of a control process in the process table, by its activity; quick to import."""
 
 from collections.abc import Sequence
 from typing import Final
 
 CONTROL_MODULE: Final = "rigd.engine.control_process"
-"""Run as ``python -m CONTROL_MODULE NUMBER``, with the number of its supervisor."""
+"""Run as ``python -m CONTROL_MODULE PID``, with the process id of its supervisor."""
 
 CONNECTING_NAME: Final = "rigd connecting"
 """Short name of the process before its devices are connected."""
@@ -15,12 +15,12 @@ SESSION_NAME: Final = "rigd session"
 
 
 def supervisor_of_control(command: Sequence[str]) -> int | None:
-    """Return the number of the supervisor of a control process, by the command line of the latter.
+    """Return the process id of a control process's supervisor, from its command line.
 
     Parameters
     ----------
     command
-        Command line of any process; None is returned if it is no control process.
+        Command line of any process. If it is no control process, the result is None.
     """
     if tuple(command[-3:-1]) != ("-m", CONTROL_MODULE) or not command[-1].isdecimal():
         return None

@@ -1,7 +1,7 @@
 """Sequence of a probing move: tare, enable, strokes, disable.
 
-It runs through the cycle of a session, with its interlocks, stops and watchdogs; only the
-controller is another one, and there is no record.
+It uses the cycle of a session, with its interlocks, stops and watchdogs, but another controller,
+and records nothing.
 """
 
 from typing import TYPE_CHECKING, Any, cast
@@ -48,19 +48,20 @@ class ProbeSequence(SessionSequence):
         self._last_tick = 0
 
     def move(self) -> dict[str, Any]:
-        """Make the strokes; the drive has just been enabled, and is off when this returns.
+        """Make the strokes with an enabled drive, which is off afterwards.
 
         Returns
         -------
         dict
-            ``end``: why it ended, and the fields of a `rigd.safety.probe_estimate.ProbeEstimate`.
+            ``end``: reason for the end; and the fields of a
+            `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------
         SessionEnd
-            If it is stopped, or an interlock ends it.
+            If the operator or an interlock ends it.
         """
-        self._board[Word.PHASE] = Phase.PROBING
+        self._shared_state[Word.PHASE] = Phase.PROBING
         self._standstill.forget()
         cycle = self._cycle
         start_rad = cycle.angle_rad

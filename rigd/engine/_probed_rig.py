@@ -1,11 +1,11 @@
-"""Data of a profile for its probing move; imports nothing heavy, for the supervisor uses it too."""
+"""Data of a profile for its probing move; quick to import, because the supervisor uses it too."""
 
 from rigd.profile import Profile
 from rigd.safety.probing_move import ProbedRig
 
 
 def probed_rig(profile: Profile) -> ProbedRig:
-    """Return the data of a profile that a probing move relies on.
+    """Return the data of a profile that a probing move needs.
 
     Parameters
     ----------

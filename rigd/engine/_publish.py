@@ -1,4 +1,4 @@
-"""Publishing of a tick's results: to the status (`Display`), and to recorder and live view."""
+"""Publication of a tick's results: to the shared state (`Display`), recorder and live view."""
 
 import time
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from rigd.session.layout import Status, pack_control_into, pack_sample_into, pac
 
 
 class Display:
-    """Writes the control process's words on the board several times a second.
+    """Publisher of the control process's readings in the shared state, several times a second.
 
     Parameters
     ----------
-    board
-        SharedState to write to.
+    shared_state
+        State to write to.
     devices
         Devices whose line health it reports.
 
     Attributes
     ----------
     doubts
-        About the age of the readings, as of the last call of `show`, for the operator.
+        Doubts about the age of the readings at the last call of `show`, for the operator.
     doubt_counts
-        How much of it there has been so far, likewise.
+        Summaries of these doubts since the devices were connected.
     """
 
-    def __init__(self, board: SharedState, devices: Devices) -> None:
-        self._board = board
+    def __init__(self, shared_state: SharedState, devices: Devices) -> None:
+        self._shared_state = shared_state
         self._devices = devices
         self.doubts: list[str] = []
         self.doubt_counts: list[str] = []
@@ -47,41 +47,41 @@ class Display:
         cycle
             Cycle with the last readings.
         now_ns
-            Time on the engine's clock: a line's load is taken from one call to the next.
+            Time of the engine's clock. The load of a line is the mean since the call before.
         """
-        board = self._board
-        board.beat(Word.CONTROL_BEAT)
-        for word, value in (
+        shared_state = self._shared_state
+        shared_state.beat(Word.CONTROL_BEAT)
+        for field, value in (
             (Word.ANGLE_NRAD, cycle.angle_rad),
             (Word.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
             (Word.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
         ):
             if isfinite(value):
-                board[word] = round(value * 1e9)
+                shared_state[field] = round(value * 1e9)
         drive, sensor = self._devices.drive.health(), self._devices.sensor.health()
         self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
         self.doubt_counts = [line.doubt_count for line in (drive, sensor) if line.doubt_count]
         known = [line.errors for line in (drive, sensor) if line.errors is not None]
-        board[Word.BUS_ERRORS] = sum(known) if known else UNKNOWN
-        board[Word.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
+        shared_state[Word.BUS_ERRORS] = sum(known) if known else UNKNOWN
+        shared_state[Word.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
         self._show_load((drive, sensor), now_ns)
 
     def _show_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
-        """Show the load of the busiest line since the last call."""
+        """Publish the load of the busiest line since the last call."""
         bits = tuple(line.bits or 0 for line in lines)
         if self._before is None:
-            self._board[Word.BUS_LOAD_PPM] = UNKNOWN
+            self._shared_state[Word.BUS_LOAD_PPM] = UNKNOWN
         else:
             then_ns, before = self._before
             if now_ns <= then_ns:
-                return  # virtual time stands still
+                return  # virtual time has not advanced
             per_ppm = 1e-15 * (now_ns - then_ns)  # 1e-9 s, 1e-6
             loads = [
                 (now - then) / (line.bit_rate_bit_s * per_ppm)
                 for line, now, then in zip(lines, bits, before, strict=True)
                 if line.bit_rate_bit_s
             ]
-            self._board[Word.BUS_LOAD_PPM] = round(max(loads)) if loads else UNKNOWN
+            self._shared_state[Word.BUS_LOAD_PPM] = round(max(loads)) if loads else UNKNOWN
         self._before = now_ns, bits
 
 
@@ -116,21 +116,21 @@ class Counts:
 
 
 class SampleLog:
-    """Writes sample and ages for each tick, and the controller's terms for every tenth.
+    """Log of a record: sample and ages of each tick, controller terms of every tenth tick.
 
     Parameters
     ----------
     cycle, metronome, clock
         Sources of a sample's content.
     channels
-        Channels that it writes to.
+        Channels to write to.
     late_ns
         Lateness above which a tick is flagged as late.
 
     Attributes
     ----------
     counts
-        Ticks that were late, readings that were stale and samples that were lost are counted here.
+        Numbers of late ticks, stale readings and lost samples.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class SampleLog:
         self._terms_ring = channels.controls
         # Under the virtual clock no reading has an age.
         self._timing_ring = None if clock.virtual else channels.timings
-        self._board = channels.board
+        self._shared_state = channels.board
         self._late_ns = late_ns
         self.counts = Counts()
 
@@ -165,8 +165,8 @@ class SampleLog:
         missed
             Ticks that were missed right before it.
         wait
-            Wait for room in the ring, because nothing moves or time stands still; otherwise a
-            sample that finds none is lost.
+            Wait for room in the ring, if nothing moves or time is virtual. Otherwise a sample
+            without room is lost.
         """
         cycle, metronome, ring = self._cycle, self._metronome, self._ring
         lateness_ns = metronome.lateness_ns
@@ -178,12 +178,12 @@ class SampleLog:
         offset = ring.slot()
         if offset < 0 and (not wait or (offset := self._wait_for_room()) < 0):
             self.counts.lost += 1
-            self._board[Word.LOST] = self.counts.lost
+            self._shared_state[Word.LOST] = self.counts.lost
             return
         if lateness_ns > self._late_ns:
             flags |= _LATE
             self.counts.late += 1
-            self._board[Word.LATE] = self.counts.late
+            self._shared_state[Word.LATE] = self.counts.late
         if flags & _STALE:
             self._count_stale(flags)
         t_ns = metronome.t_ns
@@ -214,18 +214,18 @@ class SampleLog:
             self._write_terms(tick, t_ns)
 
     def _count_stale(self, flags: int) -> None:
-        counts, board = self.counts, self._board
+        counts, shared_state = self.counts, self._shared_state
         if flags & _ANGLE_STALE:
             counts.stale_angles += 1
-            board[Word.STALE_ANGLES] = counts.stale_angles
+            shared_state[Word.STALE_ANGLES] = counts.stale_angles
         if flags & _WRENCH_STALE:
             counts.stale_wrenches += 1
-            board[Word.STALE_WRENCHES] = counts.stale_wrenches
+            shared_state[Word.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
         offset = ring.slot()
         if offset < 0:
-            return  # As with the terms.
+            return  # dropped, like the terms
         due_ns, devices = self._metronome.due_ns, self._cycle.devices
         pack_timing_into(
             ring.buffer,
@@ -241,7 +241,7 @@ class SampleLog:
         ring, terms = self._terms_ring, self._cycle.controller
         offset = ring.slot()
         if offset < 0:
-            return  # The terms explain a record; they are not what it stands on.
+            return  # dropped: the terms explain a record, but no analysis needs them
         pack_control_into(
             ring.buffer,
             offset,
@@ -257,7 +257,7 @@ class SampleLog:
         ring.publish()
 
     def _wait_for_room(self) -> int:
-        """Wait for the recorder, unless it has not read for long while the computer ran."""
+        """Return the next offset once the recorder makes room, or -1 if it stopped reading."""
         ring, recorder = self._ring, Pulse()
         while (offset := ring.slot()) < 0:
             if recorder.look(ring.read, time.monotonic()) > _ROOM_PATIENCE_S:

@@ -3,14 +3,13 @@
 A ring has one producer (the control loop), one consumer that must get everything (the recorder),
 and any number of observers that may miss records but never delay the writer (the live publisher).
 
-The memory is an unlinked temporary file handed to children by file descriptor: nothing with a
-name is left behind, however a process ends.
+The memory is an unlinked temporary file that children inherit by file descriptor. However a process
+ends, no named file remains.
 
-The two counters in a ring's header only ever grow and are written by one side each, as aligned
-64-bit words: a record is in place before the counter that announces it. That order is what the
-processor keeps on x86-64; on a weaker memory model the interpreter's own work between the two
-stores is all that separates them, and a reader's own check of the record (tags, consecutive ticks)
-is the guard.
+The two counters in a ring's header only increase. Each is an aligned 64-bit word with one writer,
+and a record is written before the counter that announces it. x86-64 processors preserve this order
+of stores. On a weaker memory model only the interpreter's work lies between the two stores, so
+readers check the records themselves (tags, consecutive ticks).
 """
 
 import mmap
@@ -26,7 +25,7 @@ _WRITTEN, _READ = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class RingSpec:
-    """What a child needs to attach to a ring: an inherited descriptor and the layout."""
+    """Inherited descriptor and layout, with which a child attaches to a ring."""
 
     fd: int
     record_size: int
@@ -39,7 +38,7 @@ class Ring:
     Parameters
     ----------
     spec
-        Descriptor of the memory and its layout; :meth:`create` makes a new one.
+        Descriptor of the memory and its layout; :meth:`create` makes a new ring.
     """
 
     def __init__(self, spec: RingSpec) -> None:
@@ -69,44 +68,44 @@ class Ring:
 
     @property
     def written(self) -> int:
-        """Records written since the ring was made."""
+        """Number of records written since the ring was created."""
         return self._counters[_WRITTEN]
 
     @property
     def read(self) -> int:
-        """Records the consumer has released."""
+        """Number of records that the consumer has released."""
         return self._counters[_READ]
 
     @property
     def waiting(self) -> int:
-        """Records that the consumer has yet to take."""
+        """Number of records that wait for the consumer."""
         return self._counters[_WRITTEN] - self._counters[_READ]
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest record that an observer reads, negative in a ring that is new.
+        """Number of the oldest record that an observer reads; negative in a new ring.
 
-        Half the ring is left as a margin for records that are written during the copy.
+        Half of the ring is a margin for records that are written during the copy.
         """
         return self._counters[_WRITTEN] - self.capacity // 2
 
     # Producer
 
     def slot(self) -> int:
-        """Offset in :attr:`buffer` where the next record goes, or -1 where the ring is full."""
+        """Return the offset of the next record in :attr:`buffer`, or -1 if the ring is full."""
         if self._next - self._counters[_READ] >= self.capacity:
             return -1
         return HEADER_SIZE + self._next % self.capacity * self.record_size
 
     def publish(self) -> None:
-        """Announce the record just placed at :meth:`slot`."""
+        """Announce the record just written at :meth:`slot`."""
         self._next += 1
         self._counters[_WRITTEN] = self._next
 
     # Consumer
 
     def take(self, most: int) -> bytes:
-        """Copy out and release up to ``most`` records, as far as they lie in one piece."""
+        """Return and release up to ``most`` records that are contiguous in memory."""
         first = self._counters[_READ]
         count = min(most, self._counters[_WRITTEN] - first, self.capacity - first % self.capacity)
         start = HEADER_SIZE + first % self.capacity * self.record_size
@@ -115,7 +114,7 @@ class Ring:
         return block
 
     def discard(self) -> None:
-        """Release all records unseen; for a consumer that starts over."""
+        """Release all records unread, for a consumer that starts again."""
         self._counters[_READ] = self._counters[_WRITTEN]
 
     def close(self) -> None:
@@ -126,14 +125,14 @@ class Ring:
 
 
 class Observer:
-    """A reader that never holds the producer up: what was overwritten before it came is counted.
+    """A reader that never delays the producer, and counts the records that it missed.
 
     Parameters
     ----------
     ring
-        Ring whose records it sees from now on.
+        Ring to read.
     first
-        Number of the first record to see, counted since the ring was made, if not from now on.
+        Number of the first record to read, counted since the ring was created; None: the next one.
 
     Attributes
     ----------
@@ -148,23 +147,23 @@ class Observer:
 
     @property
     def next(self) -> int:
-        """Number of the next record, counted like `first`."""
+        """Number of the next record, counted as `first` is."""
         return self._cursor
 
     def take(self, most: int) -> bytes:
-        """Copy out up to ``most`` of the records not yet seen, oldest first."""
+        """Return up to ``most`` unread records, oldest first."""
         ring = self._ring
         oldest = ring.oldest
         if self._cursor < oldest:
             self.dropped += oldest - self._cursor
             self._cursor = oldest
-        place = self._cursor % ring.capacity
-        count = min(most, ring.written - self._cursor, ring.capacity - place)
-        start = HEADER_SIZE + place * ring.record_size
+        index = self._cursor % ring.capacity
+        count = min(most, ring.written - self._cursor, ring.capacity - index)
+        start = HEADER_SIZE + index * ring.record_size
         block = bytes(ring.buffer[start : start + count * ring.record_size])
         self._cursor += count
         if ring.written - (self._cursor - count) >= ring.capacity:
-            # The producer lapped the copy: none of it can be trusted.
+            # The producer overtook the copy: none of it is reliable.
             self.dropped += count
             return b""
         return block
@@ -183,12 +182,12 @@ def shared_memory_fd() -> int:
 
 
 def reserve(fd: int, size: int) -> None:
-    """Give shared memory its size, all of it at once.
+    """Allocate shared memory.
 
     Raises
     ------
     OSError
-        If there is not enough: better now than as a bus error when it is written to.
+        If there is not enough memory; without this, writing to it would raise a bus error.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(fd, 0, size)

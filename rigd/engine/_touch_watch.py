@@ -1,4 +1,4 @@
-"""Watch for a touch in the control loop: after each tick of a search, and what follows at once."""
+"""Detection of a touch in the control loop, and the immediate reaction to it."""
 
 from dataclasses import dataclass
 
@@ -12,35 +12,35 @@ _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
 _TOUCHED = int(Status.TOUCHED)
 _HARD_TICKS = 2
-"""Ticks in a row with too great a force: one alone may be a disturbed reading."""
+"""Consecutive ticks with an excessive force: a single one may be a disturbed reading."""
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
-    """Contact that the loop has detected."""
+class DetectedContact:
+    """A contact that the loop has detected."""
 
     message: str
     """Sentence for the operator."""
     ends: str = ""
-    """Outcome with which the session ends at once; empty: it goes on."""
+    """Outcome with which the session ends at once; empty: it continues."""
     detected: bool = True
-    """It is a touch by the detector's judgement, and marked so in its sample."""
+    """Whether the detector found a touch, which is then marked in its sample."""
 
 
 class TouchWatch:
-    """Follows a search, and reacts to a touch.
+    """Detector of touches in a search, with the reaction to a touch.
 
-    On the way out, and in the pause after it, a touch makes the motor brake, stay and go back
-    to where the pass began. On the way back there is nowhere to go: the session is stopped.
+    On the way out and in the pause after it, the motor brakes, waits, and returns to the start of
+    the pass. On the way back the motor cannot avoid the obstacle, so the session is stopped.
 
     Parameters
     ----------
     order
-        The obstacle to look for.
+        Description of the search.
     cycle
-        Work of a tick, with the readings of the last.
+        Cycle with the readings of the last tick.
     reference_rad
-        Reference of the session, relative to its start; what follows a touch is written to it.
+        Reference of the session, relative to its start. The reaction to a touch is written to it.
     rate_hz
         Ticks a second.
     """
@@ -59,8 +59,8 @@ class TouchWatch:
         self._arms = self._pass.begins
         self._hard = 0
 
-    def step(self, tick: int, missed: int) -> Contact | None:
-        """Look at the tick that was just run.
+    def step(self, tick: int, missed: int) -> DetectedContact | None:
+        """Check the tick that was just run, and return the contact if there is one.
 
         Parameters
         ----------
@@ -95,14 +95,14 @@ class TouchWatch:
             return too_hard
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:
-            return Contact(
+            return DetectedContact(
                 "The beam met something on its way back. Find what stands in its way.", "stopped"
             )
         self._react(tick)
-        return Contact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
+        return DetectedContact(f"Touch detected at {tick / self._rate_hz:.3f} s.")
 
     def _react(self, tick: int) -> None:
-        """Write the rest of the pass anew."""
+        """Replace the remainder of the pass in the reference."""
         reference, current = self._reference_rad, self._pass
         self._detector.disarm()
         recent = reference[max(tick - 2, 0)], reference[max(tick - 1, 0)], reference[tick]
@@ -110,7 +110,7 @@ class TouchWatch:
         path = after_touch(self._approach, current.ends, tick, recent, start_rad)
         reference[tick + 1 : current.ends] = memoryview(path)  # type: ignore[arg-type] # numpy's stubs
 
-    def _too_hard(self, shear_n: float) -> Contact | None:
+    def _too_hard(self, shear_n: float) -> DetectedContact | None:
         if self._projection is None:
             return None
         force_n = abs(self._detector.contact_force_n(shear_n))
@@ -118,7 +118,7 @@ class TouchWatch:
         self._hard = self._hard + 1 if force_n > limit_n else 0
         if self._hard < _HARD_TICKS:
             return None
-        return Contact(
+        return DetectedContact(
             f"Contact force {force_n:.3g} N exceeds force_limit_n = {limit_n:g} N. Choose a lower "
             "speed, or a higher limit.",
             "fault",

@@ -1,7 +1,7 @@
-"""What the control process publishes, and the memory that a rig's processes share.
+"""Topics that the control process publishes, and the shared memory of a rig's processes.
 
-One table, `TOPICS`, from which the shared memory is laid out, by which the recorder logs, and with
-which ``rigd status`` compares the rates it sees.
+The table `TOPICS` determines the layout of the shared memory, the channels that the recorder logs,
+and the rates that ``rigd status`` expects.
 """
 
 from collections.abc import Sequence
@@ -16,28 +16,28 @@ from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 # Topics
 
 HURRIED_BUFFERED_S = 160.0
-"""What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
-second, and who only looks on lags."""
+"""Time that the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session takes
+about a second, and observers lag behind."""
 _EVENTS = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One kind of record, and its way."""
+    """One kind of record, and the processes that read it."""
 
     name: str
-    """Its channel in the file."""
+    """Name of its channel in the file."""
     record_size: int
-    """Bytes."""
+    """Size of a record in bytes."""
     every: int
-    """Ticks of the record from one to the next; 0: whenever there is something to say."""
+    """Period in ticks of the record; 0: irregular."""
     logged: bool
-    """The recorder writes each of them into the file."""
+    """Whether the recorder writes each record to the file."""
     live: bool
-    """The live publisher looks at them, as far as it can keep up."""
+    """Whether the live publisher reads them, and drops what it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
-        """Return how many records its ring holds.
+        """Return the number of records that the ring holds.
 
         Parameters
         ----------
@@ -49,7 +49,7 @@ class Topic:
         return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
-        """Return the records a second of a recorded session; None where the rate is not fixed."""
+        """Return the records per second of a recorded session; None if the rate is not fixed."""
         return rate_hz / self.every if self.every else None
 
 
@@ -59,7 +59,7 @@ TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True)
 SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
-"""The samples last: what explains a sample is in the file no later than the sample."""
+"""Topics in the order of logging: the samples last, so that what explains a sample precedes it."""
 
 
 # Memory of a rig
@@ -70,17 +70,17 @@ DESCRIPTORS = len(TOPICS) + 2
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpecs:
-    """What a child process needs to attach."""
+    """Descriptors and layout that a child process needs to attach."""
 
     rings: tuple[RingSpec, ...]
     """All rings, in the order of :data:`TOPICS`."""
-    board_fd: int
-    """Descriptor of the board's memory."""
+    shared_state_fd: int
+    """Descriptor of the memory of the shared state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The rings, in the order of :data:`TOPICS`, and the board."""
+    """The rings, in the order of :data:`TOPICS`, and the shared state."""
 
     events: Ring
     """Lines of the log."""
@@ -93,7 +93,7 @@ class Channels:
     board: SharedState
     """State that every process can read."""
     reference_fd: int = -1
-    """Where the supervisor places the reference of a session."""
+    """Descriptor of the memory for the reference of a session."""
 
     @property
     def rings(self) -> tuple[Ring, ...]:
@@ -106,12 +106,12 @@ class Channels:
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
 
     def ask_to_stop(self) -> None:
-        """Ask the control process to stop, unless that was done before."""
+        """Request a stop of the control process, unless a stop was requested before."""
         if self.board[Word.STOP] == Stop.NO:
             self.board[Word.STOP] = Stop.OPERATOR
 
     def clear(self) -> None:
-        """Forget what the last session left; only while no recorder is running."""
+        """Discard the records of the last session; only while no recorder runs."""
         for ring in self.rings:
             ring.discard()
 
@@ -130,23 +130,23 @@ def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFF
     rate_hz
         Ticks a second.
     fds
-        Descriptors, as many as `TOPICS` and one for the board.
+        Descriptors, as many as `DESCRIPTORS`: for the rings, the shared state and the reference.
     buffered_s
         Time that the rings hold.
     """
-    *for_rings, for_board, for_reference = fds
+    *for_rings, for_shared_state, for_reference = fds
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
         for topic, fd in zip(TOPICS, for_rings, strict=True)
     ]
-    return _together(rings, SharedState.create(for_board), for_reference)
+    return _together(rings, SharedState.create(for_shared_state), for_reference)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
-    """Attach in a child process to what the supervisor made."""
-    return _together([Ring(spec) for spec in specs.rings], SharedState(specs.board_fd))
+    """Return the channels that the supervisor created, attached in a child process."""
+    return _together([Ring(spec) for spec in specs.rings], SharedState(specs.shared_state_fd))
 
 
-def _together(rings: Sequence[Ring], board: SharedState, reference_fd: int = -1) -> Channels:
+def _together(rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1) -> Channels:
     events, controls, timings, samples = rings
-    return Channels(events, controls, timings, samples, board, reference_fd)
+    return Channels(events, controls, timings, samples, shared_state, reference_fd)

@@ -1,8 +1,8 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on.
 
-It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
-the supervisor requests, one after the other. A device that fails ends it: reconnecting is the
-operator's decision.
+It connects the devices, observes them at the rig's rate with the torque off, and runs the sessions
+that the supervisor requests, one after the other. It ends when a device fails: the operator decides
+when to reconnect.
 """
 
 import gc
@@ -55,8 +55,8 @@ _SILENCE_S = 1.0
 """Time for which a device may be silent between sessions."""
 _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
-_TAKE_UP_TICKS = 2
-"""Ticks after which the motor's angle is known, and that it is at rest."""
+_STANDSTILL_TICKS = 2
+"""Ticks after which the motor's angle and speed are known."""
 
 
 def main() -> None:
@@ -77,10 +77,10 @@ def main() -> None:
         parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    attend(job.profile, devices, clock, channels, parent, stop, obtained)
+    run_control(job.profile, devices, clock, channels, parent, stop, obtained)
 
 
-def attend(
+def run_control(
     profile: Profile,
     devices: Devices,
     clock: Clock,
@@ -89,29 +89,29 @@ def attend(
     stop: StopRequest,
     obtained: dict[str, str],
 ) -> None:
-    """Own `devices` from connecting to closing, whatever happens, and say last why it ended.
+    """Connect the devices, serve the supervisor, and close the devices whatever happens.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     devices
-        Not yet connected.
+        Devices, not yet connected.
     clock, channels, parent, stop
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
     obtained
-        The real-time settings that were granted, for the file.
+        Real-time settings that were granted, for the file.
     """
     failure = ""
     name_this_process(CONNECTING_NAME)
     try:
-        # The drive last: once it is operational it expects a SYNC every period.
+        # The drive last: an operational drive expects a SYNC every period.
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        attendance = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
+        server = _ControlServer(profile, devices, clock, channels, parent, stop, obtained)
         channels.board[Word.PHASE] = Phase.OFF
-        attendance.take_up_standstill()
+        server.observe_standstill()
         name_this_process(IDLE_NAME)
         parent.send(
             Connected(
@@ -121,7 +121,7 @@ def attend(
                 simulated=devices.simulated,
             )
         )
-        attendance.serve()
+        server.serve()
     except (DeviceError, OSError) as error:
         failure = str(error)
     finally:
@@ -133,7 +133,7 @@ def attend(
 
 
 class _ControlServer:
-    """Connected devices, and the requests of the supervisor."""
+    """Server of the supervisor's requests, with connected devices."""
 
     def __init__(
         self,
@@ -150,41 +150,41 @@ class _ControlServer:
         self._clock = clock
         self._metronome = TickScheduler(clock, profile.rig.rate_hz)
         self._channels = channels
-        self._board = channels.board
+        self._shared_state = channels.board
         self._parent = parent
         self._stop = stop
         self._obtained = obtained
         self._zero_rad = 0.0
         self._silent = 0
         self._on_lines = devices.on_lines
-        # A simulated motor is as cold as it was made.
+        # A simulated motor starts cold.
         warm = not devices.simulated
         self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)
         self._standstill = Standstill(profile)
         self._display = Display(channels.board, devices)
         self._cycle = self._make_cycle(profile)
 
-    def remember(self) -> None:
-        """Store the motor's heat for the next connection, at a time when nothing is urgent."""
+    def store_heat(self) -> None:
+        """Store the motor's heat for the next connection, when nothing is urgent."""
         if not self._devices.simulated:
             remember_heat(self._profile, self._watch.heat_nm2)
 
-    def take_up_standstill(self) -> None:
-        """Read where the motor stands, unless that is known: virtual time stands still from now on.
+    def observe_standstill(self) -> None:
+        """Read the motor's angle, unless it is known, because virtual time stops after this.
 
         Raises
         ------
         DeviceError, OSError
             If a device failed.
         """
-        for _ in range(_TAKE_UP_TICKS):
+        for _ in range(_STANDSTILL_TICKS):
             if not self._standstill.begun:
                 self._metronome.wait()
                 self._read_at_rest()
         self._show()
 
     def serve(self) -> None:
-        """Serve the supervisor until it is gone, or a stop is asked for between sessions.
+        """Serve the supervisor until it is gone, or a stop is requested between sessions.
 
         Raises
         ------
@@ -197,8 +197,8 @@ class _ControlServer:
                     try:
                         self._run_session(order)
                     finally:
-                        self.remember()
-                    self.take_up_standstill()
+                        self.store_heat()
+                    self.observe_standstill()
                     gc.collect()  # the torque is off: the only time for it
                 case Tare():
                     self._answer(self._tare)
@@ -206,12 +206,12 @@ class _ControlServer:
                     self._answer(self._zero)
                 case Probe():
                     self._probe(order.profile)
-                    self.take_up_standstill()
+                    self.observe_standstill()
 
     def _await_order(self) -> object | None:
-        """Observe with the torque off until there is something to do; None: nothing any more.
+        """Observe with the torque off and return the next order; None if no more will come.
 
-        Virtual time stands still meanwhile, but for a tick now and then where there are lines.
+        Virtual time does not advance meanwhile, except for occasional ticks with devices on lines.
         """
         seen_s = time.monotonic()
         while not self._stop.requested:
@@ -231,7 +231,7 @@ class _ControlServer:
         return None
 
     def _observe(self) -> None:
-        """Read the devices for some ticks, the torque off."""
+        """Read the devices for some ticks with the torque off."""
         cycle = self._cycle
         for _ in range(LOOK_EVERY):
             self._metronome.wait()
@@ -239,25 +239,25 @@ class _ControlServer:
             self._silent = self._silent + 1 if cycle.stale else 0
         if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
-                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; check that the device "
+                f"{cycle.stale_names} has not come for {_SILENCE_S:g} s; check that the device "
                 "is on and connected."
             )
 
     def _read_at_rest(self) -> None:
-        """Read the devices for one tick, the torque off."""
+        """Read the devices for one tick with the torque off."""
         self._cycle.observe(self._metronome.due_ns)
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
 
     def _run_session(self, job: SessionJob) -> None:
-        """Run one session to a disabled drive and a final message, whatever happens.
+        """Run one session; the drive ends disabled and a final message is sent, whatever happens.
 
         Raises
         ------
         DeviceError
-            If a device failed: the message has been sent all the same.
+            If a device failed; the message has been sent nevertheless.
         """
-        board, devices = self._board, self._devices
-        for word in (
+        shared_state, devices = self._shared_state, self._devices
+        for field in (
             Word.START_UTC_NS,
             Word.SCHEDULED,
             Word.MISSED,
@@ -270,7 +270,7 @@ class _ControlServer:
             Word.HELD_BEFORE,
             Word.BEGUN,
         ):
-            board[word] = 0
+            shared_state[field] = 0
         self._warn_of_refusals(job)
         self._log_accepted(job)
         cycle = self._cycle = self._make_cycle(job.profile)
@@ -280,9 +280,9 @@ class _ControlServer:
             from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
 
             touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
-        pieces = None
+        reader = None
         if job.reference.planned is not None:
-            pieces = PieceReader(reference, job.reference.planned, board)
+            reader = PieceReader(reference, job.reference.planned, shared_state)
         procedure = SessionSequence(
             job.profile,
             reference,
@@ -296,7 +296,7 @@ class _ControlServer:
             self._stop,
             job.ending,
             touch,
-            pieces,
+            reader,
         )
         outcome, reason = "complete", ""
         recorded = device_failed = False
@@ -304,7 +304,7 @@ class _ControlServer:
         try:
             seed = self._renew_noise(job)
             tare = procedure.tare()
-            devices.drive.enable(procedure.stop_asked)
+            devices.drive.enable(procedure.stop_requested)
             procedure.hold()
             self._parent.send(Ready(tare | seed))
             procedure.wait_for_go()
@@ -321,7 +321,7 @@ class _ControlServer:
         finally:
             devices.drive.disable()
             cycle.torque_off()
-            board[Word.PHASE] = Phase.OFF
+            shared_state[Word.PHASE] = Phase.OFF
             self._show()
         doubt = devices.drive.off_doubt
         if doubt:
@@ -330,7 +330,7 @@ class _ControlServer:
             name_this_process(IDLE_NAME)
         failure, fault = reason, outcome == "fault"
         if recorded and reason:
-            # What happens after the last tick does not make the record any less complete.
+            # Events after the last tick do not make the record incomplete.
             outcome, reason = "complete", f"After the record: {reason}"
         self._parent.send(
             Finished(
@@ -346,7 +346,7 @@ class _ControlServer:
             raise DeviceError(failure)
 
     def _renew_noise(self, job: SessionJob) -> dict[str, str]:
-        """Begin the noise of a simulated rig; return its seed as metadata.
+        """Restart the noise of a simulated rig; return its seed as metadata.
 
         Raises
         ------
@@ -357,7 +357,7 @@ class _ControlServer:
         return {} if renew is None else {"simulation_seed": str(renew(job.seed))}
 
     def _probe(self, profile: Profile) -> None:
-        """Make the probing move of a profile and report it; the drive ends disabled.
+        """Run the probing move of a profile and report its result; the drive ends disabled.
 
         Raises
         ------
@@ -383,7 +383,7 @@ class _ControlServer:
         name_this_process(SESSION_NAME)
         try:
             sequence.tare()
-            self._devices.drive.enable(sequence.stop_asked)
+            self._devices.drive.enable(sequence.stop_requested)
             answer = Measured(sequence.move())
         except SessionEnd as end:
             answer = Refused(end.reason)
@@ -391,7 +391,7 @@ class _ControlServer:
         finally:
             self._devices.drive.disable()
             cycle.torque_off()
-            self._board[Word.PHASE] = Phase.OFF
+            self._shared_state[Word.PHASE] = Phase.OFF
             self._show()
         failure = f"{failure} {self._devices.drive.off_doubt}".strip()
         if failure:
@@ -400,14 +400,14 @@ class _ControlServer:
         self._parent.send(answer)
 
     def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
-        """Do something at rest and tell what came out, or why it could not be done."""
+        """Send the result of a measurement at rest, or the reason why it was refused."""
         try:
             self._parent.send(Measured(measure()))
         except SessionEnd as end:
             self._parent.send(Refused(end.reason))
 
     def _tare(self) -> dict[str, object]:
-        """Average the sensor; each session does so for itself, this is for the operator's eyes."""
+        """Average the sensor for display; each session tares for itself."""
         self._cycle.sensor_watch.learn()
         rest = self._rest(self._profile.session.tare_s)
         failed = self._cycle.sensor_watch.judge()
@@ -422,7 +422,7 @@ class _ControlServer:
         }
 
     def _zero(self) -> dict[str, object]:
-        """Make the motor's present angle the rig's zero, to which its limits are relative.
+        """Set the rig's zero, from which its limits are measured, to the present angle.
 
         Raises
         ------
@@ -482,13 +482,13 @@ class _ControlServer:
 
     def _warn_of_refusals(self, job: SessionJob) -> None:
         own = {name: text for name, text in self._obtained.items() if text.startswith(REFUSED)}
-        for refused, what_follows in (
+        for refused, consequence in (
             (own, "more ticks will be late"),
             (job.refused, "a computer that is busy with other programs may end the session"),
         ):
             if refused:
                 names = ", ".join(f"{name} ({text})" for name, text in refused.items())
-                message = f"The system did not grant {names}: {what_follows}."
+                message = f"The system did not grant {names}: {consequence}."
                 write_event(self._channels.events, Event(0, "warning", message))
 
     def _log_accepted(self, job: SessionJob) -> None:

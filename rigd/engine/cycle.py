@@ -1,9 +1,9 @@
-"""One tick: read the devices, check the limits, control, command; and what is watched at rest.
+"""One tick: read the devices, check the limits, control, command; and the checks at rest.
 
-`Cycle` does the work of a tick. Readings without torque make the tare (`observe_rest`). The zero of
-the angle, and the limits with it, rest on the encoder's count: in a session `LimitWatch` checks
-every reading, before, between and after sessions `Standstill` does. While the torque is off a hand
-may turn the motor, but nothing makes it jump.
+`Cycle` does the work of a tick. Readings without torque give the tare (`observe_rest`). The zero of
+the angle, and with it the limits, depend on the encoder's count. `LimitWatch` checks every reading
+during a session, and `Standstill` before, between and after sessions. While the torque is off, a
+hand may turn the motor, but its angle cannot jump.
 """
 
 import json
@@ -46,21 +46,21 @@ _STALE_WRENCHES = tuple(BY_NAME[name].channel for name in ("stale wrench", "stal
 
 _RECENT_TICKS = 32
 _SPEED_TICKS = 4
-"""Ticks at either end of the recent ones over which the speed is taken."""
+"""Ticks at either end of the recent ticks over which the speed is computed."""
 _SURE_STEPS = 10
-"""Encoder steps within `_SPEED_TICKS` above which a speed is one, and not the encoder's noise."""
+"""Encoder steps within `_SPEED_TICKS` above which the speed exceeds the encoder's noise."""
 _GAIN = 0.2
-"""Part of the speed that has to be of these ticks: less says nothing about the torque in them."""
+"""Least fraction of the speed gained in these ticks: below it the torque explains little."""
 _AGAINST = 1 / 3, 3.0
-"""Acceleration against the torque, over the one that the torque should give: friction and a motor
-whose inertia is only assumed stay within."""
+"""Range of the ratio of the acceleration to the one opposite to the torque: it allows for friction
+and for an inertia that is only assumed."""
 
 
 # The encoder without torque
 
 
 class Standstill:
-    """Compares each angle that is read without torque with those before it.
+    """Check of each angle that is read without torque against the angles before it.
 
     From one tick to the next the speed may change by what ``limits.acceleration_rad_s2`` allows,
     as in the loop; over ticks that were missed the motor may move as fast as
@@ -82,14 +82,14 @@ class Standstill:
         self.forget()
 
     def forget(self) -> None:
-        """Start over with the next angle: the drive has been, or is being, controlled."""
+        """Start again with the next angle, because the drive is or was controlled."""
         self._angle_rad: float | None = None
         self._due_ns = 0
         self._moved: tuple[float, float] | None = None
 
     @property
     def begun(self) -> bool:
-        """Whether place and movement are known, with which the next angle is compared."""
+        """Whether angle and speed are known, against which the next angle is checked."""
         return self._moved is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
@@ -105,7 +105,7 @@ class Standstill:
         Raises
         ------
         DeviceError
-            If nothing turns a motor like that.
+            If no motor can turn like that.
         """
         before_rad, ticks = self._angle_rad, round((due_ns - self._due_ns) / self._period_ns)
         self._angle_rad, self._due_ns = angle_rad, due_ns
@@ -117,9 +117,9 @@ class Standstill:
             possible_rad = self._per_tick_rad * ticks + self._steps_rad
             jump_rad, key = moved_rad, "limits.velocity_rad_s"
         else:
-            # The movement before the first one is not known.
+            # The movement before the first is unknown.
             last_rad, before_that_rad = moved or (0.0, self._per_tick_rad)
-            # A latch may be late by most of a period, and the next one is not.
+            # One latch may be late by most of a period, and the next one punctual.
             possible_rad = (
                 self._per_tick2_rad + self._steps_rad + abs(last_rad) + abs(before_that_rad)
             )
@@ -137,7 +137,7 @@ class Standstill:
 
 
 class Cycle:
-    """The work of a tick, and what it left behind.
+    """The work of a tick, and its results.
 
     Parameters
     ----------
@@ -160,11 +160,11 @@ class Cycle:
         The last readings, the angle from the rig's zero; wrench and torque are tared, the raw
         wrench is not.
     torque_command_nm
-        The torque that stands, after the limits.
+        The present torque command, after the limits.
     flags
         Status bits of the last tick.
     encoder_watch
-        Comparison of the encoder with the torques; None: a probing move makes its own.
+        Check of the encoder against the torques; None: a probing move has its own.
     """
 
     def __init__(
@@ -221,12 +221,12 @@ class Cycle:
         self.flags = flags
 
     def step(self, due_ns: int, reference_rad: float) -> Violation | None:
-        """Do a whole tick; where a limit is violated the torque is off when this returns.
+        """Run one tick; if it returns a violation, the torque is off.
 
         Parameters
         ----------
         due_ns
-            When the tick was due.
+            Time at which the tick was due.
         reference_rad
             Reference of this tick, from the rig's zero.
         """
@@ -257,7 +257,7 @@ class Cycle:
             flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
-        if controller.saturated:  # which a torque that is not a number is as well
+        if controller.saturated:  # a torque that is not a number counts as saturated
             violation = watch.check_torque(controller.unlimited_torque_nm)
             if violation is not None:
                 self.torque_off()
@@ -275,7 +275,7 @@ class Cycle:
         return None
 
     def start(self, noise_nm: float) -> None:
-        """Begin to control from rest at the angle last read.
+        """Start the control from rest at the angle last read.
 
         Parameters
         ----------
@@ -289,26 +289,25 @@ class Cycle:
         self._recent.clear()
 
     def skip(self, missed: int) -> None:
-        """Go on after ticks that were missed, with the torque held."""
+        """Account for missed ticks, in which the torque was held."""
         if missed:
             self.watch.skip(missed)
             self.skip_encoder(missed)
 
     def skip_encoder(self, missed: int) -> None:
-        """Let the encoder watch go on after missed ticks; the limits' watch knows of them."""
+        """Account for missed ticks in the encoder watch only."""
         if self.encoder_watch is not None:
             self.encoder_watch.skip(missed, self.angle_rad)
 
-    def turns_against_torque(
+    def accelerates_against_torque(
         self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
     ) -> bool:
-        """Whether the shaft has just got faster and faster against the torque on it.
+        """Return whether the shaft has just accelerated against the torque on it.
 
-        The torque on the motor is the commanded one less the coupling torque, which the sensor
-        measures: whatever is done to the beam is in it. A motor that answers by about as much as
-        its inertia lets it, but the other way round, has the sign of its angle or torque wrong, or
-        is turned by somebody at the shaft itself. Called after a tick whose check found a limit
-        violated.
+        The torque on the motor is the commanded torque less the measured coupling torque, which
+        includes every load on the beam. If the motor accelerates about as much as its inertia
+        allows, but in the opposite direction, the sign of its angle or torque is wrong, or somebody
+        turns the shaft. Call it after a tick that violated a limit.
 
         Parameters
         ----------
@@ -338,24 +337,24 @@ class Cycle:
 
     @property
     def stale(self) -> bool:
-        """Whether a reading of the last tick did not come."""
+        """Whether a reading of the last tick is stale."""
         return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
-    def what_is_stale(self) -> str:
-        """Name what did not come in the last tick."""
+    def stale_names(self) -> str:
+        """Names of the stale readings of the last tick."""
         names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
     def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
-        """Compare the angle just read with those before it, the torque being off.
+        """Check the angle just read against those before it, while the torque is off.
 
         Parameters
         ----------
         standstill
             Monitor of the angle at rest.
         due_ns
-            When the tick was due.
+            Time at which the tick was due.
 
         Raises
         ------
@@ -366,14 +365,14 @@ class Cycle:
             standstill.check(self.angle_rad + self.zero_rad, due_ns)
 
     def check_sensor(self) -> Violation | None:
-        """Check whether the sensor repeats its readings, after a tick's reading."""
+        """Return a violation if the sensor repeats its readings; call it after each reading."""
         if self.flags & _UNUSABLE & ~_ANGLE_STALE:
             return None
         gauges = self._gauges
         return self.sensor_watch.step(self.raw_wrench if gauges is None else gauges.gauges)
 
     def check_stale(self) -> Violation | None:
-        """Say whether a device has given nothing usable for too long, after a tick's reading."""
+        """Return a violation if a device gave no usable reading for too long."""
         flags = self.flags
         if not (flags & _UNUSABLE or self._were_unusable):
             return None
@@ -385,22 +384,22 @@ class Cycle:
         )
 
     def with_cause(self, violation: Violation) -> Violation:
-        """Return a violation with what its device knows of the cause in place of the usual remedy.
+        """Return a violation whose remedy is the cause that the device reports, if any.
 
         Parameters
         ----------
         violation
-            Any; only readings that do not come have such a cause.
+            Any violation; devices report causes of stale readings only.
         """
         for device, names in ((self._drive, _STALE_ANGLES), (self._sensor, _STALE_WRENCHES)):
             if violation.channel in names and (cause := device.health().cause):
                 return replace(violation, remedy=cause)
         return violation
 
-    def look(
+    def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check what changes slowly, every `LOOK_EVERY` ticks.
+        """Check the quantities that change slowly, every `LOOK_EVERY` ticks.
 
         Parameters
         ----------
@@ -414,7 +413,7 @@ class Cycle:
         Returns
         -------
         Violation or None
-            Where a limit is violated, the torque is off.
+            The violated limit, if any; the torque is then off.
         """
         squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
         violation = self.watch.look(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
@@ -423,15 +422,15 @@ class Cycle:
         return violation
 
     def torque_off(self) -> None:
-        """Zero the torque and disable the drive, once: a real one takes its time."""
+        """Set the torque to zero and disable the drive, once: disabling takes time."""
         if self._commanding:
             self._commanding = False
             self._drive.disable()
         self.torque_command_nm = 0.0
         self.flags |= _TORQUE_OFF
 
-    def lose_readings(self) -> None:
-        """Switch off because a device failed: what was read last stands, and is marked so."""
+    def mark_readings_stale(self) -> None:
+        """Switch off after a device failure, and mark the last readings as stale."""
         self.torque_off()
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
 
@@ -441,14 +440,14 @@ class Cycle:
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """Readings without torque.
+    """Readings at rest, without torque.
 
     Attributes
     ----------
     duration_s
         Duration of the readings.
     wrenches
-        Raw: not tared; N and N·m, shape (n, 6).
+        Raw wrenches (not tared) in N and N·m, shape (n, 6).
     angles_rad
         Angles from the rig's zero; shape (n,).
     torques_nm
@@ -462,12 +461,12 @@ class Rest:
 
     @property
     def speed_rad_s(self) -> float:
-        """Mean speed of the motor, from the angles' range."""
+        """Range of the angles over the duration."""
         return float(np.ptp(self.angles_rad)) / self.duration_s
 
     @property
     def torque_spread_nm(self) -> float:
-        """Standard deviation of the coupling torque: noise, and a beam that swings."""
+        """Standard deviation of the coupling torque: noise and vibration of the beam."""
         return float(self.torques_nm.std())
 
     @property
@@ -483,7 +482,7 @@ class Rest:
         return fx, fy, fz, tx, ty, tz
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the tare as a session file states it."""
+        """Return the tare as metadata of the session file."""
         return {"tare_s": repr(self.duration_s)} | {
             f"tare_{what}_{axis}": repr(value)
             for what, values in (("mean", self.mean), ("std", self.spread))
@@ -500,7 +499,7 @@ def observe_rest(
     projection: Wrench,
     check: Callable[[], None],
 ) -> Rest:
-    """Read angle and wrench for some time without touching the torque.
+    """Read angle and wrench for some time without changing the torque.
 
     Parameters
     ----------
@@ -511,7 +510,7 @@ def observe_rest(
     projection
         Coupling torque = projection · wrench.
     check
-        Called after each reading; raises to end it.
+        Called after each reading; it ends the readings by raising.
     """
     wrenches: list[Wrench] = []
     angles: list[float] = []
@@ -529,7 +528,7 @@ def observe_rest(
 
 
 def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
-    """Return the limit monitor of a profile's rig; it is kept while the rig is connected.
+    """Return the limit monitor of a rig; it exists as long as the rig is connected.
 
     Parameters
     ----------
@@ -558,9 +557,9 @@ class Observers:
     """Checks of the readings against physics and noise, for one profile and its devices."""
 
     encoder: EncoderWatch
-    """Compares the encoder with the torques on the shaft."""
+    """Check of the encoder against the torques on the shaft."""
     sensor: SensorWatch
-    """Compares each reading of the sensor with the one before."""
+    """Check of each reading of the sensor against the one before."""
 
 
 def make_observers(profile: Profile, devices: Devices) -> Observers:
@@ -598,14 +597,14 @@ def make_observers(profile: Profile, devices: Devices) -> Observers:
 def remember_heat(profile: Profile, heat_nm2: float) -> None:
     """Store the heat of the motor for the next connection of this user.
 
-    Where it cannot be stored, the next connection takes the motor for cold.
+    If it cannot be stored, the next connection assumes a cold motor.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     heat_nm2
-        Heat of the motor, as the limit monitor counts it.
+        Heat of the motor, from the limit monitor.
     """
     document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
     with suppress(OSError, UnsafeFolderError):
@@ -617,9 +616,9 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
 
 
 def recalled_heat_nm2(profile: Profile) -> float:
-    """Return the motor's heat left from the last connection, in (N·m)²; 0.0: not known.
+    """Return the motor's remaining heat from the last connection, in (N·m)²; 0 if unknown.
 
-    It has cooled down since by its thermal time constant.
+    The motor cools with its thermal time constant.
     """
     try:
         document = json.loads(_heat_file(profile).read_text("utf-8"))

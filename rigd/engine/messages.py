@@ -1,9 +1,9 @@
-"""Messages between the processes of a rig: what each of them says, and how it travels.
+"""Messages between the processes of a rig, and their encoding.
 
-The supervisor gives jobs and orders, the others answer:
+The supervisor sends jobs and orders, the others answer:
 
 ============  =============================================  ================================
-process       is told                                        tells
+process       receives                                       sends
 ============  =============================================  ================================
 control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Ready, Finished;
                                                              Measured or Refused; last Ended
@@ -14,9 +14,9 @@ fit           FitJob, FileHeader, RecordEnded                FitReady, then FitT
                                                              SearchEnded; or Failed
 ============  =============================================  ================================
 
-A message is one of these objects, pickled, behind its length. Each is short enough for a pipe's
-buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` would wait for
-the rest of a message of which a hung child has written half; nobody here does.
+A message is its length followed by one of these objects, pickled. Each is short enough for a pipe's
+buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is not used,
+because it would wait for the remainder of a message of which a hung child has written half.
 """
 
 import os
@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
 
 _LENGTH: Final = struct.Struct("=I")
 _MOST_BYTES: Final = 1 << 24
-"""No message is longer: something else has been written into the pipe, such as a text."""
+"""Limit of a message's length: beyond it, the pipe contains something else, such as text."""
 
 
 # Control
@@ -47,60 +47,60 @@ _MOST_BYTES: Final = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class ControlJob:
-    """The rig to attend to."""
+    """The rig to control."""
 
     profile: "Profile"
     """Profile whose devices are connected."""
     moving: "WhatMoves | None"
-    """What the operator was told would move, and nothing else may; None: nothing was told."""
+    """The only thing that may move, as stated to the operator; None: nothing was stated."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     fast: bool
-    """Run under the virtual clock."""
+    """Whether to run with the virtual clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """What follows the record, while the motor is still held; planned before the session."""
+    """Steps after the record, with the motor still held; planned before the session."""
 
     stays: bool = False
-    """The motor stays where the reference ends; else it returns to the start angle."""
+    """Whether the motor stays at the end of the reference instead of returning to the start."""
     poles_rad_s: tuple[complex, ...] = ()
-    """Modes that the return leaves at rest; none: nothing is known of the beam."""
+    """Poles of the modes that the return must not excite; empty if they are unknown."""
     damper: "DamperSettings | None" = None
-    """Active damping of what still vibrates; None: it is left to itself."""
+    """Active damping of the remaining vibration; None: no active damping."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchOrder:
-    """The obstacle to look for in a session."""
+    """Search for an obstacle in a session."""
 
     beam: "WatchedBeam"
-    """What the detector knows of the beam."""
+    """Model of the beam for the detector."""
     settings: "DetectorSettings"
-    """How sure the detector has to be."""
+    """Thresholds of the detector."""
     approach: "Approach"
-    """The passes, and what to do after a touch."""
+    """Passes of the search, and the reaction to a touch."""
     shear_projection: tuple[float, ...] | None
     """Base shear = projection · wrench; None: it is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionJob:
-    """The session to run on it."""
+    """A session to run."""
 
     profile: "Profile"
-    """The rig's; its controller and limits may be others."""
+    """Profile of the rig, possibly with another controller and other limits."""
     reference: "ReferenceSpec"
     """Angles relative to the one at the start."""
     refused: Mapping[str, str] = field(default_factory=dict)
-    """What the system did not grant supervisor and recorder, and why."""
+    """Settings that the system refused to supervisor and recorder, with the reasons."""
     ending: Ending = field(default_factory=Ending)
-    """What follows the record."""
+    """Steps after the record."""
     touch: TouchOrder | None = None
-    """What to look for; None: nothing."""
+    """Search for an obstacle; None: no search."""
     seed: int | None = None
-    """Seed of a simulated rig's noise; None: one of the rig's own."""
+    """Seed of a simulated rig's noise; None: the rig chooses one."""
     accepted: tuple[str, ...] = ()
     """Failed rows of `rigd check` that the operator accepted, each as a text for the log."""
 
@@ -120,7 +120,7 @@ class Probe:
     """Make the probing move of a profile."""
 
     profile: "Profile"
-    """The rig's; its beam may be another."""
+    """Profile of the rig, possibly with another beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,16 +130,16 @@ class Connected:
     calibration: Mapping[str, Any]
     """Identity and calibration as read from the sensor, for the file."""
     drive: Mapping[str, str]
-    """What the drive states of itself, for the file."""
+    """Identity and settings that the drive reports, for the file."""
     realtime: Mapping[str, str]
-    """The real-time settings that were granted, for the file."""
+    """Real-time settings that were granted, for the file."""
     simulated: bool
-    """The devices are simulated: no motor moves."""
+    """Whether the devices are simulated, so that no motor moves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """The motor is held where it stands; the record may begin."""
+    """The motor is held at its angle; the record may begin."""
 
     tare: Mapping[str, str]
     """Metadata of the tare, and the seed of a simulated rig's noise."""
@@ -152,20 +152,20 @@ class Finished:
     outcome: str
     """Outcome of the record: ``complete``, ``stopped`` or ``fault``."""
     reason: str
-    """Why the session ended early, or what failed after the record; empty if neither."""
+    """Reason for an early end, or failure after the record; empty if neither."""
     fault: bool
-    """Something failed, in the record or after it."""
+    """Whether something failed, in the record or after it."""
     counts: Mapping[str, int]
     """Numbers of ticks: scheduled, missed, late, lost, and those with stale readings."""
     results: Mapping[str, str] = field(default_factory=dict)
     """Results for the record's outcome, in addition to the counts."""
     device_failed: bool = False
-    """The control process lets go of all, and ends."""
+    """Whether a device failed, so that the control process closes the devices and ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was measured between sessions."""
+    """Result of a measurement between sessions."""
 
     values: dict[str, Any]
     """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
@@ -173,10 +173,10 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """It could not be measured."""
+    """A measurement was not possible."""
 
     reason: str
-    """What prevented it, such as a motor that moves; a sentence for the operator."""
+    """Obstacle to the measurement, such as a moving motor; a sentence for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ class Ended:
     """The devices are closed; the last message."""
 
     reason: str
-    """Empty if it was asked for."""
+    """Failure; empty if the end was requested."""
 
 
 # Recorder
@@ -199,12 +199,12 @@ class RecorderJob:
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     realtime: "RealtimeSettings | None" = None
-    """What it may ask of the scheduler; None: nothing, for it is not in real time."""
+    """Scheduling that it may request; None: none, because the session is not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileHeader:
-    """What stands in the file before its first sample."""
+    """Contents of the file before its first sample."""
 
     metadata: Mapping[str, str]
     """Metadata ``session`` of docs/session_format.md."""
@@ -221,17 +221,17 @@ class Close:
     outcome: Mapping[str, str]
     """Metadata ``outcome`` of docs/session_format.md; the recorder recounts the samples."""
     touches: bytes = b""
-    """Touches that were estimated, packed."""
+    """Estimated touches, packed."""
     segments: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     """Segments that were not known before the record."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """The file is there."""
+    """The file exists."""
 
     realtime: Mapping[str, str]
-    """What the scheduler granted."""
+    """Scheduling that was granted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,28 +241,28 @@ class Armed:
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """The file is whole."""
+    """The file is complete."""
 
     path: Path | None = None
-    """None: no record had begun, and there is none."""
+    """Path of the file; None: no record had begun, and there is no file."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """What was counted in it."""
+    """Numbers of ticks in the file."""
     outcome: str = ""
-    """``complete``, ``stopped`` or ``fault``, as in the file; empty if there is none."""
+    """``complete``, ``stopped`` or ``fault``, as in the file; empty without a file."""
     reason: str = ""
     """Reason as in the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """A recorder or a live publisher cannot do its work, and ends."""
+    """A recorder, live publisher or fit process failed, and ends."""
 
     reason: str
-    """What failed, for the operator."""
+    """Description of the failure, for the operator."""
     taken: bool = False
-    """The file is there already, and is somebody else's."""
+    """Whether the file exists already and belongs to something else."""
     kept: Path | None = None
-    """Where the record was saved, if not under the file's own name."""
+    """Path of the record, if it was not saved under its own name."""
 
 
 # Touch
@@ -270,20 +270,20 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class TouchJob:
-    """The session whose touches are to be estimated."""
+    """Estimation of the touches of a session."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     first: int
-    """Records in the ring of samples before the session."""
+    """Number of samples in the ring before the session."""
     rate_hz: float
     """Ticks a second."""
     model: "TouchModel"
-    """The beam."""
+    """Model of the beam."""
     shear_projection: tuple[float, ...] | None
     """Base shear = projection · wrench; None: it is not measured."""
     realtime: "RealtimeSettings | None" = None
-    """Where the loop runs, from whose core it keeps off; None: not in real time."""
+    """Real-time settings, whose loop core it must avoid; None: not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +300,7 @@ class TouchTold:
     tick: int
     """Tick of its detection."""
     final: bool
-    """No better one will come."""
+    """Whether it is the last estimate of this touch."""
     document: Mapping[str, Any]
     """Point, instant, force, stiffness and kind, as in JSON documents."""
 
@@ -310,20 +310,20 @@ class TouchTold:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """The session whose record is fitted while it grows."""
+    """Fit of a session's record during the session."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
     first: int
-    """Records in the ring of samples before the session."""
+    """Number of samples in the ring before the session."""
     profile: "Profile"
     """Profile of the rig."""
     reference: "ReferenceSpec"
     """Reference of the session."""
     search: "PrecisionSearch | None" = None
-    """What the session goes on for; None: its reference is given, and nothing is planned."""
+    """Target precision, for which segments are planned; None: the reference is fixed."""
     realtime: "RealtimeSettings | None" = None
-    """Where the loop runs, from whose core it keeps off; None: not in real time."""
+    """Real-time settings, whose loop core it must avoid; None: not in real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,32 +346,32 @@ class FitTold:
     document: Mapping[str, Any]
     """Modes and parameters with their intervals, as in JSON documents."""
     final: bool = False
-    """It rests on the whole record, and is the last."""
+    """Whether it uses the whole record and is the last."""
 
 
 @dataclass(frozen=True, slots=True)
 class PieceTold:
-    """Piece of excitation that was appended to the reference."""
+    """Segment of excitation that was appended to the reference."""
 
     name: str
-    """What it is, for the operator."""
+    """Name for the operator."""
     document: Mapping[str, Any]
-    """What it is expected to bring, as in JSON documents."""
+    """Expected improvement, as in JSON documents."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchEnded:
-    """No further piece comes; the record ends with those that are there."""
+    """No further segment follows; the record ends with the present ones."""
 
     reached: bool
-    """The precision that was asked for is reached."""
+    """Whether the target precision is reached."""
     reason: str
-    """Why it ended, a sentence for the operator."""
+    """Reason for the end, a sentence for the operator."""
     segments: Mapping[str, tuple[int, int]]
-    """First tick and end of the scan and of each piece, by name."""
+    """First tick and end of the scan and of each segment, by name."""
 
 
-# On their way
+# Encoding
 
 
 def encode(message: object) -> bytes:
@@ -381,7 +381,7 @@ def encode(message: object) -> bytes:
 
 
 class MessageReader:
-    """Messages from a descriptor, without ever waiting longer than asked.
+    """Reader of messages from a descriptor, which never exceeds the given timeout.
 
     Parameters
     ----------
@@ -394,14 +394,19 @@ class MessageReader:
         self._pending = bytearray()
 
     def next(self, timeout_s: float | None) -> object | None:
-        """Return the next message, or None if none is complete in time (None: wait forever).
+        """Return the next message, or None if none is complete in time.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait; None: forever.
 
         Raises
         ------
         EOFError
-            If the other end is gone and no whole message is left.
+            If the other end is closed and no complete message remains.
         ValueError
-            If what comes is not a message.
+            If the data are not a message.
         """
         while (message := self._whole()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):
@@ -436,7 +441,7 @@ def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
     event
         ``select.POLLIN`` or ``select.POLLOUT``.
     timeout_s
-        Longest wait; None: for ever.
+        Longest wait; None: forever.
     """
     waiting = select.poll()
     waiting.register(fd, event)

@@ -1,11 +1,11 @@
-"""The processes of a rig: their table, how they are started, and both ends of their pipes.
+"""The processes of a rig: their table, their start, and both ends of their pipes.
 
-One table, `PROCESSES`, says how each process is started, watched, and ended. Every process counts
-up its word in the `SharedState` several times a second. A dead process is noticed at once, a hung
-one by its heartbeat; the table says what happens then.
+The table `PROCESSES` defines how each process is started, watched and ended. Every process counts
+up its heartbeat in the `SharedState` several times a second. The supervisor notices a dead process
+at once and a hung one by its heartbeat; the table states the consequence.
 
-A child is ``python -m MODULE``. Its standard input brings its job and then messages; the end of it
-means that the supervisor is gone. Its standard output brings its answers (`messages`).
+A child is ``python -m MODULE``. It receives its job and then messages on standard input, whose end
+means that the supervisor is gone. It sends its answers on standard output (`messages`).
 """
 
 import contextlib
@@ -34,7 +34,7 @@ _KILLED_GRACE_S = 2.0
 
 
 class ChildError(FailureError):
-    """A child process ended, or answered something else than it was asked."""
+    """A child process ended, or its answer was unexpected."""
 
 
 class Child:
@@ -45,11 +45,11 @@ class Child:
     name
         Name in messages to the operator.
     module
-        Run as ``python -m module``; it starts importing at once and waits for its job.
+        Run as ``python -m module``; it starts its imports at once and waits for its job.
     fds
-        Descriptors it inherits.
+        Descriptors that it inherits.
     cores
-        Cores that it may use, where they differ from this process's own.
+        Cores that it may use, if they differ from this process's own.
 
     Raises
     ------
@@ -77,22 +77,22 @@ class Child:
                 "computer and its limits (ulimit -a)."
             ) from None
         if cores:
-            with contextlib.suppress(OSError):  # it has ended already: poll() tells
+            with contextlib.suppress(OSError):  # it has ended already, which poll() reports
                 os.sched_setaffinity(self._process.pid, cores)
         os.set_blocking(self._stdin_fd, False)
         self._messages = MessageReader(self._stdout_fd)
 
     def start(self, job: object) -> None:
-        """Hand over its job: the first message."""
+        """Send its job, which is the first message."""
         self.send(job)
 
     def send(self, message: object) -> None:
-        """Send one message; a child that is gone is noticed when it is next listened to.
+        """Send one message; the next `poll` reports a child that is gone.
 
         Raises
         ------
         ChildError
-            If it does not take it in time.
+            If the child does not read it in time.
         """
         self._write(encode(message))
 
@@ -112,7 +112,7 @@ class Child:
         Raises
         ------
         ChildError
-            If the child has ended, or says what is no message.
+            If the child has ended, or sent something that is no message.
         """
         try:
             return self._messages.next(timeout_s)
@@ -124,7 +124,7 @@ class Child:
             raise ChildError(f"The {self.name} process sent {error}.") from None
 
     def messages(self, timeout_s: float) -> Iterator[object]:
-        """Yield the messages that are there, waiting for the first only.
+        """Yield the available messages, waiting only for the first.
 
         Raises
         ------
@@ -136,19 +136,19 @@ class Child:
             timeout_s = 0.0
 
     def wake(self) -> None:
-        """Have it go on if somebody suspended it: it may have something to bring to an end."""
+        """Resume the child if it is suspended, so that it can finish its work."""
         self._process.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """End it at once; the next :meth:`poll` tells."""
+        """Kill the child; the next :meth:`poll` reports it."""
         self._process.kill()
 
     def stop(self, grace_s: float) -> None:
-        """End it: close its input and wait; then terminate; then kill. Harmless when repeated."""
+        """End the child: close its input and wait, then terminate, then kill; repeatable."""
         if self._process.stdout is None or self._process.stdout.closed:
             return
         if self._process.stdin is not None and not self._process.stdin.closed:
-            with contextlib.suppress(BrokenPipeError):  # it was gone already
+            with contextlib.suppress(BrokenPipeError):  # it had ended already
                 self._process.stdin.close()
         self.wake()
         for end in (self._process.terminate, self._process.kill):
@@ -164,7 +164,7 @@ class Child:
         self._process.stdout.close()
 
     def _falls_silent(self, patience_s: float) -> bool:
-        """Wait until its output ends, which is noticed at once; waiting for a process polls."""
+        """Return whether its output ends in time; waiting for the process itself would poll."""
         deadline = time.monotonic() + patience_s
         while (left_s := deadline - time.monotonic()) > 0:
             if is_ready(self._stdout_fd, select.POLLIN, left_s) and not os.read(
@@ -193,27 +193,26 @@ class Child:
             try:
                 rest = rest[os.write(self._stdin_fd, rest) :]
             except BrokenPipeError:
-                return  # poll() tells how it ended
+                return  # poll() reports how it ended
 
 
 class Parent:
-    """The supervisor, as a child sees it; its process id is the child's only argument.
+    """The supervisor, seen from a child, whose only argument is the supervisor's process id.
 
-    (Asking for the parent at the start would be too late for one that has died already.)
+    (The parent's id at the start of the child would be wrong if the supervisor has died already.)
     """
 
     def __init__(self) -> None:
         self._messages = MessageReader(sys.stdin.fileno())
-        # What a library prints goes to the operator, and does not stand among the messages.
+        # Output of libraries goes to the operator instead of between the messages.
         self._messages_fd = os.dup(sys.stdout.fileno())
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         self._pid = int(sys.argv[1])
-        # A recorder that is suspended has samples to write down, a control process devices to let
-        # go of.
+        # A suspended recorder must write its samples, and a control process close its devices.
         signal_when_orphaned(signal.SIGCONT)
 
-    def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
-        """Wait for the job; ends the process quietly if the supervisor ends without one."""
+    def receive_job(self) -> Any:  # noqa: ANN401 - the child knows its type
+        """Return the job; end this process quietly if the supervisor ends without sending one."""
         try:
             return self.poll(None)
         except EOFError:
@@ -230,12 +229,12 @@ class Parent:
         return self._messages.next(timeout_s)
 
     def send(self, message: object) -> None:
-        """Send one short message; there may be no receiver left."""
+        """Send one short message, even if the supervisor may be gone."""
         with contextlib.suppress(BrokenPipeError):
             os.write(self._messages_fd, encode(message))
 
     def alive(self) -> bool:
-        """Whether the supervisor still runs; cheap enough for the loop."""
+        """Return whether the supervisor still runs; fast enough for the loop."""
         return os.getppid() == self._pid
 
 
@@ -249,17 +248,17 @@ class Process:
     name: str
     """Name in messages to the operator."""
     module: str
-    """Run as ``python -m module``; empty: it is the one that starts the others."""
+    """Run as ``python -m module``; empty for the process that starts the others."""
     beat: Word
-    """Its word on the board."""
+    """Field of its heartbeat in the shared state."""
     hung_after_s: float | None
-    """Time without a heartbeat; None: judged by what it leaves undone instead."""
+    """Longest time without a heartbeat; None: its results are checked instead."""
     grace_s: float
-    """Time in which it has to end when asked to; then it is terminated, then killed."""
+    """Time to end on request, before it is terminated and then killed."""
     for_one_session: bool
-    """A new one is started for each session."""
+    """Whether each session starts a new one."""
     loss: str
-    """What follows if it dies or hangs."""
+    """Consequence of its death or hanging."""
 
 
 CONTROL = Process(
@@ -275,7 +274,7 @@ RECORDER = Process(
     "recorder",
     "rigd.engine.recorder",
     Word.RECORDER_BEAT,
-    # A disk may stall for seconds; the samples that wait for it are what counts.
+    # A disk may stall for seconds; the number of waiting samples is checked instead.
     hung_after_s=None,
     grace_s=5.0,
     for_one_session=True,
@@ -294,7 +293,7 @@ TOUCH = Process(
     "touch",
     "rigd.engine.touch_estimator",
     Word.TOUCH_BEAT,
-    # An estimate takes its time; what it leaves undone is told as such.
+    # An estimate may take long; a missing estimate is reported as such.
     hung_after_s=None,
     grace_s=1.0,
     for_one_session=True,
@@ -304,7 +303,7 @@ FIT = Process(
     "fit",
     "rigd.runner.fit_process",
     Word.FIT_BEAT,
-    # A decision may take its time on a busy computer; the loop holds the angle meanwhile.
+    # A decision may take long on a busy computer; the loop holds the angle meanwhile.
     hung_after_s=15.0,
     grace_s=1.0,
     for_one_session=True,
@@ -321,34 +320,34 @@ SUPERVISOR = Process(
 )
 
 PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
-"""All processes, in the order in which they are ended: the one with the torque first."""
+"""All processes in the order in which they are ended: the process with the torque first."""
 
 
 class Pulse:
-    """How long a process has not beaten, as seen by one that looks every so often.
+    """Heartbeat of a process, polled by another one.
 
-    Only time in which the looking process itself ran is counted: a computer that stands still for a
-    second has not made a process hang.
+    Only time in which the polling process itself ran counts: a computer that stalls for a second
+    does not make a process count as hung.
     """
 
-    _MOST_PER_LOOK_S = 0.2
+    _MAX_STEP_S = 0.2
 
     def __init__(self) -> None:
         self._beat = -1
-        self._looked_s = 0.0
+        self._polled_s = 0.0
         self.still_s = 0.0
 
     def look(self, beat: int, now_s: float) -> float:
-        """Take a look at its beat and return for how long it has not changed, in s.
+        """Return the time in s for which the count has not changed.
 
         Parameters
         ----------
         beat
-            Count that the process adds to while it is running.
+            Count that the process increments while it runs.
         now_s
             Time of a monotonic clock.
         """
-        passed_s = min(now_s - self._looked_s, self._MOST_PER_LOOK_S)
+        passed_s = min(now_s - self._polled_s, self._MAX_STEP_S)
         self.still_s = self.still_s + passed_s if beat == self._beat else 0.0
-        self._beat, self._looked_s = beat, now_s
+        self._beat, self._polled_s = beat, now_s
         return self.still_s

@@ -1,8 +1,8 @@
-"""Real-time settings of a rig's processes: each is tried, and what was obtained is recorded.
+"""Real-time settings of a rig's processes: each is requested, and the result is recorded.
 
-The control process gets all that a 1 kHz loop wants (:func:`obtain`). Supervisor and recorder get a
-priority below the loop's and above that of every ordinary program (:class:`Precedence`), for nobody
-stops a session whose supervisor waits for the processor behind a viewer.
+The control process gets all settings for a 1 kHz loop (:func:`obtain`). Supervisor and
+recorder get a priority below the loop's and above that of every ordinary program
+(:class:`Precedence`), so that a session can be stopped even if a viewer occupies the processor.
 """
 
 import contextlib
@@ -15,12 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 REFUSED = "refused: "
-"""Beginning of the report on a setting that was not granted."""
+"""Prefix of the report on a setting that was not granted."""
 LOCKED = "locked"
-"""The report on memory of which no part is ever waited for."""
+"""Report on memory that is locked, so that it causes no page faults."""
 WAKE_UP_US = 2
-"""Idle states that take longer to leave are kept away. Halting is quicker than that; with 0 an idle
-core would poll, and a rig that waits for its operator would heat the room."""
+"""Idle states with a longer exit latency are disabled. Halting is faster than that; with 0 an idle
+core would poll and consume power."""
 
 NICE = -10
 """Niceness of supervisor and recorder where the system grants no real-time priority."""
@@ -34,7 +34,7 @@ _IDLE_STATES_BOUND = "dev/cpu_dma_latency"
 
 
 def collect_no_garbage() -> str:
-    """Turn the cyclic collector off: one run of it can take ten periods."""
+    """Turn off the cyclic garbage collector, whose run can take ten periods."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -42,22 +42,22 @@ def collect_no_garbage() -> str:
 
 
 def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
-    """Ask the system for what a 1 kHz loop wants, and report what it granted.
+    """Apply the real-time settings of a 1 kHz loop, and return which were granted.
 
     Parameters
     ----------
     priority
         Priority under SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
     cpu
-        The one core to run on; -1 for the last isolated one, or where none is isolated the last one
-        this process may use.
+        Core to run on; -1: the last isolated one, or the last one that this process may use if none
+        is isolated.
     root
         Root of the file system.
 
     Returns
     -------
     dict
-        One entry a setting: what was obtained, or "refused: " and the reason.
+        One entry per setting: the granted value, or "refused: " and the reason.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     wanted: dict[str, Callable[[], str]] = {
@@ -65,7 +65,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
         "cpu": lambda: _pin(cpu, root),
-        "idle_states": lambda: _keep_awake(root),
+        "idle_states": lambda: _limit_idle_states(root),
     }
     if priority > 0:
         wanted["scheduling"] = lambda: _schedule(priority)
@@ -73,14 +73,15 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
 
 
 def keep_off_loop(loop_cpu: int) -> None:
-    """Keep this process off the loop's core, if it may use another one.
+    """Restrict this process to cores other than the loop's, if it may use any.
 
-    The loop comes before it in any case, but not while the kernel clears or compacts memory for it.
+    The loop has the higher priority in any case, but not over the kernel that clears or compacts
+    memory for this process.
 
     Parameters
     ----------
     loop_cpu
-        ``realtime.cpu``, which says where the loop runs.
+        Core of the loop, as in ``realtime.cpu``.
     """
     core, _ = _core_of_loop(loop_cpu, Path("/"))
     others = os.sched_getaffinity(0) - {core}
@@ -89,18 +90,18 @@ def keep_off_loop(loop_cpu: int) -> None:
 
 
 class Precedence:
-    """Puts this process before the ordinary ones and behind the loop, until it is released.
+    """Priority of this process above ordinary programs and below the loop, until its release.
 
-    Where the real-time priority is granted the process also keeps off the loop's core if it may use
-    another one. Whatever it starts meanwhile is an ordinary process again, but for the cores: who
-    starts one hands it :attr:`cores_before`.
+    If the real-time priority is granted, the process also avoids the loop's core where it may use
+    another one. Its children are ordinary processes, but inherit the cores: give them
+    :attr:`cores_before`.
 
     Parameters
     ----------
     priority
         Priority under SCHED_RR; 0 leaves the scheduling policy as it is.
     loop_cpu
-        ``realtime.cpu``, which says where the loop runs.
+        Core of the loop, as in ``realtime.cpu``.
     root
         Root of the file system.
 
@@ -115,16 +116,16 @@ class Precedence:
         self.cores_before = frozenset(os.sched_getaffinity(0))
         core, _ = _core_of_loop(loop_cpu, root)
         self._others = self.cores_before - {core}
-        self._put: Callable[[int], None] | None = None
+        self._apply: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
-        """Ask for it and report what was granted.
+        """Request the priority and return what was granted.
 
         Returns
         -------
         dict
-            ``scheduling`` and ``cores``: what was obtained, or "refused: " and the reason; empty if
-            nothing was to be asked for.
+            ``scheduling`` and ``cores``: the granted values, or "refused: " and the reason; empty
+            if nothing was requested.
         """
         if self._priority == 0:
             return {}
@@ -137,63 +138,63 @@ class Precedence:
         return {"scheduling": obtained}
 
     def cover(self) -> None:
-        """Extend it to threads that were started since: they share the interpreter's lock."""
-        if self._put is None:
+        """Extend the priority to new threads, which hold the same interpreter lock."""
+        if self._apply is None:
             return
         for thread in Path("/proc/self/task").iterdir():
             with contextlib.suppress(OSError):  # one that has just ended
-                self._put(int(thread.name))
+                self._apply(int(thread.name))
 
     def release(self) -> None:
-        """Be an ordinary process again; harmless when repeated."""
-        if self._put is None:
+        """Return to ordinary priority; repeatable."""
+        if self._apply is None:
             return
-        self._put = self._put_back
+        self._apply = self._restore
         self.cover()
-        self._put = None
+        self._apply = None
 
     def _try_realtime(self) -> str:
-        self._put_first(0)
-        self._put = self._put_first
+        self._set_realtime(0)
+        self._apply = self._set_realtime
         self.cover()
         return f"SCHED_RR {self._priority}"
 
     def _try_nice(self) -> str:
-        self._put_nicely(0)
-        self._put = self._put_nicely
+        self._set_nice(0)
+        self._apply = self._set_nice
         self.cover()
         return f"nice {NICE}"
 
-    def _put_first(self, thread: int) -> None:
-        # What is forked, a thread as well, starts with the ordinary policy.
+    def _set_realtime(self, thread: int) -> None:
+        # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
         if not self._others:
             return
         try:
             os.sched_setaffinity(thread, self._others)
-        except OSError:  # the cores that it may use have become others meanwhile
-            _be_ordinary(thread)
+        except OSError:  # the set of usable cores has changed meanwhile
+            _set_ordinary(thread)
             raise
 
-    def _put_nicely(self, thread: int) -> None:
+    def _set_nice(self, thread: int) -> None:
         os.setpriority(os.PRIO_PROCESS, thread, NICE)
-        _be_ordinary(thread)
+        _set_ordinary(thread)
 
-    def _put_back(self, thread: int) -> None:
-        _be_ordinary(thread)
+    def _restore(self, thread: int) -> None:
+        _set_ordinary(thread)
         os.setpriority(os.PRIO_PROCESS, thread, max(0, os.getpriority(os.PRIO_PROCESS, thread)))
         os.sched_setaffinity(thread, self.cores_before)
 
 
-def _be_ordinary(thread: int) -> None:
-    # The mark stays: without a privilege it cannot be taken away, and it does no harm.
+def _set_ordinary(thread: int) -> None:
+    # The flag stays: removing it needs a privilege, and it is harmless.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(thread, policy, os.sched_param(0))
 
 
 def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
-    """Return the cores that the kernel was told to leave alone (``isolcpus``)."""
+    """Return the isolated cores of the kernel (``isolcpus``)."""
     try:
         return cores_of((root / _ISOLATED).read_text())
     except (OSError, ValueError):
@@ -201,12 +202,12 @@ def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
 
 
 def cores_of(text: str) -> frozenset[int]:
-    """Return the cores of a list as the kernel writes it: ``0-2,5``.
+    """Return the cores in a list in the kernel's format: ``0-2,5``.
 
     Raises
     ------
     ValueError
-        If it is none.
+        If the text is no such list.
     """
     cores: set[int] = set()
     for part in filter(None, text.strip().split(",")):
@@ -216,7 +217,7 @@ def cores_of(text: str) -> frozenset[int]:
 
 
 def page_faults() -> int:
-    """Return how often this process has waited for a page of memory so far."""
+    """Return the number of page faults of this process so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_minflt + usage.ru_majflt
 
@@ -229,12 +230,12 @@ def _attempt(setting: Callable[[], str]) -> str:
 
 
 def lock_memory(libc: ctypes.CDLL) -> str:
-    """Lock the memory of this process through `libc`, and return what was locked."""
+    """Lock the memory of this process through `libc`, and report which part was locked."""
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
         _call(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
         return LOCKED
-    # What is allocated beyond the limit would not be slow then, but fail in mid-session.
+    # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
     _call(libc.mlockall(_MCL_CURRENT))
     return f"{LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
 
@@ -245,21 +246,12 @@ def _set_timer_slack(libc: ctypes.CDLL) -> str:
 
 
 def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
-    """Return the core that a control process chooses, and whether that one is isolated.
-
-    Parameters
-    ----------
-    cpu
-        As given to :func:`obtain`. One that is named is chosen whether it may be used or not.
-    root
-        Root of the file system.
-    """
-    if cpu >= 0:
+    """Return the core that a control process chooses, and whether it is isolated."""
+    if cpu >= 0:  # chosen whether it may be used or not
         return cpu, False
     isolated = isolated_cores(root)
     if isolated:
-        # They are not among those that a process may use until it asks for one by its number; so
-        # whether it may use one is seen by asking.
+        # Isolated cores are not in a process's affinity until it requests one: try it.
         before = os.sched_getaffinity(0)
         with contextlib.suppress(OSError):
             os.sched_setaffinity(0, {max(isolated)})
@@ -278,12 +270,12 @@ def _pin(cpu: int, root: Path) -> str:
     return f"{core}, isolated" if isolated else str(core)
 
 
-def _keep_awake(root: Path) -> str:
+def _limit_idle_states(root: Path) -> str:
     states = (root / _IDLE_STATES).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
     if all(int(state.read_text()) <= WAKE_UP_US for state in states):
         return f"none slower than {WAKE_UP_US} µs"
     fd = os.open(root / _IDLE_STATES_BOUND, os.O_WRONLY | os.O_CLOEXEC)
-    # It holds as long as the descriptor is open, which is as long as this process lives.
+    # The bound holds while the descriptor is open, until this process ends.
     os.write(fd, struct.pack("=i", WAKE_UP_US))
     return f"those that are left within {WAKE_UP_US} µs"
 

@@ -1,8 +1,8 @@
-"""The recorder process: from the rings to the session file.
+"""The recorder process: it writes the records of the rings to the session file.
 
-It opens the file before anything moves, takes what the loop publishes as fast as the disk lets
-it, and closes the file with the outcome. If the supervisor dies it waits until the loop has
-stopped, and closes the file itself.
+It opens the file before anything moves, writes what the loop publishes as fast as the disk allows,
+and closes the file with the outcome. If the supervisor dies, it waits until the loop has stopped
+and then closes the file itself.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from rigd.session.layout import SAMPLE_SIZE
 _BLOCK = 250
 _IDLE_S = 0.005
 _ORPHAN_PATIENCE_S = 3.0
-_DISK_LOOK_S = 1.0
+_DISK_POLL_S = 1.0
 
 
 def main() -> None:
@@ -58,35 +58,35 @@ def main() -> None:
     try:
         _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
-        text, kept = _abandoned(writer)
-        parent.send(Failed(f"{error}{text}", kept=kept))
+        text, saved = _abandoned(writer)
+        parent.send(Failed(f"{error}{text}", kept=saved))
         raise SystemExit(1) from None
 
 
 def _abandoned(writer: SessionWriter) -> tuple[str, Path | None]:
-    """End a recording that cannot go on; say where its contents are if not under their name."""
+    """Abandon a recording; return a sentence and the path of the data, if not at its own name."""
     try:
-        kept = writer.abandon()
+        saved = writer.abandon()
     except SessionError:
         return "", None  # disk full, device gone: what reached the disk stays there
-    if kept == writer.part:
+    if saved == writer.part:
         return "", None
-    if kept is None:
+    if saved is None:
         return " What was recorded could not be saved elsewhere.", None
     return (
-        f" What was recorded is now {kept}; rigd recover {shlex.quote(str(kept))} makes "
+        f" What was recorded is now {saved}; rigd recover {shlex.quote(str(saved))} makes "
         "a session file of it.",
-        kept,
+        saved,
     )
 
 
 def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: Path) -> None:
     recorder = Recorder(channels, writer)
-    looked_s = time.monotonic()
+    polled_s = time.monotonic()
     while True:
         moved = recorder.transfer()
-        if time.monotonic() - looked_s > _DISK_LOOK_S:
-            looked_s = time.monotonic()
+        if time.monotonic() - polled_s > _DISK_POLL_S:
+            polled_s = time.monotonic()
             _show_free_space(channels.board, folder)
         try:
             message = parent.poll(0.0 if moved else _IDLE_S)
@@ -108,26 +108,26 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
                 return
 
 
-def _show_free_space(board: SharedState, folder: Path) -> None:
-    """Let the loop know; a folder that has gone is told by the next write."""
+def _show_free_space(shared_state: SharedState, folder: Path) -> None:
+    """Publish the free disk space; the next write reports a folder that is gone."""
     with contextlib.suppress(OSError):
-        board[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
+        shared_state[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
 
 
 class Recorder:
-    """From the rings into a file.
+    """Writer of the rings' records to a session file.
 
     Parameters
     ----------
     channels
-        Attached.
+        Attached channels.
     writer
         Writer of the file, not yet begun.
 
     Attributes
     ----------
     begun
-        The record has begun, and so has the file.
+        Whether the record and the file have begun.
     """
 
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
@@ -156,7 +156,7 @@ class Recorder:
         self.begun = True
 
     def transfer(self) -> bool:
-        """Move what is there into the file; say whether there was anything."""
+        """Write the available records to the file; return whether there were any."""
         self._channels.board.beat(Word.RECORDER_BEAT)
         if not self.begun:
             if self.header is None or not self._channels.board[Word.START_UTC_NS]:
@@ -183,19 +183,19 @@ class Recorder:
         outcome: Mapping[str, str],
         segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
     ) -> Closed:
-        """Write the rest and what is known at the end.
+        """Write the remaining records and the outcome, and close the file.
 
         Parameters
         ----------
         outcome
-            As of the loop.
+            Outcome as reported by the loop.
         segments
-            Segments that were not known before the record; they may go on beyond it.
+            Segments that were not known before the record; they may extend beyond its end.
         """
         while self.transfer():
             pass
         accounted = self._recorded + int(outcome["missed"])
-        # A control process that was killed may have left before it counted its last sample.
+        # A killed control process may not have counted its last sample.
         scheduled = max(int(outcome["scheduled"]), accounted)
         counts = {
             "scheduled": scheduled,
@@ -209,27 +209,31 @@ class Recorder:
                 "reason": "Samples were lost before the recorder.",
             }
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        board = self._channels.board
-        if self.header is not None and (board[Word.PLANNED] or board[Word.LAST_PIECE]):
-            # Of a reference that grows, nothing was planned beyond the end of the record.
+        shared_state = self._channels.board
+        if self.header is not None and (
+            shared_state[Word.PLANNED] or shared_state[Word.LAST_PIECE]
+        ):
+            # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled)
         path = self._writer.close(counted, segments)
         return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:
-        """Close what there is once the loop has stopped, the supervisor being gone."""
-        board = self._channels.board
-        self.transfer()  # the whole record may still be in the rings
+        """Close the file after the loop has stopped, because the supervisor is gone."""
+        shared_state = self._channels.board
+        self.transfer()  # all of the record may still be in the rings
         deadline = time.monotonic() + _ORPHAN_PATIENCE_S
-        while board[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
+        while shared_state[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
             if self.transfer():
                 deadline = time.monotonic() + _ORPHAN_PATIENCE_S
             time.sleep(_IDLE_S)
         if self.header is None or not self.begun:
             self._writer.discard()
             return
-        scheduled = board[Word.SCHEDULED]
-        whole = is_whole(board, scheduled, max(end for _, end in self.header.segments.values()))
+        scheduled = shared_state[Word.SCHEDULED]
+        whole = is_whole(
+            shared_state, scheduled, max(end for _, end in self.header.segments.values())
+        )
         self.close(
             {
                 "outcome": "complete" if whole else "fault",
@@ -237,10 +241,10 @@ class Recorder:
                 if whole
                 else "The supervising process ended during the session.",
                 "scheduled": str(scheduled),
-                "missed": str(board[Word.MISSED]),
-                "late": str(board[Word.LATE]),
-                "stale_angles": str(board[Word.STALE_ANGLES]),
-                "stale_wrenches": str(board[Word.STALE_WRENCHES]),
+                "missed": str(shared_state[Word.MISSED]),
+                "late": str(shared_state[Word.LATE]),
+                "stale_angles": str(shared_state[Word.STALE_ANGLES]),
+                "stale_wrenches": str(shared_state[Word.STALE_WRENCHES]),
             }
         )
 

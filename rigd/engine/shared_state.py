@@ -1,16 +1,16 @@
-"""Shared state of a rig's processes: words that tell where each of them is, and events.
+"""Shared state of a rig's processes: fields that each process reads and writes, and log events.
 
-Words
-    `SharedState` holds a few words by which processes tell each other where they are. Each word has
-    one writer. Access takes a fraction of a microsecond and never blocks, so the control loop may
-    use them.
+Fields
+    `SharedState` holds a few integers, such as the phase of the session and the heartbeat of each
+    process. Each field has one writer. Access takes a fraction of a microsecond and never blocks,
+    so the control loop can use it.
 Events
-    What the control process has to say, as fixed-size records in a separate ring. The loop must
-    not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
-    event into the file, the supervisor shows it to the operator.
+    Log lines of the control process, as fixed-size records in a separate ring. The loop must not
+    wait for a reader, so it writes to shared memory instead of a pipe. The recorder writes each
+    event to the file, and the supervisor shows it to the operator.
 
-What is published, and the memory that holds all of it, is in `channels`. This module imports
-nothing heavy, for the processes of a rig are started before anything else.
+The module `channels` lists what is published and lays out the memory. This module imports nothing
+heavy, because the processes of a rig start before anything else.
 """
 
 import contextlib
@@ -22,16 +22,16 @@ from typing import Literal, Self
 
 from rigd.engine._ring import Ring, reserve
 
-# Words
+# Fields
 
 
 class Phase(IntEnum):
-    """What the control process is doing."""
+    """Phase of the control process."""
 
     PREPARING = 0
     """Connecting the devices."""
     SETTLING = 1
-    """Drive enabled, the motor held where it stands."""
+    """Drive enabled, the motor held at its present angle."""
     TARING = 2
     READY = 3
     """Waiting for the recorder before tick 0."""
@@ -59,7 +59,7 @@ _WORDS = {
 
 
 class Activity(StrEnum):
-    """State of a session for its operator, the same word in every view."""
+    """State of a session for the operator, with the same name in every view."""
 
     PREPARING = "preparing"
     """The record has not begun."""
@@ -70,11 +70,11 @@ class Activity(StrEnum):
     FINISHING = "finishing"
     """The record is over and the torque off; the file is being completed."""
     STOPPING = "stopping"
-    """A stop was asked for."""
+    """A stop was requested."""
 
 
 class Stop(IntEnum):
-    """Why the supervisor asks for a stop: the values of :attr:`Word.STOP`."""
+    """Reason for which the supervisor requests a stop: the values of :attr:`Word.STOP`."""
 
     NO = 0
     OPERATOR = 1
@@ -82,7 +82,7 @@ class Stop(IntEnum):
 
 
 class Word(IntEnum):
-    """Index of each word of the :class:`SharedState`."""
+    """Index of each field of the :class:`SharedState`."""
 
     # Written by the supervisor
     STOP = 0
@@ -97,7 +97,7 @@ class Word(IntEnum):
     LATE = 7
     LOST = 8
     ANGLE_NRAD = 9
-    """The last readings, and the torque that stands, in 1e-9 rad and 1e-9 N·m."""
+    """The last readings and the present torque command, in 1e-9 rad and 1e-9 N·m."""
     COUPLING_TORQUE_NNM = 10
     TORQUE_COMMAND_NNM = 11
     CONTROL_BEAT = 12
@@ -115,7 +115,7 @@ class Word(IntEnum):
     LIVE_DROPPED = 15
     LIVE_BEAT = 16
     LIVE_SEEN = 20
-    """Samples up to this one of the ring have been shown, or counted as dropped."""
+    """Number of samples of the ring that have been shown, or counted as dropped."""
     # Written by the control process
     STALE_ANGLES = 21
     """Recorded ticks with a stale angle."""
@@ -124,28 +124,28 @@ class Word(IntEnum):
     TOUCHES = 23
     """Touches detected in the record."""
     HELD = 25
-    """Ticks of the record in which the angle was held because there was no next piece."""
+    """Ticks of the record in which the angle was held because there was no next segment."""
     HELD_BEFORE = 29
-    """Those of them before the piece that was begun last."""
+    """Number of these ticks before the segment that began last."""
     BEGUN = 30
-    """Ticks of the reference up to the end of that piece; 0: none was begun."""
+    """Ticks of the reference up to the end of that segment; 0: none has begun."""
     # Written by the touch process
     TOUCH_BEAT = 24
     # Written by the fit process
     FIT_BEAT = 26
     PLANNED = 27
-    """Ticks of the reference that are planned, where it grows during the session."""
+    """Planned ticks of a reference that grows during the session."""
     # Written by the supervisor
     LAST_PIECE = 28
-    """The record ends with what is planned."""
+    """The record ends with the segments that are planned."""
 
 
 UNKNOWN = -1
-"""Value for a line that does not exist, or does not report."""
+"""Value for a line that does not exist or does not report."""
 
 
 class SharedState:
-    """Array of signed 64-bit words, indexed by :class:`Word`.
+    """Array of signed 64-bit integers in shared memory, indexed by :class:`Word`.
 
     Parameters
     ----------
@@ -156,36 +156,36 @@ class SharedState:
     def __init__(self, fd: int) -> None:
         self.fd = fd
         self._memory = mmap.mmap(fd, 8 * len(Word))
-        self._words = memoryview(self._memory).cast("q")
+        self._fields = memoryview(self._memory).cast("q")
 
     @classmethod
     def create(cls, fd: int) -> Self:
-        """Lay out a board of zeros in shared memory."""
+        """Reserve shared memory for the fields, all of them 0."""
         reserve(fd, 8 * len(Word))
         return cls(fd)
 
-    def __getitem__(self, word: Word) -> int:
-        return self._words[word]
+    def __getitem__(self, field: Word) -> int:
+        return self._fields[field]
 
-    def __setitem__(self, word: Word, value: int) -> None:
-        self._words[word] = value
+    def __setitem__(self, field: Word, value: int) -> None:
+        self._fields[field] = value
 
-    def known(self, word: Word) -> int | None:
-        """Return a word, or None if it says that this is not known."""
-        return None if (value := self._words[word]) == UNKNOWN else value
+    def known(self, field: Word) -> int | None:
+        """Return a field, or None if it says that this is not known."""
+        return None if (value := self._fields[field]) == UNKNOWN else value
 
-    def word(self, word: Word) -> "memoryview[int]":
-        """Return a view of one word, the quickest way to it: ``view[0]``."""
-        return self._words[word : word + 1]
+    def view(self, field: Word) -> "memoryview[int]":
+        """Return a view of one field, the quickest way to it: ``view[0]``."""
+        return self._fields[field : field + 1]
 
-    def beat(self, word: Word) -> None:
-        """Give the heartbeat of the process that this word belongs to."""
-        self._words[word] += 1
+    def beat(self, field: Word) -> None:
+        """Give the heartbeat of the process that this field belongs to."""
+        self._fields[field] += 1
 
     def close(self) -> None:
         """Unmap the memory; the descriptor stays open for the other processes that inherited it."""
-        with contextlib.suppress(BufferError):  # a view of a word is still held
-            self._words.release()
+        with contextlib.suppress(BufferError):  # a view of a field is still held
+            self._fields.release()
             self._memory.close()
 
 
@@ -206,11 +206,11 @@ class Event:
     t_ns: int
     """Time since the session's start."""
     level: Level
-    """How grave it is."""
+    """Severity."""
     message: str
     """Text for the operator."""
     notable: bool = False
-    """The operator is to see it at once, grave or not; not in the file."""
+    """Show it to the operator at once, whatever the level; not stored in the file."""
 
 
 def write_event(ring: Ring, event: Event) -> None:
@@ -234,7 +234,7 @@ def write_event(ring: Ring, event: Event) -> None:
 
 
 def read_events(block: bytes) -> list[Event]:
-    """Decode what :meth:`Ring.take` returned."""
+    """Return the events in a block that :meth:`Ring.take` returned."""
     events = []
     for offset in range(0, len(block), EVENT_SIZE):
         t_ns, level, size = _HEADER.unpack_from(block, offset)
@@ -244,29 +244,29 @@ def read_events(block: bytes) -> list[Event]:
     return events
 
 
-def activity(board: SharedState) -> Activity:
-    """Return the state of the session that a board is about.
+def activity(shared_state: SharedState) -> Activity:
+    """Return the state of the session from the shared state of the processes.
 
     Parameters
     ----------
-    board
-        State that the processes share.
+    shared_state
+        State of the rig's processes.
 
     Examples
     --------
     >>> from rigd.engine import shared_memory_fd
     >>> from rigd.engine.shared_state import Phase, SharedState, Word, activity
-    >>> board = SharedState.create(shared_memory_fd())
-    >>> board[Word.PHASE] = Phase.TARING
-    >>> activity(board)
+    >>> shared_state = SharedState.create(shared_memory_fd())
+    >>> shared_state[Word.PHASE] = Phase.TARING
+    >>> activity(shared_state)
     <Activity.PREPARING: 'preparing'>
     """
-    phase = Phase(board[Word.PHASE])
-    if board[Word.STOP] != Stop.NO:
+    phase = Phase(shared_state[Word.PHASE])
+    if shared_state[Word.STOP] != Stop.NO:
         return Activity.STOPPING
     if phase is Phase.RUNNING:
         return Activity.RUNNING
     # Until tick 0 the phase may be that of the session before.
-    if board[Word.GO] and phase is not Phase.READY:
+    if shared_state[Word.GO] and phase is not Phase.READY:
         return Activity.FINISHING if phase is Phase.OFF else Activity.RETURNING
     return Activity.PREPARING

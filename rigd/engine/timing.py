@@ -1,8 +1,8 @@
 """Clocks of the cycle, real and virtual, and the schedule of its ticks.
 
-Both clocks count nanoseconds of monotonic time and answer the same two questions, so the cycle is
-the same code under either. `TickScheduler` says when a tick is due and how many were missed,
-`SuspendWatch` whether the computer was suspended.
+Both clocks count nanoseconds of monotonic time and have the same two methods, so the cycle uses
+the same code with either. `TickScheduler` computes when a tick is due and how many were missed.
+`SuspendWatch` detects that the computer was suspended.
 """
 
 import time
@@ -11,22 +11,21 @@ from functools import partial
 from typing import Protocol
 
 SUSPENDED_S = 0.01
-"""More than this of :meth:`SuspendWatch.suspended_s` is a suspend; no suspend is so short."""
+"""Threshold of :meth:`SuspendWatch.suspended_s` for a suspend; every real suspend is longer."""
 SIGN_OF_LIFE_S = 1.0
-"""Time for which virtual time may stand still where there are lines: at their other end a host that
-is silent for long is assumed to be dead."""
+"""Longest pause of virtual time with devices on lines, which assume that a silent host is dead."""
 
 
 class Clock(Protocol):
-    """Monotonic time in ns, and waiting for a point in it."""
+    """Monotonic clock with a method to wait for a deadline."""
 
     virtual: bool
 
     def now_ns(self) -> int:
-        """Return the time now."""
+        """Return the present time."""
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait for a deadline and return by how much it was missed, in ns (never negative)."""
+        """Wait for a deadline and return the lateness in ns (never negative)."""
 
 
 class RealClock:
@@ -51,11 +50,11 @@ class RealClock:
         self._spin_ns = spin_ns
 
     def now_ns(self) -> int:
-        """Return the time now."""
+        """Return the present time."""
         return time.monotonic_ns()
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait for a deadline and return by how much it was missed, in ns (never negative)."""
+        """Wait for a deadline and return the lateness in ns (never negative)."""
         remainder = deadline_ns - time.monotonic_ns() - self._spin_ns
         if remainder > 0:
             time.sleep(remainder * 1e-9)
@@ -66,7 +65,7 @@ class RealClock:
 
 
 class VirtualClock:
-    """A clock that stands at the last deadline: no sleeping, no lateness, no work time."""
+    """A clock that jumps to each deadline: no sleep, no lateness, no execution time."""
 
     virtual = True
 
@@ -74,25 +73,25 @@ class VirtualClock:
         self._now_ns = 0
 
     def now_ns(self) -> int:
-        """Return the time now."""
+        """Return the present time."""
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Move to the deadline at once."""
+        """Set the time to the deadline and return 0."""
         self._now_ns = deadline_ns
         return 0
 
 
 class SuspendWatch:
-    """Notices that the computer was suspended, which the monotonic clock does not show.
+    """Detector of a suspended computer.
 
-    It stands still meanwhile, so no tick seems missed, while the rig went on without a loop. The
-    clock since boot goes on.
+    The monotonic clock stops during a suspend, so no tick seems missed although the rig ran without
+    a loop. The clock since boot continues.
 
     Parameters
     ----------
     monotonic_ns, boot_ns
-        The clocks, for tests.
+        Clocks, which tests replace.
     """
 
     def __init__(
@@ -102,14 +101,14 @@ class SuspendWatch:
     ) -> None:
         self._monotonic_ns = monotonic_ns
         self._boot_ns = boot_ns or _clock_since_boot()
-        # This order of the two readings: a delay between them never looks like a suspend.
+        # In this order a delay between the two readings is never mistaken for a suspend.
         before_ns = self._monotonic_ns()
         self._ahead_ns = self._boot_ns() - before_ns
 
     def suspended_s(self) -> float:
-        """Return for how long the computer was suspended since this watch began.
+        """Return the time for which the computer was suspended since this watch began.
 
-        About a microsecond's work: now and then, not in every tick.
+        It takes about a microsecond: call it now and then, not in every tick.
         """
         ahead_ns = self._boot_ns() - self._monotonic_ns()
         return max(0, ahead_ns - self._ahead_ns) * 1e-9
@@ -122,14 +121,14 @@ def _clock_since_boot() -> Callable[[], int]:
 
 
 class TickScheduler:
-    """Absolute deadlines, one per period; a missed tick is skipped, never made up in a burst.
+    """Schedule of absolute deadlines, one per period; missed ticks are skipped, not made up.
 
     Parameters
     ----------
     clock
         Real or virtual time.
     rate_hz
-        Ticks a second.
+        Ticks per second.
 
     Attributes
     ----------
@@ -138,7 +137,7 @@ class TickScheduler:
     t_ns
         Scheduled time of the current tick, since tick 0.
     due_ns
-        The same on the clock: it goes on evenly through a restart.
+        Scheduled time of the current tick on the clock; a restart does not change it.
     lateness_ns
         Wake-up latency: time since its deadline, less than a period.
 
@@ -166,7 +165,7 @@ class TickScheduler:
         return self._start_ns
 
     def restart(self) -> None:
-        """Make the next tick tick 0; it is due where it would have been due anyway."""
+        """Make the next tick number 0, without moving its deadline."""
         self._start_ns += round((self.tick + 1) * self._period_ns)
         self.tick = -1
 

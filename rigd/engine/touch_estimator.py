@@ -1,8 +1,9 @@
-"""The touch process: from the samples around a detected touch to where and how hard it was.
+"""The touch process: it estimates the position and force of each detected touch.
 
-It watches the ring of samples as the live publisher does, so that it can neither delay the loop nor
-take a sample from the recorder, and looks for the bit by which the loop marks a detection. It
-begins with the samples that are there 25 ms after it, answers from 50 ms, and again from 200 ms.
+It observes the ring of samples as the live publisher does, so it can neither delay the loop nor
+take a sample from the recorder. The loop marks a detection by a status bit of the sample. The
+estimation starts with the samples of 25 ms after the detection; the first estimate uses 50 ms, and
+the final one 200 ms.
 """
 
 import time
@@ -33,7 +34,7 @@ from rigd.touch.samples import (
 
 _BLOCK = 250
 _IDLE_S, _WAITING_S = 0.005, 0.001
-"""Pause where nothing has come: while nothing has been touched, and while somebody waits."""
+"""Pause without new samples: while there is no touch, and while an estimate is awaited."""
 
 
 def main() -> None:
@@ -55,8 +56,8 @@ def main() -> None:
             touches.take(decode_samples(block))
         else:
             time.sleep(_IDLE_S if touches.idle else _WAITING_S)
-        for told in touches.told():
-            parent.send(told)
+        for report in touches.reports():
+            parent.send(report)
         try:
             if parent.poll(0.0) is not None:
                 return
@@ -66,32 +67,38 @@ def main() -> None:
 
 @dataclass(slots=True)
 class _Waiting:
-    """A touch whose last estimate is to come."""
+    """A touch whose final estimate is pending."""
 
     number: int
     tick: int
     free_from: int
-    """Tick from which the beam was free before."""
+    """First tick at which the beam is free again after the touch before."""
     estimate: GrowingEstimate
-    looked: bool = False
-    told: bool = False
+    previewed: bool = False
+    reported: bool = False
 
 
 class TouchFollower:
-    """Follows the samples of a record, and estimates each touch as soon as there is enough of it.
+    """Follower of a record's samples, which estimates each touch as soon as possible.
 
     Parameters
     ----------
     estimator
         Prepared for the model and the rate.
     job
-        What the process was told.
+        Job of the process.
     """
 
     def __init__(self, estimator: TouchEstimator, job: TouchJob) -> None:
         self._estimator = estimator
         self._job = job
-        self._history, self._look, self._first, self._final, self._contact = (
+        (
+            self._history_ticks,
+            self._preview_ticks,
+            self._first_ticks,
+            self._final_ticks,
+            self._contact_ticks,
+        ) = (
             round(seconds * job.rate_hz)
             for seconds in (HISTORY_S, LOOK_S, FIRST_S, FINAL_S, CONTACT_S)
         )
@@ -99,58 +106,58 @@ class TouchFollower:
         self._waiting: deque[_Waiting] = deque()
         self._free_from = 0
         self._count = 0
-        self._over = False
+        self._record_ended = False
 
     @property
     def idle(self) -> bool:
-        """Whether there is no touch to estimate."""
+        """Whether no touch waits for an estimate."""
         return not self._waiting
 
     def take(self, samples: NDArray[np.void]) -> None:
-        """Take the next samples of the record, shape (n,)."""
-        kept = self._samples
-        self._samples = samples if kept is None else np.concatenate([kept, samples])
+        """Process the next samples of the record, shape (n,)."""
+        earlier = self._samples
+        self._samples = samples if earlier is None else np.concatenate([earlier, samples])
         for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
             estimate = self._estimator.follow()
             self._waiting.append(_Waiting(self._count, tick, self._free_from, estimate))
-            self._free_from = tick + self._contact
-        self._over |= bool(samples["status"][-1] & Status.TORQUE_OFF)
+            self._free_from = tick + self._contact_ticks
+        self._record_ended |= bool(samples["status"][-1] & Status.TORQUE_OFF)
         if not self._waiting:
-            self._samples = self._samples[-self._history :]
+            self._samples = self._samples[-self._history_ticks :]
 
-    def told(self) -> list[TouchTold]:
-        """Return the estimates that can be made by now."""
+    def reports(self) -> list[TouchTold]:
+        """Return the estimates for which there are enough samples."""
         if self._samples is None or not self._waiting:
             return []
         touch = self._waiting[0]
         there = int(self._samples["tick"][-1]) - touch.tick + 1
-        final = self._over or there >= self._final
-        # In real time somebody waits for the first one, even if the record is whole after a look.
+        final = self._record_ended or there >= self._final_ticks
+        # In real time the operator waits for the first estimate, even if the record is complete.
         first = self._job.realtime is not None or not final
-        if there >= self._first and first and not touch.told:
-            touch.told = True
-            return [self._told(touch, self._first, final=False)]
+        if there >= self._first_ticks and first and not touch.reported:
+            touch.reported = True
+            return [self._estimate(touch, self._first_ticks, final=False)]
         if final:
             self._waiting.popleft()
-            return [self._told(touch, self._final, final=True)]
-        if there >= self._look and not touch.looked:
-            touch.looked = True
-            record, _ = self._record(touch, self._look)
+            return [self._estimate(touch, self._final_ticks, final=True)]
+        if there >= self._preview_ticks and not touch.previewed:
+            touch.previewed = True
+            record, _ = self._record(touch, self._preview_ticks)
             touch.estimate.look(record)
         return []
 
-    def _told(self, touch: _Waiting, after: int, *, final: bool) -> TouchTold:
+    def _estimate(self, touch: _Waiting, after: int, *, final: bool) -> TouchTold:
         record, start_s = self._record(touch, after)
         found = touch.estimate.told(record, scan=False, first=not final)
         document = found.as_dict(start_s)
         return TouchTold(touch.number, touch.tick, final, document)
 
     def _record(self, touch: _Waiting, after: int) -> tuple[TouchRecord, float]:
-        """Return the record with so many ticks from the detection on, and when it begins."""
+        """Return the record up to `after` ticks from the detection, and its start in s."""
         assert self._samples is not None
         job = self._job
-        # Soon after another touch nothing before this one may be free: then it is told as unknown.
+        # Soon after another touch the beam may not have been free: the estimate is then unknown.
         free_from = min(touch.free_from, touch.tick)
         part = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
         record = touch_record(part, touch.tick, job.rate_hz, job.shear_projection)

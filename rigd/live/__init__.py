@@ -1,9 +1,9 @@
-"""The live view: a process that shows the samples in Rerun and that nothing waits for.
+"""The live view: a process that shows the samples in Rerun, and for which nothing waits.
 
-Offers the viewer's window (`Viewer`, `Window`), the page for browsers (`PageOfFile`), the views
-that run (`LiveAddress`, `running`) and the jobs of the publisher (`LiveJob`, `LiveSession`). The
-publisher, `rigd.live.publisher`, only looks at the rings: neither the loop nor the recorder can
-feel it. What is drawn is in `rigd.view`.
+The public interface is the viewer's window (`Viewer`, `Window`), the page for browsers
+(`PageOfFile`), the running views (`LiveAddress`, `running`) and the jobs of the publisher
+(`LiveJob`, `LiveSession`). The publisher, `rigd.live.publisher`, only observes the rings, so it
+affects neither the loop nor the recorder. `rigd.view` has the drawings.
 """
 
 import lazy_loader as lazy

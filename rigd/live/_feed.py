@@ -1,8 +1,8 @@
 """Connection from the publisher to the Rerun server, which never blocks and restores itself.
 
-With its server absent or frozen the SDK first buffers without telling, then blocks indefinitely.
-Therefore whatever is sent is flushed with a time limit, and nothing more is handed to the SDK until
-everything before it has left: what waits in the SDK is never more than what was sent at once.
+If its server is absent or frozen, the SDK first buffers silently and then blocks indefinitely.
+Therefore each batch of drawings is flushed with a time limit, and the next one is given to the SDK
+only when the one before has left. The SDK never buffers more than one batch.
 """
 
 import contextlib
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 
 _PATIENCE_S: Final = 0.2
 _STALLED_PATIENCE_S: Final = 0.02
-"""Once it stalls, the session must not be kept waiting again and again."""
-_MOST_STALLED_LOOKS: Final = 200
-"""Looks after which the server is killed: at 20 a second, as the publisher looks, 10 s."""
+"""Timeout of a flush while the server stalls, so that the session is not delayed repeatedly."""
+_MOST_STALLED_POLLS: Final = 200
+"""Polls of a stalled server after which it is killed: 10 s at the publisher's 20 per second."""
 
 
 class Feed:
-    """The recording of one session after the other, sent to the server there is.
+    """Stream of successive sessions' recordings to the present server.
 
     Parameters
     ----------
     outlet
-        Outlet whose server passes it on.
+        Outlet with the server.
 
     Attributes
     ----------
     connections
-        Number of connections that began, each with the frame of what is shown.
+        Number of connections so far, each of which began with the frame of the scene.
     stalled
-        The server does not take what was sent.
+        Whether the server does not accept the last drawings.
     """
 
     def __init__(self, outlet: Outlet) -> None:
@@ -48,32 +48,32 @@ class Feed:
         self._stream: RecordingStream | None = None
         self._server: int | None = None
         self._laid_out: int | None = None
-        self._stalled_looks = 0
+        self._stalled_polls = 0
         self._breaking: list[threading.Thread] = []
         self.connections = 0
         self.stalled = False
 
     def begin(self, recording_id: str, frame: "Callable[[], Iterable[Drawing]]") -> None:
-        """Send to a new recording from now on.
+        """Start a new recording.
 
         Parameters
         ----------
         recording_id
-            Viewers show the latest that comes with another one.
+            Identifier of the recording; viewers switch to a new one.
         frame
-            Asked for what each new connection needs first.
+            Returns the first drawings of each connection.
         """
         self._recording_id, self._frame = recording_id, frame
 
     def ready(self) -> bool:
-        """Connect if need be; say whether something can be sent without waiting."""
-        if not self._outlet.attend():
+        """Connect if necessary; return whether drawings can be sent without waiting."""
+        if not self._outlet.poll():
             self._discard()
             return False
         assert self._outlet.address is not None
         if self._server != self._outlet.address.server:
             self._discard()
-        if self.stalled and not self._goes_on():
+        if self.stalled and not self._recovered():
             return False
         if self._stream is not None and self._stream.get_recording_id() != self._recording_id:
             self._close()
@@ -82,9 +82,9 @@ class Feed:
         return self._stream is not None and not self.stalled
 
     def send(self, drawings: "Iterable[Drawing]") -> bool:
-        """Send drawings, when ready; say whether they are on their way.
+        """Send drawings; return whether the stream has accepted them.
 
-        If the server stalls they wait in the SDK, and are sent when it goes on.
+        If the server stalls, they wait in the SDK until it recovers.
         """
         if self._stream is None:
             return False
@@ -93,18 +93,18 @@ class Feed:
         self._flush(_PATIENCE_S)
         return self._stream is not None
 
-    def _goes_on(self) -> bool:
-        """Whether the server goes on after having stalled; one that never does is ended."""
+    def _recovered(self) -> bool:
+        """Return whether a stalled server has recovered; kill it if it never does."""
         self._flush(_STALLED_PATIENCE_S)
         if self.stalled:
-            self._stalled_looks += 1
-            if self._stalled_looks > _MOST_STALLED_LOOKS:
+            self._stalled_polls += 1
+            if self._stalled_polls > _MOST_STALLED_POLLS:
                 self._outlet.kill_server()
-        # Where the connection broke instead, it is to be seen first what became of the server.
+        # If the connection broke instead, the state of the server is checked first.
         return self._stream is not None and not self.stalled
 
     def _flush(self, patience_s: float) -> None:
-        """Wait a moment for the SDK to have sent everything; notice if it stalls or is cut off."""
+        """Flush the SDK with a timeout, and detect a stalled server or a broken connection."""
         assert self._stream is not None
         try:
             self._stream.flush(timeout_sec=patience_s)
@@ -112,29 +112,29 @@ class Feed:
             if "timed out" in str(error):
                 self.stalled = True
             else:
-                # The connection is broken, and a stream never connects a second time.
+                # The connection is broken, and a stream cannot connect again.
                 self._discard()
         else:
             self.stalled = False
-            self._stalled_looks = 0
+            self._stalled_polls = 0
 
     def _close(self) -> None:
-        """End a stream that has sent everything."""
+        """Close a stream that has sent everything."""
         assert self._stream is not None
-        # Forgetting a stream waits for all that are being let go, and others wait for it.
+        # The clean-up of a stream waits for all others that are closing, and they for it.
         forget = not any(thread.is_alive() for thread in self._breaking)
-        _in_background(_let_go, [self._stream], forget)
+        _in_background(_close_stream, [self._stream], forget)
         self._stream = None
 
     def _discard(self) -> None:
-        """Let go of a stream whose server is gone or another one."""
+        """Close a stream whose server is gone or replaced."""
         if self._stream is not None:
-            # For up to 10 s it tries to reach its server once more; not for us to wait.
+            # In the background, because it tries to reach its server for up to 10 s.
             self._breaking = [thread for thread in self._breaking if thread.is_alive()]
-            self._breaking.append(_in_background(_let_go, [self._stream], False))
+            self._breaking.append(_in_background(_close_stream, [self._stream], False))
         self._stream = None
         self.stalled = False
-        self._stalled_looks = 0
+        self._stalled_polls = 0
 
     def _connect(self) -> None:
         import rerun as rr
@@ -155,10 +155,10 @@ class Feed:
 
 
 class _LaidOut:
-    """A stream to viewers that have their layout already.
+    """A stream to viewers that already have their layout.
 
-    What the operator has moved since stays where it was moved. (Each blueprint that is sent also
-    costs the SDK 2 MB and two threads that it does not give back.)
+    It preserves changes of the layout by the operator. (Each blueprint also costs the SDK 2 MB and
+    two threads that it never releases.)
     """
 
     def __init__(self, stream: "RecordingStream") -> None:
@@ -168,7 +168,7 @@ class _LaidOut:
         return getattr(self._stream, name)
 
     def send_blueprint(self, *_: object, **__: object) -> None:
-        """Leave the layout as it is."""
+        """Do nothing, so that the layout is unchanged."""
 
 
 def _in_background(function: Callable[..., None], *arguments: object) -> threading.Thread:
@@ -177,8 +177,8 @@ def _in_background(function: Callable[..., None], *arguments: object) -> threadi
     return thread
 
 
-def _let_go(streams: "list[RecordingStream]", forget: bool) -> None:
-    """End a stream to which nothing else refers; `forget`: have the SDK give back what it took."""
+def _close_stream(streams: "list[RecordingStream]", forget: bool) -> None:
+    """Close the only reference to a stream; `forget`: release its resources in the SDK."""
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
     with contextlib.suppress(RuntimeError):

@@ -1,9 +1,9 @@
 """Page of the live view for browsers: Rerun's web viewer on loopback, confined to this computer.
 
-Unchanged, Rerun's page loads fonts and sends usage statistics to the internet, from the operator's
-browser. Therefore it is passed on from here, with a policy that browsers enforce: it may load from
-this computer, and from nowhere else. A few lines are added by which it is loaded again when a
-server was replaced: viewers do not connect a second time by themselves.
+Rerun's own page loads fonts from the internet and sends usage statistics there from the operator's
+browser. This module therefore serves the page with a policy by which browsers load from this
+computer only. It adds a script that reloads the page when the server was replaced, because viewers
+do not reconnect by themselves.
 """
 
 import http.client
@@ -23,9 +23,9 @@ from typing import Any, Final
 from rigd.live.address import LOOPBACK, LiveAddress
 
 PAGE_PORT: Final = 9090
-"""Rerun's own, unless another process uses it."""
+"""Rerun's default port, unless another process uses it."""
 _STATE: Final = "live.json"
-"""Tells the page which server there is now."""
+"""File that identifies the present server."""
 _FILES: Final = frozenset(
     {
         _STATE,
@@ -34,12 +34,12 @@ _FILES: Final = frozenset(
 )
 _BLOCK: Final = 65_536
 _PATIENCE_S: Final = 10.0
-_LOOK_S: Final = 0.1
+_POLL_S: Final = 0.1
 _LONGEST_S: Final = 60.0
-"""Longest time of a connection: the viewer has 40 MB, and the tunnel may be slow."""
+"""Longest connection: the viewer has 40 MB, and a tunnel may be slow."""
 _MOST_AT_ONCE: Final = 16
 _OWN_NAMES: Final = frozenset({LOOPBACK, "localhost"})
-"""Any page on the internet can have its own name lead here; it is not to read what this shows."""
+"""Permitted host names: any page on the internet can resolve its own name to loopback."""
 
 _HERE: Final = f"http://{LOOPBACK}:* http://localhost:*"
 _POLICY: Final = "; ".join(
@@ -73,17 +73,17 @@ _AGAIN: Final = """
 """
 
 
-class PageServer:
-    """Serves the page to browsers on this computer, in separate threads.
+class ViewerPageServer:
+    """Server of the page for browsers on this computer, in separate threads.
 
     Parameters
     ----------
     port
-        Port to take on loopback; 0 leaves the choice to the system.
+        Port on loopback; 0: the system chooses one.
     address
-        Asked for the view that there is now; None: none at the moment.
+        Returns the present view; None: there is none.
     upstream
-        Asked for the port on loopback where Rerun itself serves the page; 0: nowhere.
+        Returns the port on loopback at which Rerun itself serves the page; 0: none.
 
     Attributes
     ----------
@@ -105,12 +105,12 @@ class PageServer:
         self._server = _Server(port, address, upstream)
         self.port = self._server.server_port
         self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(_LOOK_S,), daemon=True
+            target=self._server.serve_forever, args=(_POLL_S,), daemon=True
         )
         self._thread.start()
 
     def close(self) -> None:
-        """Take no more connections."""
+        """Stop the server."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -118,18 +118,18 @@ class PageServer:
 
 def serve_page(
     address: Callable[[], LiveAddress | None], upstream: Callable[[], int]
-) -> PageServer:
-    """Serve the page, on :data:`PAGE_PORT` unless that is taken; as for :class:`PageServer`."""
+) -> ViewerPageServer:
+    """Serve the page on :data:`PAGE_PORT` or on a free port if that is taken."""
     try:
-        return PageServer(PAGE_PORT, address, upstream)
+        return ViewerPageServer(PAGE_PORT, address, upstream)
     except OSError:
-        return PageServer(0, address, upstream)
+        return ViewerPageServer(0, address, upstream)
 
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    block_on_close = False  # does not wait for a browser
-    # So that the port of a view that has just ended can be taken; not one where somebody listens.
+    block_on_close = False  # does not wait for browsers
+    # Permits the port of a view that has just ended, but not one with a listener.
     allow_reuse_address = True
 
     def __init__(
@@ -141,27 +141,27 @@ class _Server(ThreadingHTTPServer):
         super().__init__((LOOPBACK, port), _Handler)
 
     def server_bind(self) -> None:
-        """Bind, and spare the base class's look-up of a name for the address."""
+        """Bind without the base class's name resolution of the address."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = LOOPBACK, self.socket.getsockname()[1]
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Take a connection; where that fails for want of descriptors, it would at once again."""
+        """Accept a connection; pause if that fails for lack of descriptors."""
         try:
             return super().get_request()
         except OSError:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - as there
-        """Answer in a thread, if there is room for one more."""
+        """Handle a request in a thread, unless there are too many."""
         if self.room.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Answer, and have the connection cut off if that takes too long."""
+        """Handle a request, and cut off the connection if that takes too long."""
         end = threading.Timer(_LONGEST_S, _cut_off, (request,))
         end.daemon = True
         end.start()
@@ -172,7 +172,7 @@ class _Server(ThreadingHTTPServer):
             self.room.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of a browser that goes away."""
+        """Ignore errors of browsers that disconnect."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -180,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
-        """Answer a browser."""
+        """Handle a request of a browser."""
         host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
         if host in _OWN_NAMES:
             self._answer()
@@ -188,7 +188,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._say(HTTPStatus.FORBIDDEN, f"Open this page as http://{LOOPBACK}:PORT.")
 
     def log_message(self, *_: object) -> None:
-        """Keep quiet: the operator's terminal is for the session."""
+        """Log nothing: the operator's terminal is for the session."""
 
     def _answer(self) -> None:
         split = urllib.parse.urlsplit(self.path)
@@ -196,18 +196,18 @@ class _Handler(BaseHTTPRequestHandler):
         if name not in _FILES:
             self._say(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
-            self._come_again()
+            self._send_retry()
         elif name == _STATE:
             self._send(json.dumps({"server": address.server}).encode(), "application/json")
         elif not name and "url" not in urllib.parse.parse_qs(split.query):
-            # Relative: the browser may have come through a tunnel, from another port.
+            # Relative, because the browser may use a tunnel on another port.
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/?{urllib.parse.urlsplit(address.viewer_url).query}")
             self.end_headers()
         else:
-            self._pass_on(name)
+            self._forward(name)
 
-    def _pass_on(self, name: str) -> None:
+    def _forward(self, name: str) -> None:
         """Send one of Rerun's files."""
         link = http.client.HTTPConnection(LOOPBACK, self.server.upstream(), timeout=_PATIENCE_S)
         try:
@@ -215,11 +215,11 @@ class _Handler(BaseHTTPRequestHandler):
             answer = link.getresponse()
             kind = answer.headers.get("Content-Type", "application/octet-stream")
             if not name:
-                self._send(kept_here(answer.read().decode()).encode(), kind)
+                self._send(confine_to_loopback(answer.read().decode()).encode(), kind)
                 return
             self.send_response(answer.status)
             self.send_header("Content-Type", kind)
-            # Its length, although it comes in pieces.
+            # The length, although the transfer is chunked.
             if (size := answer.headers.get("rerun-final-length")) is not None:
                 self.send_header("Content-Length", size)
             self._end_headers()
@@ -228,12 +228,12 @@ class _Handler(BaseHTTPRequestHandler):
         except (OSError, http.client.HTTPException):
             # The server is being replaced, or the browser is gone.
             with suppress(OSError):
-                self._come_again()
+                self._send_retry()
         finally:
             link.close()
 
-    def _come_again(self) -> None:
-        """Have the browser try again."""
+    def _send_retry(self) -> None:
+        """Make the browser try again."""
         self._say(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", again=True)
 
     def _say(self, status: HTTPStatus, text: str, *, again: bool = False) -> None:
@@ -262,6 +262,6 @@ def _cut_off(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def kept_here(page: str) -> str:
-    """Return Rerun's page without links to other computers, and with what connects it again."""
+def confine_to_loopback(page: str) -> str:
+    """Return Rerun's page without links to other computers, and with the reload script."""
     return _REMOTE_LINK.sub("", page).replace("</body>", f"{_AGAIN}</body>", 1)

@@ -1,4 +1,4 @@
-"""Rerun's program as a child process: quiet, on loopback, and gone when this process is."""
+"""Rerun's program as a child process: silent, on loopback only, and ending with this process."""
 
 import collections
 import ctypes
@@ -19,22 +19,22 @@ from rigd.view.rrd_file import without_settings
 _NOWHERE = f"http://{LOOPBACK}:9"
 """The discard port, on which no process listens."""
 _QUIET: Mapping[str, str] = {
-    # How Rerun is told, for one process, to send no usage data.
+    # With this variable Rerun sends no usage data.
     "CI": "1",
-    # What it would look up on the web (newer versions, examples) is refused on this computer. Its
-    # own connections to viewers and recordings know of no proxy.
+    # Its requests to the web (newer versions, examples) fail on this computer. Its connections to
+    # viewers and recordings ignore proxies.
     **dict.fromkeys(("ALL_PROXY", "HTTPS_PROXY", "HTTP_PROXY"), _NOWHERE),
     **dict.fromkeys(("all_proxy", "https_proxy", "http_proxy"), _NOWHERE),
     "NO_PROXY": "",
     "no_proxy": "",
-    # Its log is where it tells its ports: readable, whatever the user has set.
+    # Its log contains its ports, so it must be readable whatever the user has set.
     "RUST_LOG": "info",
     "NO_COLOR": "1",
 }
 _LISTENING = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
 _SERVING_PAGE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
 _NO_GRAPHICS = re.compile(
-    # Neither Vulkan nor OpenGL; OpenGL alone, of which Mesa offers too little in software.
+    # Neither Vulkan nor OpenGL, or only OpenGL, which is incomplete in Mesa's software renderer.
     "[Nn]o (suitable )?(graphics|wgpu) adapter|Failed to get render context"
 )
 _MOMENT_S: Final = 0.5
@@ -43,7 +43,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class RerunError(FailureError):
-    """Rerun's program cannot be run."""
+    """Rerun's program cannot run."""
 
 
 class RerunProgram:
@@ -59,7 +59,7 @@ class RerunProgram:
     Raises
     ------
     RerunError
-        If the program is not there or does not run.
+        If the program is missing or cannot be started.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RerunProgram:
         self._ports: dict[re.Pattern[str], int] = {}
         self._last_lines: collections.deque[str] = collections.deque(maxlen=3)
         self._without_graphics = False
-        # Read to the end: a program whose output is not read would block once the pipe is full.
+        # Read to the end: a program blocks if its output fills the pipe.
         self._reader = threading.Thread(target=self._read_log, daemon=True)
         self._reader.start()
 
@@ -93,43 +93,43 @@ class RerunProgram:
 
     @property
     def running(self) -> bool:
-        """Whether the process exists, be it frozen."""
+        """Whether the process exists, even if it is frozen."""
         return self._process.poll() is None
 
     @property
     def exit_code(self) -> int | None:
-        """How it ended; None while it is running."""
+        """Exit code; None while it is running."""
         return self._process.poll()
 
     @property
     def grpc_port(self) -> int:
-        """Port for connections; 0: none yet."""
+        """Port for connections; 0: not known yet."""
         return self._ports.get(_LISTENING, 0)
 
     @property
     def page_port(self) -> int:
-        """Port of the web viewer's page, if it is to serve one; 0: none yet."""
+        """Port of the web viewer's page; 0: not known yet, or no page."""
         return self._ports.get(_SERVING_PAGE, 0)
 
     @property
     def last_words(self) -> str:
         """The last lines of its log."""
         self._read_on()
-        return " ".join(self._last_lines) or "it said nothing"
+        return " ".join(self._last_lines) or "it wrote no log"
 
     @property
     def without_graphics(self) -> bool:
-        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        """Whether its log reports that the computer has no usable graphics."""
         self._read_on()
         return self._without_graphics
 
     def kill(self) -> None:
-        """End it at once; there is nothing in it to be saved."""
+        """Kill the process; it has nothing to save."""
         self._process.kill()
         self._process.wait()
 
     def _read_on(self) -> None:
-        # To its end, if it has one: what a program says last is read when it has long ended.
+        # After the process has ended, read the log to its end.
         self._reader.join(timeout=_MOMENT_S if self.running else _MOST_READING_S)
 
     def _read_log(self) -> None:
@@ -137,7 +137,7 @@ class RerunProgram:
         with self._process.stdout as log:
             for line in log:
                 self._last_lines.append(line.strip()[:200])
-                # A backtrace follows it, so that it is not among the last words.
+                # A backtrace follows this line, so it is not among the last lines.
                 self._without_graphics |= _NO_GRAPHICS.search(line) is not None
                 for pattern in (_LISTENING, _SERVING_PAGE):
                     if found := pattern.search(line):
@@ -145,7 +145,7 @@ class RerunProgram:
 
 
 def _path() -> str:
-    # Not the `rerun` command on the path: that is a script; ending it leaves the program behind.
+    # Not the `rerun` command on the path, a script: ending it would leave the program running.
     package = importlib.util.find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise RerunError("The Python package rerun-sdk is not installed; the live view needs it.")

@@ -20,14 +20,14 @@ Records = TypeVar("Records")
 
 @dataclass(frozen=True, slots=True)
 class Harvest:
-    """Records that came since the last time, as drawings.
+    """Drawings of the records since the last call.
 
     Attributes
     ----------
     notes
-        Draw what happened, which is not to be left out.
+        Drawings of events, which must not be dropped.
     drawings
-        Draw everything else.
+        All other drawings.
     samples
         Number of samples that the drawings show for the first time.
     """
@@ -38,9 +38,9 @@ class Harvest:
 
 
 class Intake:
-    """Reads the rings of one session, from its first record to its last.
+    """Reader of one session's rings, from its first record to its last.
 
-    What cannot be read in time is overwritten, which is counted; the writer never waits.
+    Records that are overwritten before they are read are counted; the writer never waits.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ class Intake:
     channels
         The memory of the rig's processes.
     seen
-        Samples that another publisher showed before this one took over, counted as `begins` is:
-        those that are still there are read again, for the scene is made of them.
+        Number of samples that an earlier publisher showed, counted as `begins` is. Those still in
+        the ring are read again for the scene.
     last
         Response of the last session of the same specimen.
 
@@ -77,7 +77,7 @@ class Intake:
         self._rate_hz = session.subject.rate_hz
         self._seen = seen
         self._readers = {
-            topic: _Reader(ring, first, seen if topic is SAMPLE else 0)
+            topic: _RingReader(ring, first, seen if topic is SAMPLE else 0)
             for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
             if topic.live
         }
@@ -94,17 +94,17 @@ class Intake:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the session is over, and all of it has been read."""
+        """Whether the session is over and completely read."""
         return all(reader.exhausted for reader in self._readers.values())
 
     def end(self, ends: Sequence[int]) -> None:
-        """Take note of how many records each ring had when the session ended."""
+        """Set the number of records in each ring at the end of the session."""
         for topic, end in zip(TOPICS, ends, strict=True):
             if topic in self._readers:
                 self._readers[topic].end = end
 
     def take(self) -> Harvest:
-        """Read what has come, and put it into the scene."""
+        """Return the drawings of the new records, from the scene."""
         picture, readers = self.picture, self._readers
         notes: list[Drawing] = []
         drawings: list[Drawing] = []
@@ -122,12 +122,12 @@ class Intake:
         return Harvest(notes, drawings, fresh)
 
 
-class _Reader:
-    """The part of one ring that a session wrote."""
+class _RingReader:
+    """Reader of one session's records in a ring."""
 
     def __init__(self, ring: Ring, first: int, seen: int) -> None:
         self._ring = ring
-        # What was seen and has been overwritten since is not dropped.
+        # Overwritten records that an earlier publisher showed do not count as dropped.
         self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
         self._damaged = 0
         self.end: int | None = None
@@ -145,11 +145,11 @@ class _Reader:
         return self.end is not None and self._observer.next >= self.end
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
-        """Yield what has come up to now, in pieces."""
+        """Yield the present records in decoded blocks."""
         observer, written = self._observer, self._ring.written
         last = written if self.end is None else min(self.end, written)
         while True:
-            observer.take(0)  # past what has been overwritten
+            observer.take(0)  # skip overwritten records
             if observer.next >= last:
                 return
             block = observer.take(last - observer.next)

@@ -1,8 +1,8 @@
-"""Server of the live view: takes what the publisher sends, and passes it on to any viewers.
+"""Server of the live view, which forwards the publisher's drawings to any number of viewers.
 
-It is a separate process because a slow or frozen viewer then delays nothing else, and because
-the SDK's own server listens on every interface. Viewers connect to it without any authentication,
-so it must never be reachable from another machine.
+It is a separate process so that a slow or frozen viewer delays nothing else, and because the SDK's
+own server listens on every interface. Viewers connect without authentication, so the server must
+never be reachable from another computer.
 """
 
 import socket
@@ -15,20 +15,20 @@ from rigd.live._program import RerunError, RerunProgram
 from rigd.live.address import LOOPBACK, LiveAddress, announce, withdraw
 
 GRPC_PORT: Final = 9876
-"""Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""
+"""Rerun's default port, which viewers use by default and tunnels can forward in advance."""
 _BACKLOG: Final = "16MiB"
-"""Data that a viewer which joins late is sent first: some 80 s."""
+"""Stored data for viewers that connect late: about 80 s."""
 _MOST_SESSIONS: Final = 20
-"""Each leaves some 300 kB of layout and charts in the server; then another takes its place."""
+"""Sessions per server: each leaves about 300 kB of layout and charts in it."""
 _START_S: Final = 15.0
-"""Time in which a server has to accept connections, on a busy computer."""
+"""Longest start of a server, on a busy computer."""
 _ANSWER_S: Final = 0.1
 _PAUSE_S: Final = 1.0
 """Least time between two starts of a server."""
 
 
 class Outlet:
-    """A Rerun server that is replaced when it ends, and how viewers find it.
+    """A Rerun server that is replaced when it ends, with its announced address.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ class Outlet:
     Attributes
     ----------
     address
-        Address of the server that accepts connections now; None while there is none.
+        Address of the present server; None while none accepts connections.
 
     Raises
     ------
     RerunError
-        If Rerun's program cannot be run.
+        If Rerun's program cannot be started.
     """
 
     def __init__(self, rig: str) -> None:
@@ -63,7 +63,7 @@ class Outlet:
             If it ends or does not answer.
         """
         deadline = time.monotonic() + 2 * _START_S
-        while not self.attend():
+        while not self.poll():
             if not self._program.running:
                 if not self._grpc_port:
                     raise RerunError(f"The Rerun server ended: {self._program.last_words}.")
@@ -75,23 +75,24 @@ class Outlet:
         assert self.address is not None
         return self.address
 
-    def attend(self) -> bool:
-        """Look after the server; say whether one takes connections."""
+    def poll(self) -> bool:
+        """Check and replace the server if necessary; return whether it accepts connections."""
         program = self._program
         if program.running and program.grpc_port and program.page_port:
             if self.address is None:
-                self._tell()
+                self._announce()
             return True
         self.address = None
         age_s = time.monotonic() - self._started_s
         if age_s > _START_S:
-            program.kill()  # it mistook a listener on its port for its like, and serves no one
+            # It mistook a listener on its port for another Rerun server, and serves nothing.
+            program.kill()
         if age_s > _PAUSE_S and not program.running:
             self._replace()
         return False
 
     def answers(self) -> bool:
-        """Whether the server takes connections now: the SDK waits 5 s for one that does not."""
+        """Return whether the server accepts connections: otherwise the SDK would wait 5 s."""
         try:
             socket.create_connection((LOOPBACK, self._grpc_port), _ANSWER_S).close()
         except OSError:
@@ -99,31 +100,31 @@ class Outlet:
         return True
 
     def begin_session(self) -> None:
-        """Make room for a session: what stays of each, the server never forgets by itself."""
+        """Count a session; replace the server after many, because it never frees their data."""
         self._sessions += 1
         if self._sessions > _MOST_SESSIONS:
             self.kill_server()
 
     def kill_server(self) -> None:
-        """End the server, which does not answer any more; another one takes its place."""
+        """Kill the server, which is then replaced."""
         self._program.kill()
 
     def close(self) -> None:
-        """End the server, and what leads to it."""
+        """End the server and withdraw its address."""
         self._program.kill()
         self._page.close()
         if self._announced is not None:
-            with suppress(OSError):  # who looks there sees that its process has ended
+            with suppress(OSError):  # readers of the file notice that its process has ended
                 withdraw(self._announced)
 
     def _replace(self) -> None:
-        """Start another server: on the same port, where viewers and tunnels look for it.
+        """Start another server, on the same port for viewers and tunnels.
 
-        If the last one never served, it found that port taken.
+        If the last one never served, the port was taken, and the system chooses another.
         """
         if not self._program.grpc_port:
             self._grpc_port = 0
-        with suppress(RerunError):  # to be tried again
+        with suppress(RerunError):  # `poll` tries again
             self._start()
 
     def _start(self) -> None:
@@ -138,19 +139,19 @@ class Outlet:
             )
         )
 
-    def _tell(self) -> None:
+    def _announce(self) -> None:
         self._grpc_port = self._program.grpc_port
         self.address = self._announced = LiveAddress.of_this_process(
             self._rig, self._grpc_port, self._page.port, time.time_ns()
         )
-        with suppress(OSError):  # the view is there all the same
+        with suppress(OSError):  # the view works nevertheless
             announce(self.address)
 
 
 def free_port(wanted: int) -> int:
-    """Return a port if no process listens on it, or 0, which leaves the choice to the system.
+    """Return a port if no process listens on it, or 0, with which the system chooses one.
 
-    Rerun's program is not to find out: it may take who listens there for its like.
+    Rerun's program cannot check this itself: it may mistake a listener for another Rerun server.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         # Connections of a server that has just ended do not count.

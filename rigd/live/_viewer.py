@@ -1,4 +1,4 @@
-"""Rerun's native viewer: a window on a live view, or on a file; and the page for a file."""
+"""Rerun's native viewer: a window for a live view or a file, and the page for a file."""
 
 import contextlib
 import threading
@@ -13,39 +13,33 @@ from rigd.live.address import LiveAddress, proxy_url
 from rigd.runtime.addresses import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"
-"""Limit beyond which the oldest data are dropped: a session of some hours has room."""
+"""Limit beyond which the oldest data are dropped: enough for a session of some hours."""
 _START_S: Final = 30.0
-"""Time in which a server has to accept connections."""
-_LOOK_S: Final = 0.05
+"""Longest start of a server."""
+_POLL_S: Final = 0.05
 
 
 # File in a window or a browser
 
 
 class _Playback:
-    """Rerun's program with a file, as long as this context is entered."""
+    """Rerun's program, which ends with this context."""
 
     _program: RerunProgram
 
     @property
     def program(self) -> RerunProgram:
-        """The program itself."""
+        """Rerun's program."""
         return self._program
 
     def wait(self) -> int:
-        """Wait until it ends: a window when it is closed, a server not by itself.
-
-        Returns
-        -------
-        int
-            Its exit code.
-        """
+        """Wait until the program ends, such as a closed window, and return its exit code."""
         while (code := self._program.exit_code) is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         return code
 
     def close(self) -> None:
-        """End it."""
+        """End the program."""
         self._program.kill()
 
     def __enter__(self) -> Self:
@@ -56,23 +50,10 @@ class _Playback:
 
 
 class _Window(_Playback):
-    """The viewer's window. What the user has set in Rerun's own viewer is not used, nor changed.
+    """The viewer's window, which neither uses nor changes the user's settings of Rerun.
 
-    Parameters
-    ----------
-    shown
-        Command line that says what is shown first.
-    memory
-        Limit beyond which the oldest data are dropped.
-    scratch
-        Folder in which Rerun may leave files: it does when it is ended.
-    options
-        More of the program's command line.
-
-    Raises
-    ------
-    RerunError
-        If Rerun's program cannot be run.
+    `shown` is the command line for its first contents, `memory` the limit beyond which the oldest
+    data are dropped, and `scratch` a folder for files that Rerun leaves when it is killed.
     """
 
     def __init__(
@@ -91,7 +72,7 @@ class _Window(_Playback):
 
     @property
     def fault(self) -> str:
-        """Why it was closed, if not by the user: a sentence."""
+        """Reason, as a sentence, if the window was not closed by the user."""
         if self._program.without_graphics:
             return (
                 "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's "
@@ -102,21 +83,21 @@ class _Window(_Playback):
 
 
 class Window(_Window):
-    """The viewer's window on a file.
+    """The viewer's window for a file.
 
     Parameters
     ----------
     path
         Path of the recording.
     scratch
-        Folder in which Rerun may leave files: it does when it is ended.
+        Folder for files that Rerun leaves when it is killed.
     options
-        More of the program's command line.
+        Further options of the command line.
 
     Raises
     ------
     RerunError
-        If Rerun's program cannot be run.
+        If Rerun's program cannot be started.
     """
 
     def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
@@ -124,14 +105,14 @@ class Window(_Window):
 
 
 class PageOfFile(_Playback):
-    """The viewer's page on a file, on loopback.
+    """The viewer's page for a file, on loopback.
 
     Parameters
     ----------
     path
         Path of the recording.
     scratch
-        Folder in which Rerun may leave files.
+        Folder for files that Rerun leaves.
 
     Attributes
     ----------
@@ -141,7 +122,7 @@ class PageOfFile(_Playback):
     Raises
     ------
     RerunError
-        If Rerun's program cannot be run, or takes no connections.
+        If Rerun's program cannot be started, or accepts no connections.
     """
 
     def __init__(self, path: Path, scratch: Path) -> None:
@@ -158,7 +139,7 @@ class PageOfFile(_Playback):
         )
 
     def close(self) -> None:
-        """Take the page away."""
+        """Close the page and end the program."""
         self._page.close()
         super().close()
 
@@ -181,12 +162,12 @@ class PageOfFile(_Playback):
             if not self._program.running:
                 if anywhere or self._program.grpc_port:
                     raise RerunError(f"The Rerun server ended: {self._program.last_words}.")
-                # Most likely another was quicker to take the port.
+                # Most likely another process has taken the port.
                 anywhere = True
                 self._serve(0)
             if time.monotonic() > deadline:
                 raise RerunError(f"The Rerun server does not answer: {self._program.last_words}.")
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
 
 
 # Window on a live view
@@ -198,21 +179,21 @@ _HOSTS: Final = ("127.0.0.1", "localhost")
 
 
 class Viewer(_Window):
-    """The viewer's window on live views.
+    """The viewer's window for live views.
 
     Parameters
     ----------
     address
-        Live view that is shown first.
+        First live view to show.
     scratch
-        Folder in which Rerun may leave files: it does when it is ended.
+        Folder for files that Rerun leaves when it is killed.
     options
-        More of the program's command line.
+        Further options of the command line.
 
     Raises
     ------
     RerunError
-        If Rerun's program cannot be run.
+        If Rerun's program cannot be started.
     """
 
     def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
@@ -228,7 +209,7 @@ class Viewer(_Window):
 
     @property
     def exit_code(self) -> int | None:
-        """How it ended; None while the window is open."""
+        """Exit code; None while the window is open."""
         return self._program.exit_code
 
     @property
@@ -238,30 +219,29 @@ class Viewer(_Window):
 
     @property
     def without_graphics(self) -> bool:
-        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        """Whether its log reports that the computer has no usable graphics."""
         return self._program.without_graphics
 
     @property
     def control_url(self) -> str:
-        """Address at which the viewer accepts commands; empty: none yet."""
+        """Address at which the viewer accepts commands; empty: not known yet."""
         port = self._program.grpc_port
         return proxy_url(_HOSTS[0], port) if port else ""
 
     def connect(self, address: LiveAddress) -> bool:
-        """Show a live view whose server is another one than before; say whether that was done.
+        """Connect to a live view whose server was replaced; return whether that succeeded.
 
-        The viewer connects to an address once. To have it connect again, it is given another name
-        of the same place. Earlier sessions are forgotten: it would go to the first of them instead
-        of staying with the one that is shown.
+        The viewer connects to an address only once. It therefore gets another name of the same
+        address. Its earlier sessions are closed, because it would switch to the first of them.
         """
         if not self.control_url or (self._connecting and self._connecting.is_alive()):
             return False
         self._connections += 1
         url = self._next_url(address)
         done: list[bool] = []
-        # A window that is frozen never answers, and who waits for it in here hears no Ctrl-C.
+        # In a thread, because a frozen window never responds, and the wait would block Ctrl-C.
         self._connecting = threading.Thread(
-            target=_have_it_connect, args=(self.control_url, url, done), daemon=True
+            target=_switch_server, args=(self.control_url, url, done), daemon=True
         )
         self._connecting.start()
         self._connecting.join(_ANSWER_S)
@@ -271,8 +251,8 @@ class Viewer(_Window):
         return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)
 
 
-def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
-    """Have a viewer go on to another server; `done` gets an item if it did."""
+def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
+    """Switch a viewer to another server; append to `done` on success."""
     from rerun.experimental import ViewerClient
 
     try:
@@ -281,9 +261,9 @@ def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
         earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
         if earlier:
             client.close(store_ids=earlier)
-        with contextlib.suppress(ConnectionError):  # nothing came from there
+        with contextlib.suppress(ConnectionError):  # it received nothing from there
             client.close(url)
         client.open(url)
-    except (OSError, RuntimeError):  # it is busy, or about to end
+    except (OSError, RuntimeError):  # the viewer is busy or about to end
         return
     done.append(True)

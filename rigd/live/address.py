@@ -1,6 +1,6 @@
-"""Address of a live view: one small file in the user's runtime folder as long as there is one.
+"""Address of a live view, in a small file of the user's runtime folder while the view runs.
 
-A file that a killed process left is recognised by that process being gone.
+The file of a killed process is recognised because the process is gone.
 """
 
 import os
@@ -25,7 +25,7 @@ _SUFFIX: Final = ".json"
 
 @dataclass(frozen=True, slots=True)
 class LiveAddress:
-    """A live view that runs.
+    """Address of a running live view.
 
     Attributes
     ----------
@@ -34,14 +34,13 @@ class LiveAddress:
     pid
         Process of the publisher.
     born
-        When that process was started, in clock ticks since the computer was: no other process has
-        both numbers.
+        Start of that process in clock ticks since boot; together with `pid` it is unique.
     grpc_port
-        Port on loopback, for native viewers.
+        Port on loopback for native viewers.
     page_port
-        Port on loopback, for browsers.
+        Port on loopback for browsers.
     server
-        Number of the server, another for each: viewers do not connect a second time by themselves.
+        Unique number of the server, by which viewers notice a replacement.
     """
 
     rig: str
@@ -62,7 +61,7 @@ class LiveAddress:
         grpc_port, page_port
             Ports on loopback, for native viewers and for browsers.
         server
-            Number of the server, another for each.
+            Unique number of the server.
         """
         pid = os.getpid()
         return cls(rig, pid, started_at(pid) or 0, grpc_port, page_port, server)
@@ -79,13 +78,13 @@ class LiveAddress:
 
     @property
     def viewer_url(self) -> str:
-        """Where :attr:`page_url` leads to: the page, told which server to show."""
+        """Target of :attr:`page_url`: the page with the address of the server."""
         query = urllib.parse.urlencode({"url": self.proxy_url})
         return f"{self.page_url}/?{query}"
 
     @property
     def alive(self) -> bool:
-        """Whether its process still runs."""
+        """Whether the process still runs."""
         return started_at(self.pid) == self.born
 
 
@@ -103,18 +102,18 @@ def proxy_url(host: str, grpc_port: int) -> str:
 
 
 def announce(address: LiveAddress) -> None:
-    """Write down where a live view is, for this user only, until :func:`withdraw`.
+    """Write the address of a live view to its file, for this user only.
 
     Raises
     ------
     OSError
-        If that cannot be written.
+        If the file cannot be written.
     """
     write_address(_file(address.rig), asdict(address))
 
 
 def withdraw(address: LiveAddress) -> None:
-    """Take the address away, unless it is another's by now."""
+    """Delete the file of an address, unless it belongs to another process by now."""
     path = _file(address.rig)
     found = _read(path)
     if found is not None and (found.pid, found.born) == (address.pid, address.born):
@@ -122,13 +121,13 @@ def withdraw(address: LiveAddress) -> None:
 
 
 def find(rig: str) -> LiveAddress | None:
-    """Return the live view of a rig, if one runs."""
+    """Return the address of a rig's live view; None if none runs."""
     address = _read(_file(rig))
     return address if address is not None and address.alive else None
 
 
 def running() -> list[LiveAddress]:
-    """Return all live views of this user."""
+    """Return the addresses of all live views of this user."""
     found = map(_read, address_files(f"{_PREFIX}*{_SUFFIX}"))
     return [address for address in found if address is not None and address.alive]
 
@@ -138,7 +137,7 @@ def _file(rig: str) -> Path:
 
 
 def _read(path: Path) -> LiveAddress | None:
-    """Return what a file says, None if it is none of ours: its text ends up on terminals."""
+    """Return the address in a file; None if it is invalid, because it is shown on terminals."""
     found = read_address(path)
     try:
         address = LiveAddress(**found)
@@ -148,7 +147,7 @@ def _read(path: Path) -> LiveAddress | None:
 
 
 def _is_sound(found: dict[str, object]) -> bool:
-    """Whether what a file holds can be an address."""
+    """Return whether the contents of a file are a valid address."""
     rig = found.pop("rig")
     ports = (found["grpc_port"], found["page_port"])
     return (

@@ -14,16 +14,16 @@ from rigd.view import Subject
 
 @dataclass(frozen=True, slots=True)
 class LiveJob:
-    """The rig whose sessions are shown.
+    """Job of the publisher for a rig.
 
     Attributes
     ----------
     rig
-        The profile's name, by which the view is found.
+        Name of the profile, by which the view is found.
     channels
-        The shared memory of the rig's processes.
+        Shared memory of the rig's processes.
     linger_s
-        How long the view stays open after the last session.
+        Time for which the view stays open after the last session.
     """
 
     rig: str
@@ -38,14 +38,14 @@ class LiveSession:
     Attributes
     ----------
     subject
-        What the views need to know of it.
+        Data of the session for its views.
     recording_id
-        By which viewers tell it from others; the same for a publisher that takes it over.
+        Identifier of the session in viewers, also for a publisher that takes over.
     begins
-        How many records had been written to each ring before it, in the order of
+        Number of records in each ring before the session, in the order of
         :data:`rigd.engine.channels.TOPICS`.
     folder
-        Folder of its file, where the sessions before it are; None: it is not known.
+        Folder of its file and of earlier sessions; None: unknown.
     """
 
     subject: Subject
@@ -59,27 +59,27 @@ class LiveTouches:
     """Estimates of touches in the session that is shown."""
 
     touches: tuple[Mapping[str, Any], ...]
-    """As in JSON documents; a later estimate of a touch takes the place of an earlier one."""
+    """Touches as in JSON documents; a later estimate of a touch replaces an earlier one."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveFit:
-    """Fit of the record so far, of the session that is shown."""
+    """Fit of the record so far, in the session that is shown."""
 
     fit: Mapping[str, Any]
-    """As in JSON documents; it takes the place of the one before."""
+    """Fit as in JSON documents; it replaces the one before."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveEnd:
-    """The end of a session that is shown.
+    """End of the session that is shown.
 
     Attributes
     ----------
     ends
-        How many records each ring had then, as :attr:`LiveSession.begins`.
+        Number of records in each ring at the end, as :attr:`LiveSession.begins`.
     outcome, reason
-        How the session ended, if that is known.
+        Outcome of the session and its reason; empty if unknown.
     """
 
     ends: tuple[int, ...]
@@ -92,4 +92,4 @@ class LiveShown:
     """A session is shown from now on."""
 
     recording_id: str
-    """That of its :class:`LiveSession`."""
+    """Identifier of its :class:`LiveSession`."""

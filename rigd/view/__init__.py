@@ -1,9 +1,9 @@
-"""What Rerun shows of a session: its layout, and the drawing of samples, events and health.
+"""Display of a session in Rerun: its layout, and the drawing of samples, events and health.
 
-Offers the scene of a session (`Scene`), which turns records into drawings, recorded sessions and
-Rerun's files (`draw_session`, `new_rrd_file`), and charts over frequency (`Chart`). Rerun takes
-half a second to import, so it is imported by the functions that need it. Viewers, servers and
-processes are in `rigd.live`.
+The public interface is the scene of a session (`Scene`), which turns records into drawings,
+recorded sessions and Rerun files (`draw_session`, `new_rrd_file`), and charts over frequency
+(`Chart`). Rerun takes half a second to import, so only the functions that need it import it.
+Viewers, servers and processes are in `rigd.live`.
 """
 
 import lazy_loader as lazy

@@ -1,11 +1,11 @@
 """The antenna in 3D: its motor, and the beam as it turns and bends, seen from behind the motor.
 
-The bend is computed, from the measured angle and the exact model; no sensor sees it.
+The bend is computed from the measured angle and the exact model; no sensor measures it.
 
 Lengths are drawn in beam lengths, so that every antenna fills the same picture. The beam points
-along x and the motor turns it about z. What moves it across is drawn larger than it is, angle and
-bend by the same factor: so nodes stay where they are, and a tip that rests is drawn at rest. Where
-the motor goes far, in moves and searches, all is drawn to scale.
+along x, and the motor turns it about z. Angle and bend are exaggerated by the same factor: nodes
+are drawn at their true positions, and a tip at rest is drawn at rest. In moves and searches, with
+their large angles, everything is drawn to scale.
 """
 
 import collections
@@ -40,32 +40,32 @@ LABEL: Final = f"{ANTENNA}/label"
 TOUCH: Final = f"{ANTENNA}/touch"
 
 FACTOR: Final = 2.0
-"""How many times larger than it is motion across the beam is drawn.
+"""Factor by which motion across the beam is exaggerated.
 
-The paper's chirp turns the motor by 25 mrad, and when it passes the first resonance the tip swings
-by a third of the beam's length: the one is still seen, the other still in the picture.
+The reference paper's chirp turns the motor by 25 mrad, and at the first resonance the tip swings by
+a third of the beam's length: with this factor the former is visible, and the latter in the picture.
 """
 _TO_SCALE: Final = ("move", "touch")
 TITLE: Final = "Antenna"
 
 DRAWN_HZ: Final = 20.0
 TRAIL_S: Final = 0.5
-"""Time that each drawn shape stays visible: the shapes show where the beam swings."""
+"""Time for which each drawn shape stays visible, so that the shapes show the range of motion."""
 
-_LOOKS_HZ: Final = 100.0
-"""How often the tip is looked at for its largest deflection."""
-_SELDOM_HZ: Final = 4.0
-"""Rate at which slow items are sent: the label, and the trail."""
+_SHAPE_HZ: Final = 100.0
+"""Rate at which the deflected shape is computed, for the largest deflection of the tip."""
+_LABEL_HZ: Final = 4.0
+"""Rate at which the label and the trail are sent."""
 _LONGEST_GAP_S: Final = 10.0
 """Longest gap of missing samples that is filled."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
-"""First mode's, where the profile has no damping; the least of the paper's fits has half."""
+"""Damping ratio of the first mode if the profile has none; the reference paper's lowest is half."""
 
-_REMEMBERED_S: Final = 30.0
-"""For so long the shapes are kept on which a touch can be drawn."""
+_STORED_S: Final = 30.0
+"""Time for which shapes are stored, so that a touch can be drawn on them."""
 _ARROW_PER_N: Final = 0.2
 _LONGEST_ARROW: Final = 0.4
-"""Arrow of a contact force, in beam lengths."""
+"""Longest arrow of a contact force, in beam lengths."""
 
 _HOUSING: Color = (105, 110, 120)
 _METAL: Color = (140, 145, 155)
@@ -73,7 +73,7 @@ _PAST: Color = (70, 115, 145)
 
 
 class Antenna:
-    """Follows the beam of one session and draws it.
+    """Drawing of the beam during one session.
 
     Parameters
     ----------
@@ -86,19 +86,19 @@ class Antenna:
         self._filter = DeflectionFilter(subject.beam, damping, subject.rate_hz)
         self._rate_hz = subject.rate_hz
         self._length_m = subject.beam.length_m
-        self._look_ticks = max(1, round(subject.rate_hz / _LOOKS_HZ))
-        looks_hz = subject.rate_hz / self._look_ticks
-        self._looks_a_drawing = math.ceil(looks_hz / DRAWN_HZ)
-        self._seldom_looks = math.ceil(looks_hz / _SELDOM_HZ)
-        self._looks = 0
-        lately = max(1, round(looks_hz * TRAIL_S))
-        self._tips_m: collections.deque[float] = collections.deque(maxlen=lately)
+        self._shape_ticks = max(1, round(subject.rate_hz / _SHAPE_HZ))
+        shape_hz = subject.rate_hz / self._shape_ticks
+        self._shapes_per_drawing = math.ceil(shape_hz / DRAWN_HZ)
+        self._shapes_per_label = math.ceil(shape_hz / _LABEL_HZ)
+        self._shape_count = 0
+        trail_shapes = max(1, round(shape_hz * TRAIL_S))
+        self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shapes)
         self._to_scale = subject.excitation in _TO_SCALE
         self._newest: tuple[int, Real] | None = None  # tick; time and angle
-        self._waiting: Real = np.zeros((0, 2))  # times and angles since the last look
+        self._waiting: Real = np.zeros((0, 2))  # times and angles since the last shape
         self._trail: list[_Moment] = []  # not yet sent
         self._shapes: collections.deque[_Moment] = collections.deque(
-            maxlen=round(_REMEMBERED_S * DRAWN_HZ)
+            maxlen=round(_STORED_S * DRAWN_HZ)
         )
 
     def frame(self) -> list["Drawing"]:
@@ -106,27 +106,27 @@ class Antenna:
         return static_drawings()
 
     def samples(self, samples: Records) -> list["Drawing"]:
-        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; across gaps the angle is interpolated.
+        """Return the drawings of samples (n,) of ``SAMPLE_DTYPE``, in order.
 
-        What comes back draws the beam at 20 moments a second.
+        They draw the beam 20 times per second. Across gaps the angle is interpolated.
         """
         if len(samples) == 0:
             return []
         samples = np.concatenate([self._waiting, self._at_every_tick(samples)])
-        looks = len(samples) // self._look_ticks
-        self._waiting = samples[looks * self._look_ticks :]
+        count = len(samples) // self._shape_ticks
+        self._waiting = samples[count * self._shape_ticks :]
         moments: list[_Moment] = []
         labels: list[Drawing] = []
-        for look in samples[: looks * self._look_ticks].reshape(looks, self._look_ticks, 2):
-            deflection_m = self._filter.feed(look[:, 1])
+        for step in samples[: count * self._shape_ticks].reshape(count, self._shape_ticks, 2):
+            deflection_m = self._filter.feed(step[:, 1])
             self._tips_m.append(abs(float(deflection_m[-1])))
-            self._looks += 1
-            t_ns, angle_rad = int(look[-1, 0]), float(look[-1, 1])
-            if self._looks % self._looks_a_drawing == 0:
+            self._shape_count += 1
+            t_ns, angle_rad = int(step[-1, 0]), float(step[-1, 1])
+            if self._shape_count % self._shapes_per_drawing == 0:
                 deflection = deflection_m / self._length_m
                 drawn = (to_scale if self._to_scale else lines)(angle_rad, deflection)
                 moments.append((t_ns, drawn))
-            if self._looks % self._seldom_looks == 0:
+            if self._shape_count % self._shapes_per_label == 0:
                 text = label(max(self._tips_m), to_scale=self._to_scale)
                 labels.append(partial(_draw_label, t_ns=t_ns, text=text))
         self._trail += [(t_ns, beam_and_line[1:]) for t_ns, beam_and_line in moments]
@@ -140,13 +140,13 @@ class Antenna:
         return drawings + labels
 
     def touch(self, touch: Mapping[str, Any]) -> list["Drawing"]:
-        """Draw the point of a touch, its interval and the force on the beam as it was then.
+        """Return the drawing of a touch: point, interval and force on the beam at that time.
 
         Parameters
         ----------
         touch
-            As in JSON documents. Without point and time, and without the shape of that time,
-            nothing is drawn.
+            Touch as in JSON documents. It is not drawn without point and time, or without the
+            shape at that time.
         """
         point, time = touch.get("x_m"), touch.get("time_s")
         shapes = list(self._shapes)
@@ -156,19 +156,19 @@ class Antenna:
         after = next((i for i in range(1, len(shapes)) if shapes[i][0] >= t_ns), len(shapes) - 1)
         (earlier_ns, earlier), (later_ns, later) = shapes[after - 1], shapes[after]
         if t_ns < earlier_ns:
-            return []  # no shape of that time is left
-        share = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
-        beam = (1 - share) * earlier[1] + share * later[1]
+            return []  # the shape of that time is no longer stored
+        fraction = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
+        beam = (1 - fraction) * earlier[1] + fraction * later[1]
         moved = later[1] - earlier[1]
         along = np.linspace(0.0, 1.0, len(beam))
         x = np.array([point["value"], *point["interval_95"]]) / self._length_m
-        places, ahead = (
+        points, ahead = (
             np.column_stack([np.interp(x, along, axis) for axis in each.T])
             for each in (beam, moved)
         )
         force = touch.get("force_n")
         size = 0.0 if force is None else min(_ARROW_PER_N * abs(force["value"]), _LONGEST_ARROW)
-        # An obstacle pushes against the motion that met it.
+        # An obstacle pushes against the motion.
         way = float(np.linalg.norm(ahead[0]))
         arrow = -size / way * ahead[0] if way > 0 else np.zeros(3)
         return [
@@ -176,14 +176,14 @@ class Antenna:
                 _draw_touch,
                 number=int(touch["number"]),
                 t_ns=t_ns,
-                places=places,
+                points=points,
                 arrow=arrow,
                 text=touch_label(touch),
             )
         ]
 
     def _at_every_tick(self, samples: Records) -> Real:
-        """Fill gaps; return times in ns and angles in rad since the sample before, (n, 2)."""
+        """Return times in ns and angles in rad, (n, 2), after the last sample, with gaps filled."""
         ticks = samples["tick"].astype(np.int64)
         values = np.column_stack([samples["t_ns"], samples["angle_rad"]])
         tick, value = self._newest or (int(ticks[0]) - 1, values[0])
@@ -191,9 +191,9 @@ class Antenna:
         steps = np.minimum(np.diff(ticks, prepend=tick), round(_LONGEST_GAP_S * self._rate_hz))
         if np.all(steps == 1):
             return values
-        places, values = np.cumsum(np.append(0, steps)), np.vstack([value, values])
-        every = np.arange(1, places[-1] + 1)
-        return np.column_stack([np.interp(every, places, column) for column in values.T])
+        points, values = np.cumsum(np.append(0, steps)), np.vstack([value, values])
+        every = np.arange(1, points[-1] + 1)
+        return np.column_stack([np.interp(every, points, column) for column in values.T])
 
 
 def view() -> "rrb.Spatial3DView":
@@ -219,25 +219,25 @@ def view() -> "rrb.Spatial3DView":
 
 
 def static_drawings() -> list["Drawing"]:
-    """Return what stays as it is: the motor, and how that looks which moves."""
+    """Return the static drawings: the motor, and the styles of the moving parts."""
     return [_draw_motor, _draw_direction, _draw_styles]
 
 
 def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
-    """Return the undeformed line and the beam as they are drawn, in beam lengths.
+    """Return the undeformed line and the beam for drawing, in beam lengths.
 
     Parameters
     ----------
     angle_rad
         Angle of the motor.
     deflection
-        Shape (points,), evenly along the beam, relative to the line that its root points along; in
-        beam lengths.
+        Deflection at evenly spaced points of the beam, shape (points,), relative to the undeformed
+        line, in beam lengths.
 
     Returns
     -------
     lines
-        Shape (2, points, 3): the line, the beam; x, y, z of their points.
+        Coordinates x, y, z of the line and of the beam, shape (2, points, 3).
     """
     x = np.linspace(0.0, 1.0, deflection.size)
     drawn = np.zeros((2, x.size, 3), dtype=np.float32)
@@ -248,12 +248,12 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
 
 
 def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
-    """Return the same as `lines`, turned and bent as they are.
+    """Return the same as `lines`, but to scale.
 
     Parameters
     ----------
     angle_rad, deflection
-        See `lines`.
+        As for `lines`.
     """
     along = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     across = np.array([-along[1], along[0], 0.0])
@@ -262,19 +262,19 @@ def to_scale(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
 
 
 def label(tip_m: float, *, to_scale: bool = False) -> str:
-    """Return the text of the tip's deflection, to two figures or 0.1 mm."""
+    """Return the text of the tip's deflection, with two significant digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {FACTOR:g}'}"
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
-    """Return the text at a touch: its number and point.
+    """Return the label of a touch: its number and point.
 
     Parameters
     ----------
     touch
-        As in JSON documents.
+        Touch as in JSON documents.
     """
     point = touch["x_m"]
     return f"touch {touch['number']}: {with_half_width(point['value'], point['interval_95'])} m"
@@ -286,7 +286,7 @@ def _small_damping(beam: Beam) -> Damping:
 
 
 def _draw_motor(stream: "RecordingStream") -> None:
-    """Draw, from below, the mount, the housing, the shaft and the hub that clamps the beam."""
+    """Draw mount, housing, shaft, and the hub that clamps the beam."""
     import rerun as rr
 
     stream.log(
@@ -319,7 +319,7 @@ def _draw_motor(stream: "RecordingStream") -> None:
 
 
 def _draw_direction(stream: "RecordingStream") -> None:
-    """Draw an arrow that turns as positive angles do."""
+    """Draw an arrow in the direction of positive angles."""
     import rerun as rr
 
     angle = np.linspace(0.35, 1.05, 15)
@@ -343,7 +343,7 @@ def _draw_direction(stream: "RecordingStream") -> None:
 
 
 def _draw_styles(stream: "RecordingStream") -> None:
-    """Send once what is the same at all moments: colours, widths, where the label stands."""
+    """Send the constant properties once: colours, widths and the position of the label."""
     import rerun as rr
 
     for entity, colors, widths in ((BEAM, [GREY, SKY_BLUE], [1.0, 2.5]), (TRAIL, [_PAST], [0.6])):
@@ -365,7 +365,7 @@ def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_Momen
     t_ns = np.array([t_ns for t_ns, _ in moments])
     strips = np.concatenate([strips for _, strips in moments])
     count = len(strips) // len(moments)
-    # Put together by hand: Rerun's own way of making columns takes three times as long.
+    # Built here, because Rerun's own function for columns takes three times as long.
     column = rr.ComponentColumn(
         rr.LineStrips3D.descriptor_strips(),
         rr.components.LineStrip3DBatch(strips),
@@ -384,13 +384,13 @@ def _draw_label(stream: "RecordingStream", t_ns: int, text: str) -> None:
 
 
 def _draw_touch(
-    stream: "RecordingStream", number: int, t_ns: int, places: Real, arrow: Real, text: str
+    stream: "RecordingStream", number: int, t_ns: int, points: Real, arrow: Real, text: str
 ) -> None:
-    """Draw from the time of a touch on: point, interval along the beam, and force."""
+    """Draw a touch from its time on: point, interval along the beam, and force."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    point, ends = places[:1], places[1:]
+    point, ends = points[:1], points[1:]
     entity = f"{TOUCH}/{number}"
     stream.log(
         f"{entity}/interval",
@@ -400,7 +400,7 @@ def _draw_touch(
         f"{entity}/point",
         rr.Points3D(point, radii=rr.Radius.ui_points(5.0), colors=[VERMILION]),
     )
-    # Of the last touch alone: those of several passes would stand on one another.
+    # Only the label of the last touch: labels of several passes would overlap.
     stream.log(
         f"{TOUCH}/label",
         rr.Points3D(point, radii=[0.0], colors=[VERMILION], labels=[text], show_labels=True),

@@ -1,7 +1,7 @@
 """Fits of the record: modes over time with their shrinking intervals, and a table of the last fit.
 
-Fits of a session that runs come every second or with every piece of a search for a precision; a
-recorded file has the last one only, of which there is the table.
+During a session a fit comes every second, or with every segment of a search for a precision. A
+recorded file has only the last fit, which is shown as a table.
 """
 
 from collections.abc import Mapping
@@ -16,13 +16,13 @@ from rigd.session import Validity
 from rigd.session.online_fit import unseen_modes
 from rigd.units import suffix_of, unit_of, with_half_width, with_share
 from rigd.view._session_info import plain
-from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Curve, Plot, Source, Values
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
 Fit = Mapping[str, Any]
-"""Answer of the fit program, as JSON documents have it (docs/online_fit.md)."""
+"""Fit as in JSON documents (docs/online_fit.md)."""
 
 TABLE: Final = "/fit_table"
 _ENTITY: Final = "/fits"
@@ -32,11 +32,11 @@ _MOST_FINDINGS: Final = 8
 @dataclass(frozen=True, slots=True)
 class _Quantity:
     name: str
-    """As targets of a search have it."""
+    """Name as in the targets of a search."""
     key: str
-    """Its key in a mode of a fit."""
+    """Key in a mode of a fit."""
     suffix: str
-    """Ending of the component's name."""
+    """Suffix of the component's name."""
     title: str
     unit: str
     factor: float
@@ -49,62 +49,64 @@ _QUANTITIES: Final = (
     _Quantity("damping", "damping_ratio", "percent", "Damping ratio", "%", 100.0),
     _Quantity("frequency", "frequency_hz", "hz", "Frequency", "Hz", 1.0),
 )
-_ASKED_LOW, _ASKED_HIGH, _LOW, _HIGH, _VALUE = range(5)
-"""Columns of a field of a fit's record; NaN is what is not known."""
+_TARGET_LOW, _TARGET_HIGH, _LOW, _HIGH, _VALUE = range(5)
+"""Columns of a field of a fit's record; unknown values are NaN."""
 
 
-def fit_source(modes: int, *, asked: bool) -> Source:
-    """Return the plots of the first modes: of each its damping ratio, then its frequency.
+def fit_source(modes: int, *, with_targets: bool) -> Source:
+    """Return the plots of the first modes, for each the damping ratio and then the frequency.
 
     Parameters
     ----------
     modes
-        How many.
-    asked
-        Whether a precision may be asked for.
+        Number of modes.
+    with_targets
+        Whether the session may have target precisions.
     """
     plots = (
-        _plot(quantity, n, asked=asked) for n in range(1, modes + 1) for quantity in _QUANTITIES
+        _plot(quantity, n, with_targets=with_targets)
+        for n in range(1, modes + 1)
+        for quantity in _QUANTITIES
     )
     return Source(_ENTITY, tuple(plots))
 
 
-def _plot(quantity: _Quantity, mode: int, *, asked: bool) -> Plot:
+def _plot(quantity: _Quantity, mode: int, *, with_targets: bool) -> Plot:
     field, unit = quantity.field(mode), quantity.unit
 
     def values(records: npt.NDArray[Any], column: int) -> Values:
         found: Values = records[field][:, column]
         return found
 
-    # What is called the same has one entry in the legend.
-    wanted, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
-    wanted_ends = (
-        Curve(wanted, GREY, partial(values, column=_ASKED_LOW)),
-        Curve(wanted, GREY, partial(values, column=_ASKED_HIGH)),
+    # Curves with the same name have one entry in the legend.
+    target, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
+    target_ends = (
+        PlotCurve(target, GREY, partial(values, column=_TARGET_LOW)),
+        PlotCurve(target, GREY, partial(values, column=_TARGET_HIGH)),
     )
     return Plot(
         f"{quantity.name}_{mode}_{quantity.suffix}",
         f"{quantity.title} of mode {mode} ({unit})",
         (
-            *(wanted_ends if asked else ()),
-            Curve(interval, ORANGE, partial(values, column=_LOW)),
-            Curve(interval, ORANGE, partial(values, column=_HIGH)),
-            Curve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
+            *(target_ends if with_targets else ()),
+            PlotCurve(interval, ORANGE, partial(values, column=_LOW)),
+            PlotCurve(interval, ORANGE, partial(values, column=_HIGH)),
+            PlotCurve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE), 2.5),
         ),
     )
 
 
 def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
-    """Return an array (1,) with ``t_ns`` and what the plots of `fit_source` show of a fit.
+    """Return the record of a fit for the plots of `fit_source`, shape (1,), with ``t_ns``.
 
-    What the record does not show, or is doubtful, is left out.
+    Modes that the record does not show and doubtful values are NaN.
 
     Parameters
     ----------
     fit
-        The fit; None: nothing is known yet.
+        Fit; None: there is none yet.
     modes
-        How many modes the plots are of.
+        Number of modes in the plots.
     """
     fields = [(q.field(n), "<f8", (5,)) for n in range(1, modes + 1) for q in _QUANTITIES]
     record = np.zeros(1, [("t_ns", "<i8"), *fields])
@@ -121,10 +123,10 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
             if not mode.get("shown", True) or found["flag"] or ends is None:
                 continue
             value, (low, high) = found["value"], ends
-            asked_std = stds.get((quantity.name, mode["mode"]))
+            target_std = stds.get((quantity.name, mode["mode"]))
             half = np.nan
-            if asked_std is not None and found["std"]:
-                half = asked_std * (high - low) / (2.0 * found["std"])
+            if target_std is not None and found["std"]:
+                half = target_std * (high - low) / (2.0 * found["std"])
             shown = np.array([value - half, value + half, low, high, value])
             record[quantity.field(mode["mode"])] = quantity.factor * shown
     return record
@@ -138,12 +140,12 @@ def _targets(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return a fit as Markdown: what is asked for and how much of it is reached, modes, parameters.
+    """Return a fit as Markdown: target precisions and those reached, modes, parameters.
 
     Parameters
     ----------
     fit
-        The fit; None: none has been made yet.
+        Fit; None: there is none yet.
     """
     if fit is None:
         return "No fit yet."
@@ -187,17 +189,17 @@ def _markdown(*heads: str, rows: list[tuple[str, ...]]) -> str:
 
 
 def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
-    value, std, asked_std = target["value"], target["std"], target["asked_std"]
+    value, std, target_std = target["value"], target["std"], target["asked_std"]
     if value is None:
         return plain(target["name"]), "–", "–", "–"
     if std is None:
-        return plain(target["name"]), f"{value:.4g}", "doubtful", with_share(asked_std, value)
-    reached = " ✓" if std <= asked_std else ""
+        return plain(target["name"]), f"{value:.4g}", "doubtful", with_share(target_std, value)
+    reached = " ✓" if std <= target_std else ""
     return (
         plain(target["name"]),
         f"{value:.4g}",
         f"**{with_share(std, value)}**{reached}",
-        with_share(asked_std, value),
+        with_share(target_std, value),
     )
 
 
@@ -214,7 +216,7 @@ def _parameter_row(name: str, found: Mapping[str, Any]) -> tuple[str, ...]:
     value, ends = found["value"], found["interval_95"]
     if value is None:
         return ()
-    # Small numbers, such as zeta, in powers of ten that are the same for value and interval.
+    # Small numbers, such as zeta, have a power of ten, the same for value and interval.
     size = abs(value) if ends is None else max(abs(value), (ends[1] - ends[0]) / 2.0)
     power = 0 if size == 0 or size >= 1e-2 else int(np.floor(np.log10(size)))
     text = with_half_width(value, ends, 10.0**-power)
@@ -232,7 +234,7 @@ def _doubt(found: Mapping[str, Any]) -> str:
 
 
 def send_table(stream: "RecordingStream", fit: Fit | None) -> None:
-    """Show the table of a fit, from the end of its samples on; without one, that there is none."""
+    """Show the table of a fit from the end of its samples on, or a note that there is none."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=0.0 if fit is None else fit["duration_s"])

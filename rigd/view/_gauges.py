@@ -1,4 +1,4 @@
-"""Gauges: how near the signals of a session come to their limits."""
+"""Gauges: signals of a session as fractions of their limits."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from rigd.session.layout import WRENCH_FIELDS, Status
 Records = npt.NDArray[Any]
 
 NEAR: Final = 0.8
-"""Fraction of a limit from which on a gauge is near it, as the interlocks' warnings."""
+"""Fraction of a limit above which a gauge is near it, as for the interlocks' warnings."""
 
 
 UNITS: Final = {
@@ -28,14 +28,14 @@ UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """A signal beside its limit.
+    """A signal with its limit.
 
     Attributes
     ----------
     value
-        Largest magnitude; None where it is not known.
+        Largest magnitude; None if unknown.
     limit
-        Magnitude at which the session ends, or a torque is clipped; None where there is none.
+        Magnitude at which the session ends or the torque is clipped; None without a limit.
     unit
         Unit of both.
     """
@@ -46,23 +46,23 @@ class Gauge:
 
     @property
     def fraction(self) -> float | None:
-        """Value as a fraction of the limit; None where either is not known."""
+        """Value as a fraction of the limit; None if either is unknown."""
         return None if self.value is None or self.limit is None else self.value / self.limit
 
 
 class Gauges:
-    """Peaks of the samples, block by block, beside their limits.
+    """Peaks of the samples with their limits, block by block.
 
-    The rms torque (i²t) counts from the first sample on: the motor is assumed to be cold before.
+    The rms torque (i²t) assumes a cold motor at the first sample.
 
     Parameters
     ----------
     rate_hz
-        Scheduled ticks a second.
+        Scheduled ticks per second.
     limits
-        Limits by the names of ``UNITS``; one that is absent or infinite is none.
+        Limits by the names of ``UNITS``; an absent or infinite one is no limit.
     thermal_time_constant_s
-        Time over which the rms torque is taken.
+        Time constant of the rms torque.
     """
 
     def __init__(
@@ -93,12 +93,12 @@ class Gauges:
         return self.beside(peaks)
 
     def beside(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
-        """Return values beside their limits, by the names of ``UNITS``.
+        """Return values with their limits, by the names of ``UNITS``.
 
         Parameters
         ----------
         values
-            Magnitudes by name; what is absent is not known.
+            Magnitudes by name; an absent one is unknown.
         """
         return {
             name: Gauge(values.get(name), self._limits.get(name), unit)
@@ -106,22 +106,22 @@ class Gauges:
         }
 
     def cool(self, duration_s: float) -> float:
-        """Let the motor cool without torque; return its rms torque (i²t) then.
+        """Return the rms torque (i²t) after the motor has cooled without torque.
 
         Parameters
         ----------
         duration_s
-            Time of which there are no samples.
+            Time without samples.
         """
         self._heat_nm2 *= exp(-duration_s / self._time_constant_s)
         return sqrt(self._heat_nm2)
 
     def forget_angle(self) -> None:
-        """Take no speed from the last angle to the next, which is of another record."""
+        """Forget the last angle, because the next sample is of another record."""
         self._last = None
 
     def _speeds_rad_s(self, samples: Records) -> npt.NDArray[np.float64]:
-        """Return the speeds between fresh angles: one that is held would double the next."""
+        """Return the speeds between fresh angles: a stale one would double the next speed."""
         fresh = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
         ticks, angles_rad = fresh["tick"].astype(np.int64), fresh["angle_rad"]
         if self._last is not None:

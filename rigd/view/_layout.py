@@ -1,12 +1,11 @@
-"""The one layout of Rerun's window: which views there are, how each curve is drawn, axis labels.
+"""Layout of Rerun's window: its views, the style of each curve, and axis labels.
 
-Rerun's plots have no axis titles: the unit stands in the title of the view and in the legend.
+Rerun's plots have no axis titles: the title of the view and the legend state the unit.
 
-Rerun makes an axis as long as its values need, and labels multiples of a power of ten where they
-are far enough apart to be read. So ±0.06 would have a single label, 0. Where it comes to this, the
-next multiple is put among the values, invisibly, which makes the axis a little longer (`Scale`). In
-time it is put where an extreme value is, and leaves the plot with it. In the same way an axis is
-kept at least as long as its plot asks for.
+Rerun fits an axis to its values, and labels multiples of a power of ten that are far enough apart.
+So ±0.06 would have a single label, 0. In such a case `Scale` adds the next multiple to the values
+as an invisible point, which extends the axis a little. The point has the time of an extreme value
+and leaves the plot with it. In the same way an axis gets the least length of its plot.
 """
 
 import collections
@@ -44,16 +43,16 @@ if TYPE_CHECKING:
 
 
 WINDOW_S = 10.0
-"""Time shown up to the cursor; a viewer's load grows with it, not with the session."""
+"""Time shown up to the cursor; the viewer's load grows with it, not with the session."""
 
 CLOSE_UP_S = 2.0
-"""Time shown of the signals where they are all that is shown: one sees the oscillations."""
+"""Time shown in the tab Signals, short enough to resolve the oscillations."""
 
 HISTORY_S = 60.0
-"""Time shown of what comes a few times a second only."""
+"""Time shown of values that come only a few times per second."""
 
 WHOLE_S = 86_400.0
-"""Stands for the whole session: time shown of what comes once a second at the most."""
+"""Window for the whole session, for values that come at most once per second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +62,11 @@ class TimeView:
     Attributes
     ----------
     source, plot
-        Source and plot that it shows.
+        Source and plot to show.
     window_s
         Time shown up to the cursor.
     height
-        Height inside its axes, in points, in a window of 1280 × 800.
+        Height inside the axes, in points, in a window of 1280 × 800.
     """
 
     source: Source
@@ -77,17 +76,17 @@ class TimeView:
 
     @property
     def ticks(self) -> str:
-        """Rerun's name for the invisible values that make room for axis labels."""
+        """Component name of the invisible points that extend the axis."""
         return f"{self.plot.component}_ticks_{self.window_s:g}_s"
 
 
-_BESIDE_BANNER: Final = 228.0
+_OVERVIEW_HEIGHT: Final = 228.0
 _THREE_ROWS: Final = 189.0
 _FOUR_ROWS: Final = 131.0
 """Heights of the plots of a tab."""
 
 OVERVIEW: Final = tuple(
-    TimeView(plots.SIGNALS, plot, WINDOW_S, _BESIDE_BANNER)
+    TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_HEIGHT)
     for plot in (plots.ANGLE, plots.COUPLING_TORQUE)
 )
 SIGNALS: Final = tuple(
@@ -107,12 +106,12 @@ HEALTH: Final = (
     *(TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROWS) for plot in plots.HEALTH.plots),
 )
 _TWO_COLUMNS: Final = 4
-"""Fewest plots of the tab Health that stand in two columns."""
+"""Least number of plots of the tab Health for two columns."""
 TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
 
 TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
 FIT_TAB = "Fit"
-"""Second tab of sessions whose record is fitted."""
+"""Second tab, for sessions whose record is fitted."""
 _FIT_TAB_HEIGHT: Final = 640.0
 _FIT_PLOT_MARGIN: Final = 50.0
 
@@ -123,7 +122,7 @@ def fit_views(source: Source) -> tuple[TimeView, ...]:
     Parameters
     ----------
     source
-        Source of the plots, two of each mode.
+        Source of the plots, two for each mode.
     """
     rows = max(1, len(source.plots) // 2)
     height = _FIT_TAB_HEIGHT / rows - _FIT_PLOT_MARGIN
@@ -134,18 +133,18 @@ def blueprint(
     *,
     absent: Collection[str] = (),
     fit_modes: int | None = None,
-    fit_asked: bool = False,
+    fit_targets: bool = False,
 ) -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample, with its first tab in front.
+    """Return the layout, which follows the newest sample and shows the first tab.
 
     Parameters
     ----------
     absent
-        Components of plots that are left out, for nothing of theirs comes.
+        Components of plots to omit, because they have no values.
     fit_modes
         As `Subject.fit_modes`.
-    fit_asked
-        Whether a precision of fits may be asked for.
+    fit_targets
+        Whether the session may have target precisions.
     """
     import rerun.blueprint as rrb
 
@@ -159,7 +158,7 @@ def blueprint(
     ]
     names = list(TABS)
     if fit_modes is not None:
-        contents.insert(1, _fit(fit_modes, asked=fit_asked))
+        contents.insert(1, _fit(fit_modes, with_targets=fit_targets))
         names.insert(1, FIT_TAB)
     for tab, name in zip(contents, names, strict=True):
         tab.name = name
@@ -227,14 +226,16 @@ def _health(absent: Collection[str]) -> "rrb.Container":
     )
 
 
-def _fit(modes: int, *, asked: bool) -> "rrb.Container":
+def _fit(modes: int, *, with_targets: bool) -> "rrb.Container":
     import rerun.blueprint as rrb
 
     table = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
     if modes == 0:
         return rrb.Vertical(table)
     return rrb.Horizontal(
-        rrb.Grid(*map(_plot, fit_views(fit_source(modes, asked=asked))), grid_columns=2),
+        rrb.Grid(
+            *map(_plot, fit_views(fit_source(modes, with_targets=with_targets))), grid_columns=2
+        ),
         table,
         column_shares=[7, 4],
     )
@@ -255,10 +256,10 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         names=[curve.label for curve in plot.curves],
         colors=[curve.color for curve in plot.curves],
         widths=[curve.width for curve in plot.curves],
-        # The default averages what falls on one pixel, and so understates peaks.
+        # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
-    # Not seen, but within the axis. The legend has one entry for all that is called the same.
+    # Invisible, but within the axis. Curves with the same name have one entry in the legend.
     ticks = rr.SeriesPoints(
         names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
     )
@@ -278,12 +279,12 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
         origin=view.source.entity,
         contents=[str(entity) for entity in visualizers],
         overrides=visualizers,
-        # The title says it all where there is but one curve. Intervals of fits are wide at first.
+        # A single curve needs no legend. Intervals of fits are wide at first.
         plot_legend=rrb.PlotLegend(
             corner="RightTop" if view.window_s == WHOLE_S else "LeftTop",
             visible=len(plot.curves) > 1,
         ),
-        # Left to itself it shows a minute around the cursor, half of it yet to come.
+        # The default is a minute around the cursor, half of it in the future.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
@@ -323,16 +324,16 @@ def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatia
 def chart_page(
     wide: "rrb.Spatial2DView", *narrow: "rrb.Spatial2DView", name: str | None = None
 ) -> "rrb.Vertical":
-    """Return a wide chart over narrow ones side by side.
+    """Return a wide chart above a row of narrow ones.
 
     Parameters
     ----------
     wide
-        View on top, with four sevenths of the height.
+        View at the top, with four sevenths of the height.
     *narrow
         Views below it, from left to right.
     name
-        Title of the tab; None: none is set.
+        Title of the tab; None: no title.
     """
     import rerun.blueprint as rrb
 
@@ -346,7 +347,7 @@ def _summary() -> "rrb.TextDocumentView":
 
 
 def _recent_events() -> "rrb.TextDocumentView":
-    """Return the newest events as a document: its lines are wrapped, those of a log are cut."""
+    """Return the view of the newest events, a document, because a log does not wrap its lines."""
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(name="Events, newest first", origin=RECENT_EVENTS)
@@ -367,28 +368,28 @@ def _log() -> "rrb.TextLogView":
 # Axis labels
 
 LEAST_SPACING: Final = 24.0
-"""Space between labels, in points: Rerun shows none nearer than 20, and hardly those at 21."""
+"""Space between labels, in points: Rerun omits labels nearer than 20, and fades those at 21."""
 MARGINS: Final = 1.1
-"""Factor by which an axis is longer than its values need."""
+"""Ratio of an axis to the range of its values."""
 
 _STEP_NS: Final = 100_000_000
-"""Interval of time of which the extremes are looked at."""
+"""Time interval over which the extremes are computed."""
 _MOST_SPANS: Final = 1e9
-"""Values beyond so many of the shortest axis are another program's; they are shown as they are."""
+"""Ratio of values to the shortest axis above which the axis is left to Rerun."""
 _ABSURDLY_SMALL, _ABSURDLY_LARGE = 1e-300, 1e300
 _Mark = tuple[int, float]
 """Time since the start of the session in ns, and a value."""
 
 
 class Scale:
-    """Follows the extremes of what views show of one source.
+    """Tracker of the extremes of one source in its views, which adds points for axis labels.
 
     Parameters
     ----------
     source
         Source of the values.
     views
-        Views; those of other sources and those whose axis has fixed ends are ignored.
+        Views; those of other sources and those with fixed axes are ignored.
     """
 
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
@@ -398,15 +399,16 @@ class Scale:
         ]
 
     def frame(self) -> list["Drawing"]:
-        """Return what each new connection needs first: a view complains of what it never got."""
+        """Return the first drawings: a view reports missing components as errors."""
         nothing = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=nothing)]
 
     def draw(self, t_ns: npt.NDArray[np.int64], columns: Mapping[str, Values]) -> list["Drawing"]:
-        """Take values (n, k) by component, at times (n,) of the session; draw the ticks they lack.
+        """Return the drawings of the points that values lack for their axis labels.
 
-        What is not a finite number is passed over, as Rerun does.
+        The values have shape (n, k), by component, at times (n,). Values that are not finite are
+        ignored, as in Rerun.
         """
         steps = (t_ns - t_ns[0]) // _STEP_NS
         begins = np.append(0, np.flatnonzero(np.diff(steps)) + 1)
@@ -437,7 +439,7 @@ class Scale:
 
 
 class _Axis:
-    """Extremes within the window of one view, and the ticks it was given last."""
+    """Extremes within the window of one view, and the last points that were added."""
 
     def __init__(self, view: "TimeView") -> None:
         self.view = view
@@ -447,13 +449,13 @@ class _Axis:
         self._above: _Mark | None = None
 
     def take(self, t_ns: int, low: float, high: float) -> list[_Mark]:
-        """Take the extremes of a moment; return the ticks that are to be added."""
+        """Add the extremes of a moment; return the points to draw."""
         if not (math.isfinite(low) and math.isfinite(high)):
             return []
         high_ns, high = self._greatest.take(t_ns, high)
         low_ns, minus_low = self._least.take(t_ns, -low)
         below, above = missing_ticks(-minus_low, high, self.view.height, self.view.plot.least_span)
-        # When either extreme leaves, what is missing is determined again.
+        # When either extreme leaves the window, the missing points are computed again.
         earlier_ns = min(low_ns, high_ns)
         added = []
         if above is not None and self._lacks(self._above, above, t_ns):
@@ -465,20 +467,20 @@ class _Axis:
         return added
 
     def _lacks(self, last: _Mark | None, value: float, t_ns: int) -> bool:
-        """Whether the last tick is another one, or about to leave the window."""
+        """Return whether a value is missing because the last one differs or leaves the window."""
         return last is None or last[1] != value or last[0] <= t_ns - self._window_ns + _STEP_NS
 
 
 class _Greatest:
-    """The greatest value within a window of time that moves on."""
+    """Running maximum over a window of time."""
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
-        # Each is greater than all that come after it.
+        # Each is greater than all later ones.
         self._marks: collections.deque[_Mark] = collections.deque()
 
     def take(self, t_ns: int, value: float) -> _Mark:
-        """Take the newest value; return the greatest one, and when it was."""
+        """Add the newest value; return the greatest one with its time."""
         while self._marks and self._marks[-1][1] <= value:
             self._marks.pop()
         self._marks.append((t_ns, value))
@@ -490,7 +492,7 @@ class _Greatest:
 def missing_ticks(
     low: float, high: float, height: float, least_span: float = 0.0
 ) -> tuple[float | None, float | None]:
-    """Return what an axis must hold besides its values to be long enough and have two labels.
+    """Return the values that an axis needs to have its least length and two labels.
 
     Parameters
     ----------
@@ -504,10 +506,10 @@ def missing_ticks(
     Returns
     -------
     below, above
-        Values that the axis has to hold; None where none is needed.
+        Additional values of the axis; None if none is needed.
     """
     if 0.0 <= high - low < least_span and max(-low, high) < _MOST_SPANS * least_span:
-        # In steps, so that a little noise does not move the axis.
+        # In steps, so that noise does not move the axis.
         step = least_span / 2
         first, last = math.floor(low / step), math.ceil(high / step)
         if last - first < 2:
@@ -527,7 +529,7 @@ def missing_ticks(
         )
         return below if below < low else None, above if above > high else None
     spacing = MARGINS * (high - low) / height * LEAST_SPACING
-    # Rerun shows a single value with one unit to either side, and absurd ones as it can.
+    # Rerun shows a single value with one unit on either side.
     if not _ABSURDLY_SMALL < spacing < _ABSURDLY_LARGE:
         return None, None
     step = 10.0 ** math.ceil(math.log10(spacing))
@@ -537,5 +539,5 @@ def missing_ticks(
     below, above = (first - 1) * step, (last + 1) * step
     if last < first:
         return below, above
-    # Rather above, so that it stays there while a signal swings, and makes room for the legend.
+    # Prefer above: the point stays there while a signal oscillates, and makes room for the legend.
     return (None, above) if above - high <= 2.0 * (low - below) else (below, None)

@@ -1,4 +1,4 @@
-"""Recorded sessions as Rerun shows them."""
+"""Recorded sessions in Rerun."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -30,37 +30,37 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 
 _BLOCK_S: Final = 1.0
-"""Part of the session that is drawn at a time: as often as the charts are redrawn."""
+"""Duration of a block that is drawn at once: the period of the charts."""
 _MOST_SPAN: Final = 10
-"""Ticks per sample: what lies between few samples would be made up, and fill the disk."""
-_TOLD_AFTER_S: Final = 0.2
-"""After a touch: by then the antenna's shapes around it are drawn."""
+"""Limit of ticks per sample: filling longer gaps would invent data and fill the disk."""
+_DRAWN_AFTER_S: Final = 0.2
+"""Delay of a touch's drawing, so that the antenna's shapes around it exist."""
 _LAST_UTC_NS: Final = 2**63 - 1
 _DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
-"""Attachments that tell the nominal damping; the first that does counts."""
+"""Attachments with the nominal damping; the first that has it counts."""
 
 
 def subject_of_session(
     session: Session, timings: Records | None = None, *, fitted: bool = False
 ) -> Subject:
-    """Return what the views need to know of a recorded session.
+    """Return the data of a recorded session for its views.
 
-    A stopped session is shown as it was planned, as it was live. Without segments all of
-    the record is the sweep.
+    A stopped session is shown with its planned length, as it was live. Without segments the whole
+    record is the sweep.
 
     Parameters
     ----------
     session
         The session.
     timings
-        The readings' ages (n,) of ``TIMING_DTYPE``, if there are any.
+        Ages (n,) of the readings, of ``TIMING_DTYPE``; None without any.
     fitted
-        Whether there is a fit that was made while it was recorded (`rigd.session.fit_of`).
+        Whether the file has a fit from the session (`rigd.session.fit_of`).
 
     Raises
     ------
     SessionError
-        If there are no samples, or far too few, or a number is missing, or cannot be a rig's.
+        If there are no samples or far too few, or a number is missing or not plausible.
     """
     ticks = session.samples["tick"]
     if len(ticks) == 0:
@@ -98,7 +98,7 @@ def subject_of_session(
         limits=_stated_limits(attached[-1]),
         absent=_absent(session, timings),
         recorded=True,
-        # The fits before the last one are not in the file.
+        # The file has only the last fit.
         fit_modes=0 if fitted else None,
     )
 
@@ -111,11 +111,11 @@ _LIMITS: Final = {
     "i2t": ("motor", "continuous_torque_nm"),
     "missed": ("limits", "missed_percent"),
 }
-"""Where a profile states the limits of the gauges."""
+"""Section and key of a profile with the limit of each gauge."""
 
 
 def _stated_limits(profile: bytes) -> dict[str, float]:
-    """Return the limits that a profile states and that can be used; it may be of any version."""
+    """Return the usable limits in a profile of any version."""
     try:
         table = parse_toml(decode_text(profile))
     except (UnicodeDecodeError, DocumentError):
@@ -129,7 +129,7 @@ def _stated_limits(profile: bytes) -> dict[str, float]:
 
 
 def _absent(session: Session, timings: Records | None) -> frozenset[str]:
-    """Return the plots of which a file has nothing, by component."""
+    """Return the components of plots without values in a file."""
     absent = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
     if timings is None or len(timings) == 0:
         absent.add(AGES.component)
@@ -139,9 +139,9 @@ def _absent(session: Session, timings: Records | None) -> frozenset[str]:
 
 
 def nominal_damping(profile: bytes) -> Damping | None:
-    """Return the nominal damping of a profile or specimen; None if there is none of use.
+    """Return the nominal damping in a profile or specimen; None if there is no usable one.
 
-    Only these numbers are looked for: the profile of an older or of a newer program serves as well.
+    Only these numbers are read, so the profile may be of any version.
     """
     try:
         table = parse_toml(decode_text(profile))["beam"]["damping"]
@@ -150,7 +150,7 @@ def nominal_damping(profile: bytes) -> Damping | None:
         )
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
-    # Comparisons are false of what is not a number.
+    # Comparisons with NaN are false.
     usable = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
     return Damping(zeta, alpha, gamma, lambda_) if usable and 0.0 <= lambda_ < 2.0 else None
 
@@ -161,22 +161,22 @@ def draw_session(
     timings: Records,
     *,
     front: "Sequence[rrb.Container]" = (),
-    on_progress: Callable[[float], None] = lambda _share: None,
+    on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> None:
-    """Draw a recorded session as it was drawn live, so that every chart grows with its time.
+    """Draw a recorded session as if it were live, so that every chart grows with time.
 
     Parameters
     ----------
     stream
-        Takes the drawings.
+        Stream for the drawings.
     session
         Session to draw.
     timings
-        The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
+        Ages (n,) of the readings, of ``TIMING_DTYPE``; may be empty.
     front
-        Tabs that stand before those of the live view.
+        Tabs before those of the live view.
     on_progress
-        Told the share that is drawn, from time to time.
+        Called from time to time with the fraction that is drawn.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def draw_session(
     outcome = session.outcome or {}
     state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
     picture.state(0, replace(state, over=False))
-    # The time at which it is drawn is not to be shown.
+    # Hide the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)
@@ -216,7 +216,7 @@ def draw_session(
             *picture.health(t_ns, health),
         ):
             draw(stream)
-        drawn = [each for each in touches if _TOLD_AFTER_S + each["time_s"]["value"] < 1e-9 * t_ns]
+        drawn = [each for each in touches if _DRAWN_AFTER_S + each["time_s"]["value"] < 1e-9 * t_ns]
         for draw in picture.touches(drawn):
             draw(stream)
         touches = touches[len(drawn) :]
@@ -234,14 +234,14 @@ def recorded_blueprint(
     absent: Collection[str] = (),
     fit_modes: int | None = None,
 ) -> "rrb.Blueprint":
-    """Return the layout of the live view, which here is played from the start.
+    """Return the layout of the live view, with playback from the start.
 
     Parameters
     ----------
     front
-        Tabs that stand before those of the live view.
+        Tabs before those of the live view.
     absent
-        Components of plots that are left out.
+        Components of plots to omit.
     fit_modes
         As `Subject.fit_modes`.
     """
@@ -257,7 +257,7 @@ def recorded_blueprint(
 
 
 def _within(session: Session, key: str, least: float, most: float) -> float:
-    """Return a number of the file, if a rig can have it."""
+    """Return a number of the file, or raise if it is outside the plausible range."""
     value = session.number(key)
     if not least <= value <= most:
         raise SessionError(
@@ -268,7 +268,7 @@ def _within(session: Session, key: str, least: float, most: float) -> float:
 
 
 def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
-    """Yield the log of the session, with what is told elsewhere in the file: touches, its end."""
+    """Yield the log of the session, with its touches and its outcome."""
     for event in session.events:
         yield Note(event.t_ns, event.level, event.message)
     for touch in touches:
@@ -280,7 +280,7 @@ def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[N
 
 
 def _touches(session: Session) -> list[dict[str, Any]]:
-    """Return the touches of which the file tells when in the record they were, in that order."""
+    """Return the touches with a time within the record, in order of time."""
     last_s = 1e-9 * int(session.samples["t_ns"][-1])
     timed = [touch for touch in touches_of(session.outcome) if touch["time_s"] is not None]
     within = [touch for touch in timed if 0.0 <= touch["time_s"]["value"] <= last_s]
@@ -288,7 +288,7 @@ def _touches(session: Session) -> list[dict[str, Any]]:
 
 
 def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
-    """Return how many ticks were missed, late and lost, (3,), from the one after `last_tick` on."""
+    """Return the numbers of missed, late and lost ticks after `last_tick`, shape (3,)."""
     gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
     status = samples["status"]
     lost = np.where(status & Status.AFTER_LOST, gaps, 0)
@@ -299,7 +299,7 @@ def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
 def _blocks(
     samples: Records, timings: Records, block_ticks: int
 ) -> Iterator[tuple[Records, Records]]:
-    """Yield samples of `block_ticks` consecutive ticks each, and the timings of the same ticks."""
+    """Yield blocks of samples of `block_ticks` ticks each, with the timings of the same ticks."""
     starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
     ends = np.append(starts, len(samples))
     last_ticks = samples["tick"][ends - 1]

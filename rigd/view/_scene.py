@@ -1,4 +1,4 @@
-"""Scene of one session: records, events and health come in, drawings for Rerun go out."""
+"""Scene of one session, which turns records, events and health into drawings for Rerun."""
 
 import collections
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ from rigd.view._session_info import (
     send_recent,
     send_summary,
 )
-from rigd.view.banner import State, preparing
+from rigd.view.banner import BannerState, preparing
 from rigd.view.frequency_charts import (
     LAST_HZ,
     LastResponse,
@@ -42,31 +42,31 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 
 Drawing = Callable[["RecordingStream"], None]
-"""Sends one thing to Rerun."""
+"""Function that sends one item to Rerun."""
 
 _BLOCK_S: Final = 0.1
-"""Records are drawn in blocks of at least so much: what a block costs hardly grows with it."""
+"""Least duration of a block of records: the cost of a block hardly depends on its size."""
 _CHARTS_S: Final = 1.0
-"""Session time between drawings of the charts: a response is recomputed for each."""
+"""Session time between drawings of the charts, for each of which a response is computed."""
 _STEP_S: Final = 0.5
 """Time between columns of the spectrogram."""
 _MOST_NOTES: Final = 200
-"""Lines of the log that a new connection is given again."""
+"""Log lines that are sent again to a new connection."""
 
 
 class Scene:
-    """Keeps what must be computed along, and turns what comes into drawings.
+    """Scene of one session: it computes continuously and returns drawings.
 
-    It sends nothing itself, so nothing that stalls can disturb what is computed.
+    It sends nothing itself, so a stalled viewer cannot disturb its computations.
 
     Parameters
     ----------
     subject
         The session.
     layout
-        Returns the layout of the window; by default that of the live view.
+        Returns the layout of the window; None: that of the live view.
     last
-        Response of the last session of the same specimen, which is drawn beside this one's.
+        Response of the last session of the same specimen, drawn for comparison.
     """
 
     def __init__(
@@ -76,9 +76,9 @@ class Scene:
         last: LastResponse | None = None,
     ) -> None:
         self._subject = subject
-        asked = subject.excitation == "until"
+        with_targets = subject.excitation == "until"
         self._layout = layout or partial(
-            blueprint, absent=subject.absent, fit_modes=subject.fit_modes, fit_asked=asked
+            blueprint, absent=subject.absent, fit_modes=subject.fit_modes, fit_targets=with_targets
         )
         last_hz = min(LAST_HZ, subject.rate_hz / 2)
         self._antenna = Antenna(subject)
@@ -94,12 +94,12 @@ class Scene:
         self._samples = _Gathering(subject.rate_hz)
         self._timings = _Gathering(subject.rate_hz)
         self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
-        # With a record of nothing first: a view complains of what it never got.
+        # An empty record first: a view reports missing components as errors.
         self._fits = [fit_record(None, subject.fit_modes or 0)]
         self._fit: Mapping[str, Any] | None = None
         self._fit_source: Source | None = None
         if subject.fit_modes:
-            source = self._fit_source = fit_source(subject.fit_modes, asked=asked)
+            source = self._fit_source = fit_source(subject.fit_modes, with_targets=with_targets)
             self._scales[source] = Scale(source, fit_views(source))
         self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
@@ -109,11 +109,11 @@ class Scene:
 
     @property
     def last_response(self) -> LastResponse | None:
-        """Response of this session as far as it is known, for the next one of the specimen."""
+        """Response of this session so far, for the next session of the specimen."""
         return self.response_charts.as_last(self._subject)
 
     def frame(self) -> list[Drawing]:
-        """Return what each new connection needs first: name, layout, axes, and what is known."""
+        """Return the first drawings of a connection: name, layout, axes, and present contents."""
         name = self._subject.name
         return [
             lambda stream: stream.send_recording_name(name),
@@ -132,15 +132,15 @@ class Scene:
         ]
 
     def samples(self, samples: Records) -> list[Drawing]:
-        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
+        """Return the drawings of samples (n,) of ``SAMPLE_DTYPE``, in order, maybe with gaps."""
         return self._draw_samples(self._samples.add(samples))
 
     def timings(self, timings: Records) -> list[Drawing]:
-        """Take the readings' ages (n,) of ``TIMING_DTYPE``."""
+        """Return the drawings of ages (n,) of the readings, of ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(timings))
 
     def events(self, events: Sequence[Note]) -> list[Drawing]:
-        """Take what happened."""
+        """Return the drawings of log events."""
         if not events:
             return []
         self._notes.extend(events)
@@ -150,26 +150,26 @@ class Scene:
         ]
 
     def touches(self, touches: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Take touches as JSON documents have them; a later estimate replaces an earlier one."""
+        """Return the drawings of touches (JSON documents), which replace earlier estimates."""
         drawn = {touch["number"]: self._antenna.touch(touch) for touch in touches}
         self._touches |= drawn
         return [drawing for drawings in drawn.values() for drawing in drawings]
 
     def fit(self, fit: Mapping[str, Any]) -> list[Drawing]:
-        """Take a fit of the record so far, as JSON documents have it."""
+        """Return the drawings of a fit of the record so far (a JSON document)."""
         self._fit = fit
         self._fits.append(fit_record(fit, self._subject.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
 
-    def state(self, t_ns: int, state: State) -> list[Drawing]:
-        """Take the state of the session; nothing is drawn as long as it stays the same.
+    def state(self, t_ns: int, state: BannerState) -> list[Drawing]:
+        """Return the drawings of a new state of the session; none if it is unchanged.
 
         Parameters
         ----------
         t_ns
             Time since the session's start.
         state
-            The state.
+            State of the session.
         """
         if state == self._state:
             return []
@@ -177,14 +177,14 @@ class Scene:
         return self._banner()
 
     def health(self, t_ns: int, health: Health) -> list[Drawing]:
-        """Take a reading of the health, a few times a second.
+        """Return the drawings of a health reading, which comes a few times per second.
 
         Parameters
         ----------
         t_ns
             Time since the session's start.
         health
-            What was read.
+            Health reading.
         """
         self._health, self._health_ns = health, t_ns
         drawings: list[Drawing] = [
@@ -196,7 +196,7 @@ class Scene:
         return drawings
 
     def finish(self) -> list[Drawing]:
-        """Return what can only be drawn when everything has come: the final frequency response."""
+        """Return the final drawings, such as the final frequency response."""
         return [
             *self._draw_samples(self._samples.rest()),
             *self._draw_timings(self._timings.rest()),
@@ -223,14 +223,14 @@ class Scene:
         return drawings
 
     def _take_peaks(self, samples: Records) -> None:
-        """Keep the peaks since the values were drawn last."""
+        """Update the peaks since the values were drawn last."""
         peaks = self._gauges.take(samples)
         if not self._peaks_shown:
             peaks = {name: _larger(gauge, self._peaks.get(name)) for name, gauge in peaks.items()}
         self._peaks, self._peaks_shown = peaks, False
 
     def _banner(self) -> list[Drawing]:
-        """Draw the state, and the values beside their limits."""
+        """Return the drawings of the state, and of the values with their limits."""
         subject, t_ns, health = self._subject, self._health_ns, self._health
         missed = banner.missed_gauge(subject, t_ns, health)
         return [
@@ -263,7 +263,7 @@ class Scene:
         if not self._response_is_final and (estimate := self._response.estimate()) is not None:
             self.response_charts.update(self._t_ns, estimate)
             self._response_is_final = estimate.final
-        # Again although it is known: what was drawn last may have been dropped on its way.
+        # Drawn again even if final: the last drawing may have been dropped.
         drawings.append(self.response_charts.draw)
         if self._columns:
             self._spectrogram_chart.update(self._t_ns, self._columns)
@@ -279,7 +279,7 @@ def _larger(gauge: Gauge, other: Gauge | None) -> Gauge:
 
 
 class _Periodically:
-    """Whether it is time again, by the clock of the session."""
+    """Timer in session time: a call returns whether the period has passed."""
 
     def __init__(self, period_s: float) -> None:
         self._period_ns = round(1e9 * period_s)
@@ -293,14 +293,14 @@ class _Periodically:
 
 
 class _Gathering:
-    """Makes larger blocks of records with a field ``tick`` from small ones."""
+    """Collector that combines small blocks of records with a field ``tick`` into larger ones."""
 
     def __init__(self, rate_hz: float) -> None:
         self._ticks = max(1, round(_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
     def add(self, records: Records) -> Records | None:
-        """Take records (n,); return all that wait as soon as they span a block."""
+        """Add records (n,); return all of them once they span a block."""
         if len(records) == 0:
             return None
         self._parts.append(records)
@@ -308,6 +308,6 @@ class _Gathering:
         return self.rest() if span >= self._ticks else None
 
     def rest(self) -> Records | None:
-        """Return all that wait, None if nothing does."""
+        """Return the remaining records; None if there are none."""
         parts, self._parts = self._parts, []
         return np.concatenate(parts) if parts else None

@@ -1,4 +1,4 @@
-"""Session information for the viewer: the session's data, its log lines, its health, a summary."""
+"""Session information for the viewer: data, log lines, health and summary of the session."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -21,54 +21,54 @@ RECENT_EVENTS: Final = "/recent_events"
 SUMMARY: Final = "/summary"
 
 _LOG_WIDTH: Final = 150
-"""Characters of a line of the log: longer ones, which the viewer would cut, go on in the next."""
+"""Width of the log in characters: longer lines are wrapped, because the viewer would cut them."""
 _MOST_RECENT: Final = 20
-"""Events in the document of the newest."""
+"""Number of events in the document of the newest events."""
 _SYMBOLS: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A session, as far as its views depend on it.
+    """Data of a session for its views.
 
     Attributes
     ----------
     name
-        Name of the session; the viewer shows it as the recording's.
+        Name of the session, which the viewer shows as the recording's name.
     rate_hz
-        Scheduled ticks a second.
+        Scheduled ticks per second.
     ticks
-        Ticks of the whole record, as scheduled.
+        Scheduled ticks of the whole record.
     sweep
-        First tick of the excitation, and its end (exclusive); of two sweeps, of the first.
+        First tick and end (exclusive) of the excitation, or of the first of two sweeps.
     beam
         The specimen.
     damping
-        Nominal damping of the profile; None where it is not known: then no model is drawn over the
-        frequency response.
+        Nominal damping of the profile; None: unknown, and no model of the frequency response is
+        drawn.
     tool_inertia_kg_m2
         Inertia between the torque sensor and the beam, about the motor's axis.
     angle_delay_s, torque_delay_s
         Age of either value at its time stamp; positive: the value is older.
     excitation
-        What is run, in a few words; empty if that is not known.
+        Name of the excitation; empty if unknown.
     sweep_hz
-        Frequencies at the two ends of a linear sweep; None: it is none.
+        Frequencies at the ends of a linear sweep; None: no linear sweep.
     back
         First tick and end (exclusive) of a second sweep, back to the first frequency; None: none.
     specimen
         Name of the specimen as the operator gave it.
     limits
         Limits by the names of the gauges (`rigd.view.Gauges`), and ``missed`` in percent of all
-        ticks; what is absent has none.
+        ticks; an absent one is no limit.
     thermal_time_constant_s
-        Time over which the motor's rms torque is taken.
+        Time constant of the motor's rms torque.
     absent
-        Components of plots of which nothing comes, such as the load of a bus that is not there.
+        Components of plots without values, such as the bus load without a bus.
     recorded
-        The session is played from a file.
+        Whether the session is played from a file.
     fit_modes
-        Modes of which fits are plotted over time; 0: only the last fit is shown, as a table; None:
+        Number of modes whose fits are plotted over time; 0: only a table of the last fit; None:
         the record is not fitted.
     """
 
@@ -92,7 +92,7 @@ class Subject:
     fit_modes: int | None = None
 
     def frequency_hz(self, tick: int) -> float | None:
-        """Return the present frequency of the sweep; None before, after, or without one.
+        """Return the frequency of the sweep at a tick; None before, after or without a sweep.
 
         Parameters
         ----------
@@ -106,25 +106,25 @@ class Subject:
 
 
 def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
-    """Return the part of a record that its frequency response is estimated over.
+    """Return the part of a record over which its frequency response is estimated.
 
     Parameters
     ----------
     segments
-        First tick and end (exclusive) of each, with ``sweep`` among them.
+        First tick and end (exclusive) of each segment, one of which is the sweep.
     """
-    # The pieces that a search runs after its scan are no sweep through the band, and of two sweeps
-    # the first is the one that a chirp without a way back has.
+    # The segments of a search after its scan do not sweep the band. The first of two sweeps is the
+    # one that a chirp without a way back has.
     return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
 
 
 def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
-    """Return the frequencies at the ends of a linear sweep; None where the excitation is none.
+    """Return the frequencies at the ends of a linear sweep; None for other excitations.
 
     Parameters
     ----------
     kind, parameters
-        Excitation and its parameters, numbers or as a session file has them.
+        Excitation and its parameters, as numbers or as texts of a session file.
     """
     if kind != "chirp":
         return None
@@ -136,7 +136,7 @@ def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[flo
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something that happened.
+    """A log event for the views.
 
     Attributes
     ----------
@@ -154,14 +154,14 @@ class Note:
 
 
 def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
-    """Return the last line of a session's log: how it ended, at the time of its last sample.
+    """Return the last log event of a session: its outcome, at the time of the last sample.
 
     Parameters
     ----------
     t_ns
         Time of the last sample.
     outcome, reason
-        How the session ended, and why.
+        Outcome of the session and its reason.
     """
     return Note(
         t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
@@ -173,16 +173,16 @@ _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Health readings at one time; None where a value is not known (without a bus, say).
+    """Health readings at one time; unknown values are None, such as the load without a bus.
 
     Attributes
     ----------
     missed_ticks
-        Skipped by the loop since the start of the session.
+        Ticks that the loop missed since the start of the session.
     late_ticks
-        Ticks that woke late but were not missed, since the start.
+        Ticks with a late wake-up that were not missed, since the start.
     lost_ticks
-        Ticks whose samples found no room in the ring, since the start.
+        Ticks whose samples were lost because the ring was full, since the start.
     recorder_lag_ticks
         Samples that wait in the ring for the recorder.
     disk_free_mb
@@ -194,9 +194,9 @@ class Health:
     bus_errors
         Disturbed, damaged or missing messages, since the devices were connected.
     sensor_status
-        Status word of the force-torque sensor; 0: all is well.
+        Status word of the force-torque sensor; 0: no fault.
     rate_hz
-        Ticks a second, as measured.
+        Measured ticks per second.
     """
 
     missed_ticks: float | None = None
@@ -212,7 +212,7 @@ class Health:
 
 
 HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each in fields(Health)])
-"""A reading as a record; NaN is what is not known."""
+"""Record of a reading; unknown values are NaN."""
 
 
 def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
@@ -228,14 +228,14 @@ _RERUN_LEVELS: Final = {
     "error": "ERROR",
     "fatal": "CRITICAL",
 }
-"""Rerun's names of the levels: it has colours for these."""
+"""Rerun's names of the levels, for which it has colours."""
 
 
 def send_note(stream: "RecordingStream", note: "Note") -> None:
     """Add a line to the log."""
     import rerun as rr
 
-    # To the millisecond: more is hard to read.
+    # In milliseconds: more digits are hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
     text = "\n".join(
         line for part in note.message.splitlines() for line in wrap(part, _LOG_WIDTH) or [""]
@@ -244,35 +244,32 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
 
 
 def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
-    """Show the newest of the events (notes in order of time) as a document.
-
-    Its lines are wrapped, whatever the width of the view.
-    """
+    """Show the newest of `notes`, which are in order of time, as a document with wrapped lines."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
     lines = []
     for note in reversed(notes[-_MOST_RECENT:]):
-        time_s = max(0.0, 1e-9 * note.t_ns)  # the first one may come a tick early
+        time_s = max(0.0, 1e-9 * note.t_ns)  # the first event may come a tick early
         symbol = _SYMBOLS.get(note.level, "")
         lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
     stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
 
 
 def plain(text: str) -> str:
-    """Return a text as Markdown that shows it as it is.
+    """Return a text escaped for Markdown.
 
     Parameters
     ----------
     text
-        Whatever an operator wrote or a process said.
+        Any text from an operator or a process.
     """
     escaped = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
     return escaped.replace("\n", "  \n")
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
-    """Return a Markdown table of the session's health; unknown values are left out."""
+    """Return a Markdown table of the session's health, without unknown values."""
     elapsed_s = 1e-9 * t_ns
     total_s = subject.ticks / subject.rate_hz
     rows = [
@@ -297,7 +294,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
 def send_summary(
     stream: "RecordingStream", subject: "Subject", t_ns: int, health: "Health"
 ) -> None:
-    """Show the summary of one moment."""
+    """Show the summary at a time."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

@@ -1,4 +1,4 @@
-"""Banner of the overview: state of the session in words and colour, values beside their limits."""
+"""Banner of the overview: state of the session as text and colour, and values with their limits."""
 
 import math
 from collections.abc import Mapping
@@ -21,8 +21,8 @@ VALUES: Final = "/values"
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """State of a session, as the banner says it.
+class BannerState:
+    """State of a session in the banner.
 
     Attributes
     ----------
@@ -31,9 +31,9 @@ class State:
     color
         Colour of the band above the values: red for alarms only.
     reason
-        Why it is so; empty if there is nothing to say.
+        Reason of the state; empty without one.
     over
-        Nothing comes any more: no time is left.
+        Whether the session is over, so that no remaining time is shown.
     """
 
     word: str
@@ -42,26 +42,26 @@ class State:
     over: bool = False
 
 
-RUNNING: Final = State("RUNNING", GREEN)
-STOPPING: Final = State("STOPPING", ORANGE)
-RETURNING: Final = State("RETURNING", ORANGE, "The record is over.")
-FINISHING: Final = State("FINISHING", ORANGE, "The record is over and the torque is off.")
-SUPERVISOR_SILENT: Final = State(
+RUNNING: Final = BannerState("RUNNING", GREEN)
+STOPPING: Final = BannerState("STOPPING", ORANGE)
+RETURNING: Final = BannerState("RETURNING", ORANGE, "The record is over.")
+FINISHING: Final = BannerState("FINISHING", ORANGE, "The record is over and the torque is off.")
+SUPERVISOR_SILENT: Final = BannerState(
     "SUPERVISOR NOT RESPONDING",
     RED,
     "The session cannot be stopped now; it is aborted after 2 s. Check CPU load.",
 )
-SUPERVISOR_SILENT_TORQUE_OFF: Final = State(
+SUPERVISOR_SILENT_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR NOT RESPONDING", RED, "The session has ended and the torque is off. Check CPU load."
 )
-SUPERVISOR_LOST: Final = State(
+SUPERVISOR_LOST: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended. The control process ends the session and switches the torque "
     "off.",
     over=True,
 )
-SUPERVISOR_LOST_TORQUE_OFF: Final = State(
+SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended; the torque is off.",
@@ -71,43 +71,43 @@ SUPERVISOR_LOST_TORQUE_OFF: Final = State(
 _COLOR_OF_OUTCOME: Final = {"complete": SKY_BLUE, "stopped": GREY, "fault": RED}
 
 
-def preparing(doing: str = "") -> State:
+def preparing(doing: str = "") -> BannerState:
     """Return the state of a session before its record.
 
     Parameters
     ----------
     doing
-        What is being done, in words.
+        Present activity, as text.
     """
-    return State("PREPARING", ORANGE, doing)
+    return BannerState("PREPARING", ORANGE, doing)
 
 
-def ended(outcome: str, reason: str) -> State:
+def ended(outcome: str, reason: str) -> BannerState:
     """Return the state of a session that is over.
 
     Parameters
     ----------
     outcome, reason
-        How the session ended, and why; an empty outcome is not known.
+        Outcome of the session and its reason; an empty outcome is unknown.
     """
     word = outcome.upper() or "ENDED"
-    return State(word, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
+    return BannerState(word, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
 
 
 # State in words
 
 
-def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str:
-    """Return the banner as Markdown: state, time left, reason, and what is run.
+def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") -> str:
+    """Return the banner as Markdown: state, remaining time, reason and excitation.
 
     Parameters
     ----------
     subject
         The session.
     state
-        Its state.
+        State of the session.
     t_ns
-        Time since its start.
+        Time since the start of the session.
     health
         Health at that time.
     """
@@ -119,9 +119,9 @@ def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str
     if state.reason:
         lines.append(f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason))
     if not state.over and health.missed_ticks:
-        share = 100.0 * health.missed_ticks / max(1e-9 * t_ns * subject.rate_hz, 1.0)
+        percentage = 100.0 * health.missed_ticks / max(1e-9 * t_ns * subject.rate_hz, 1.0)
         lines.append(
-            f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({share:.2g} %)."
+            f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({percentage:.2g} %)."
         )
     what = f"**{plain(subject.excitation or 'session')}**"
     if subject.sweep_hz is not None:
@@ -138,14 +138,14 @@ def banner(subject: "Subject", state: State, t_ns: int, health: "Health") -> str
 
 
 def send_banner(
-    stream: "RecordingStream", subject: "Subject", state: State, t_ns: int, health: "Health"
+    stream: "RecordingStream", subject: "Subject", state: BannerState, t_ns: int, health: "Health"
 ) -> None:
-    """Show the banner of one moment.
+    """Show the banner at a time.
 
     Parameters
     ----------
     stream
-        Takes the drawing.
+        Stream for the drawing.
     subject
         The session.
     state
@@ -162,7 +162,7 @@ def send_banner(
     stream.log(STATE, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
-# Values beside their limits
+# Values with their limits
 
 SIZE: Final = (700.0, 132.0)
 """Width and height of the canvas, in points."""
@@ -186,11 +186,11 @@ _LABELS: Final = {
     "ty": "Ty",
     "tz": "Tz",
 }
-"""Gauges by name, down the left column and then down the right one."""
+"""Labels of the gauges by name, first the left column and then the right one."""
 
 
 def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
-    """Return the share of missed ticks beside its limit.
+    """Return the percentage of missed ticks with its limit.
 
     Parameters
     ----------
@@ -203,12 +203,12 @@ def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
     """
     scheduled = max(1e-9 * t_ns, 10.0) * subject.rate_hz
     missed = health.missed_ticks
-    share = None if missed is None else 100.0 * missed / scheduled
-    return Gauge(share, subject.limits.get("missed"), "%")
+    percentage = None if missed is None else 100.0 * missed / scheduled
+    return Gauge(percentage, subject.limits.get("missed"), "%")
 
 
 def gauge_text(label: str, gauge: Gauge) -> str:
-    """Return a gauge in words: ``speed 1.05 of 15 rad/s``.
+    """Return the text of a gauge: ``speed 1.05 of 15 rad/s``.
 
     Parameters
     ----------
@@ -221,13 +221,13 @@ def gauge_text(label: str, gauge: Gauge) -> str:
         return f"{label} unknown"
     if gauge.limit is None:
         return f"{label} {gauge.value:.3g} {gauge.unit}"
-    # To a thousandth of the limit, with as many digits all the time.
+    # To a thousandth of the limit, with a constant number of digits.
     digits = max(0, 3 - math.floor(math.log10(gauge.limit)))
     return f"{label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
 
 
 def gauge_color(gauge: Gauge) -> Color:
-    """Return the colour of a gauge's bar: red at the limit, orange from 80 % of it on.
+    """Return the colour of a gauge's bar: red at the limit, orange above 80 % of it.
 
     Parameters
     ----------
@@ -241,20 +241,20 @@ def gauge_color(gauge: Gauge) -> Color:
 
 
 def send_values(
-    stream: "RecordingStream", state: State, t_ns: int, gauges: Mapping[str, Gauge]
+    stream: "RecordingStream", state: BannerState, t_ns: int, gauges: Mapping[str, Gauge]
 ) -> None:
-    """Draw the band in the state's colour, and bars of the values up to their limits.
+    """Draw the band in the state's colour, and bars of the values relative to their limits.
 
     Parameters
     ----------
     stream
-        Takes the drawing.
+        Stream for the drawing.
     state
         State of the session.
     t_ns
         Time since its start.
     gauges
-        Values and limits by name, as of `rigd.view.Gauges`.
+        Values and limits by name, from `rigd.view.Gauges`.
     """
     import rerun as rr
 
@@ -269,7 +269,7 @@ def send_values(
         column, row = divmod(index, _ROWS)
         x, y = column * (width / 2 + 10.0), _FIRST_ROW + row * _ROW_HEIGHT
         text, color = gauge_text(label, gauge), gauge_color(gauge)
-        # Rerun centres a label, and only it knows how wide that is.
+        # Rerun centres a label, whose width is not known here.
         points.append([x + _TEXT_WIDTH / 2, y - LABEL_DROP])
         labels.append(text)
         label_colors.append(GREY if color == GREEN else color)
@@ -290,7 +290,7 @@ def send_values(
 
 
 def views() -> "tuple[rrb.View, rrb.View]":
-    """Return the views of state and values."""
+    """Return the views of the state and of the values."""
     import rerun.blueprint as rrb
 
     width, height = SIZE

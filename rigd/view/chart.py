@@ -1,10 +1,10 @@
-"""Charts whose horizontal axis is not time, drawn on a canvas, and curves of fewer points for them.
+"""Charts whose horizontal axis is not time, drawn on a canvas, and decimation of their curves.
 
-Rerun plots over time only. A view of two-dimensional things shows a canvas of any size, and keeps
-its aspect; so each chart has the size in points that its view has in a window of 1280 × 800, and
-is scaled with it from there. Text keeps its size whatever the scale.
+Rerun plots over time only. A two-dimensional view shows a canvas of any size with a fixed aspect
+ratio. Each chart therefore has the size in points of its view in a window of 1280 × 800, and is
+scaled with the view. The size of text does not change with the scale.
 
-`Thinning` reduces the points of a curve without losing a peak of it.
+`Thinning` reduces the points of a curve without losing its peaks.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ Real = npt.NDArray[np.float64]
 # Chart
 
 _LEFT, _TOP, _BOTTOM = 62.0, 44.0, 54.0
-"""Room for the tick labels and titles beside the frame, in points."""
+"""Margins for tick labels and titles around the frame, in points."""
 _RIGHT = 24.0
 _TITLE_RISE = 27.0
-"""Height of the middle of titles and legend above the frame, in points."""
+"""Distance of the middle of titles and legend from the frame, in points."""
 
 LABEL_DROP = 12.0
-"""How far Rerun puts the middle of a label under its point, in points."""
+"""Distance of the middle of a label below its position in Rerun, in points."""
 _CHARACTER = 6.7
 """Mean width of a character of a label, in points."""
 _DOT_SPACING = 6.0
@@ -51,11 +51,11 @@ class Axis:
     first, last
         Values at its ends.
     ticks
-        Values that have a label.
+        Values with a label and a grid line.
     lines
-        Values that have a line of the grid only.
+        Values with a grid line only.
     logarithmic
-        Whether equal ratios are equally long.
+        Whether the axis is logarithmic.
     """
 
     title: str
@@ -66,7 +66,7 @@ class Axis:
     logarithmic: bool = False
 
     def fraction(self, values: npt.ArrayLike) -> Real:
-        """Return where values are along the axis: 0 at its first, 1 at its last, never beyond."""
+        """Return values as fractions of the axis, from 0 at its first to 1 at its last value."""
         found, first, last = np.asarray(values, dtype=np.float64), self.first, self.last
         if self.logarithmic:
             found, first, last = np.log(np.maximum(found, first)), np.log(first), np.log(last)
@@ -80,11 +80,11 @@ class Key:
     Attributes
     ----------
     label
-        Name of what it stands for.
+        Name of the curve or area.
     color, width
-        Color and width of the line, the width in points.
+        Color of the line, and its width in points.
     is_area
-        Whether it is a shade and no line.
+        Whether it is a shaded area instead of a line.
     """
 
     label: str
@@ -108,7 +108,7 @@ class Chart:
     legend
         Entries of the legend, in reading order.
     left, right
-        Room beside the frame, in points.
+        Margins left and right of the frame, in points.
     """
 
     entity: str
@@ -122,16 +122,16 @@ class Chart:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of the frame on the canvas, which counts down from the top.
+        """Left, top, right and bottom of the frame on the canvas.
 
-        Rerun's canvases do.
+        As in all of Rerun's canvases, the vertical coordinate increases downwards.
         """
         return self.left, _TOP, self.width - self.right, self.height - _BOTTOM
 
-    def place(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Real:
-        """Return where points are on the canvas, (n, 2), from values (n,) of either axis.
+    def to_canvas(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Real:
+        """Return the canvas coordinates (n, 2) of points, from values (n,) of either axis.
 
-        What lies beyond an axis is put at its end.
+        Values beyond an axis are limited to its ends.
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class Chart:
         return np.stack([left + (right - left) * across, bottom - (bottom - top) * up], axis=-1)
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw frame, grid, tick labels, titles and legend, which stay as they are."""
+        """Draw the static parts: frame, grid, tick labels, titles and legend."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
@@ -160,13 +160,13 @@ class Chart:
         self._draw_legend(stream)
 
     def tick_labels(self) -> list[tuple[str, float, float]]:
-        """Return text and place of the middle of every tick's label on the canvas."""
+        """Return text and canvas coordinates of the middle of each tick label."""
         left, _, _, bottom = self.frame
         return [
-            (number(tick), float(self.place(tick, self.y.first)[0]), bottom + 14.0)
+            (number(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
             for tick in self.x.ticks
         ] + [
-            (number(tick), left - 26.0, float(self.place(self.x.first, tick)[1]))
+            (number(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
             for tick in self.y.ticks
         ]
 
@@ -181,22 +181,22 @@ class Chart:
         dotted: bool = False,
         order: int = 0,
     ) -> None:
-        """Draw lines through points (n, 2) of the two axes, each strip by itself.
+        """Draw a curve, as a separate line through each strip of points (n, 2).
 
         Parameters
         ----------
         stream, name, strips, key
-            Where the curve goes, its name under the chart, its points, and how it looks.
+            Recording, name under the chart, points, and style of the curve.
         static
-            Whether it stays as it is; it lies beneath whatever is drawn as it comes then.
+            Whether it never changes; static curves lie beneath all others.
         dotted
-            Whether the points stand for themselves, where a line between them would mean nothing.
+            Whether to draw the points only, if a line between them would have no meaning.
         order
-            Place among the curves of its kind, from the lowest to the topmost.
+            Rank among the static or the other curves, from the lowest to the topmost.
         """
         import rerun as rr
 
-        drawn = [self.place(strip[:, 0], strip[:, 1]) for strip in strips]
+        drawn = [self.to_canvas(strip[:, 0], strip[:, 1]) for strip in strips]
         draw_order = (20.0 if static else 30.0) + order
         shape = (
             rr.Points2D(
@@ -216,16 +216,16 @@ class Chart:
         stream.log(f"{self.entity}/{name}", shape, static=static)
 
     def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
-        """Write a text into the middle of the frame; an empty one takes it away.
+        """Write a text into the middle of the frame; an empty one removes it.
 
         Parameters
         ----------
         stream
             Recording to draw into.
         text
-            Empty: none.
+            Text to show; empty: none.
         color
-            Red, green, blue, 0 to 255.
+            Color of the text.
         """
         import rerun as rr
 
@@ -244,7 +244,7 @@ class Chart:
         )
 
     def draw_shade(self, stream: "RecordingStream", name: str) -> None:
-        """Draw what `move_shade` moves: two-dimensional views fill nothing but images.
+        """Draw the shade for `move_shade`: an image, because views do not fill other shapes.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class Chart:
         pixel = np.array([[GREY]], dtype=np.uint8)
         stream.log(
             f"{self.entity}/{name}",
-            # Rerun honours an opacity for images only.
+            # Rerun supports opacity for images only.
             rr.Image(
                 bytes=pixel.tobytes(),
                 width=1,
@@ -271,7 +271,7 @@ class Chart:
         )
 
     def move_shade(self, stream: "RecordingStream", name: str, first: float, last: float) -> None:
-        """Shade the chart between two values of its horizontal axis, and nowhere else.
+        """Move a shade between two values of the horizontal axis.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ class Chart:
             Values of the horizontal axis.
         """
         _, top, _, bottom = self.frame
-        left, right = self.place([first, last], self.y.first)[:, 0]
+        left, right = self.to_canvas([first, last], self.y.first)[:, 0]
         self._put_shade(stream, name, (left, top, right, bottom))
 
     def _draw_labels(self, stream: "RecordingStream") -> None:
@@ -312,12 +312,12 @@ class Chart:
         )
 
     def _draw_grid(self, stream: "RecordingStream") -> None:
-        """Draw dotted lines: lines are opaque, and whole ones too strong beside the curves."""
+        """Draw dotted grid lines: solid ones are opaque and distract from the curves."""
         import rerun as rr
 
         left, top, right, bottom = self.frame
-        verticals = self.place([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
-        horizontals = self.place(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
+        verticals = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
+        horizontals = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
         dots = [
             *([x, y] for x in verticals for y in np.arange(bottom, top, -_DOT_SPACING)),
             *([x, y] for y in horizontals for x in np.arange(left, right, _DOT_SPACING)),
@@ -356,7 +356,7 @@ class Chart:
         *,
         static: bool = False,
     ) -> None:
-        """Put a shade between left, top, right and bottom of the canvas."""
+        """Position a shade between left, top, right and bottom on the canvas."""
         import rerun as rr
 
         left, top, right, bottom = corners
@@ -369,7 +369,7 @@ class Chart:
         )
 
     def _legend(self) -> list[tuple[Key, float, float]]:
-        """Return the entries and where their texts begin: above the frame, up to its right end."""
+        """Return the legend's entries with positions above the frame, aligned to the right."""
         _, top, right, _ = self.frame
         entries = []
         x = right
@@ -381,8 +381,8 @@ class Chart:
 
 
 def number(value: float) -> str:
-    """Return a number as a tick label has it."""
-    return f"{value + 0.0:.9g}".replace("-", "−")  # adding makes −0 to 0
+    """Return a number as the text of a tick label."""
+    return f"{value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
 
 
 def _width(text: str) -> float:
@@ -390,7 +390,7 @@ def _width(text: str) -> float:
 
 
 def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return ticks and grid lines of a logarithmic axis: at 1, 2 and 5 of each decade, at all.
+    """Return ticks (1, 2 and 5 of each decade) and further grid lines of a logarithmic axis.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
 
 
 def steps(first: float, last: float, most: int) -> tuple[float, ...]:
-    """Return round values from `first` to `last`, `most` of them at the most.
+    """Return at most `most` round values from `first` to `last`.
 
     Parameters
     ----------
@@ -434,23 +434,23 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     scale = 10.0 ** np.floor(np.log10(least))
     step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
     begin, end = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
-    values = step * np.arange(begin, end + 1) + 0.0  # adding makes −0 to 0
+    values = step * np.arange(begin, end + 1) + 0.0  # adding turns −0 into 0
     return tuple(float(f"{value:.9g}") for value in values)
 
 
-# Fewer points of a curve
+# Decimation of curves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinning:
-    """Points of a grid, gathered in groups of which the extremes are kept.
+    """Decimation of curves on a grid, which preserves the extremes of groups of points.
 
     Attributes
     ----------
     grid
-        (n,) of increasing values.
+        Increasing values, shape (n,).
     groups
-        (k, m) indices into the grid, each group filled up with its first one.
+        Indices into the grid, shape (k, m); each group is padded with its first index.
     """
 
     grid: Real
@@ -458,14 +458,14 @@ class Thinning:
 
     @classmethod
     def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
-        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones.
+        """Return the decimation with groups of equal frequency ratio, without empty groups.
 
         Parameters
         ----------
         grid
             Frequencies of the points, increasing.
         first, last
-            Band that is kept.
+            Ends of the band; points outside are dropped.
         groups
             Largest number of groups.
         """
@@ -474,40 +474,40 @@ class Thinning:
         edges[-1] = np.nextafter(last, np.inf)
         bounds = np.unique(np.searchsorted(grid, edges))
         starts, sizes = bounds[:-1], np.diff(bounds)
-        offsets = np.arange(sizes.max(initial=1))  # of no group, too, there are extremes: none
+        offsets = np.arange(sizes.max(initial=1))  # also without any group
         return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
 
     def strips(self, values: Real) -> list[Real]:
-        """Return the curve as strips (p, 2) of grid point and value, broken where values are NaN.
+        """Return the curve as strips (p, 2) of grid point and value, interrupted at NaN.
 
-        The least and the greatest value of every group are kept at their places.
+        The strips have the least and the greatest value of every group at their grid points.
 
         Parameters
         ----------
         values
-            (n,) on the grid.
+            Values on the grid, shape (n,).
         """
-        rows, kept = self._extremes(values)
+        rows, stored = self._extremes(values)
         if rows.size == 0:
             return []
         breaks = np.flatnonzero(np.diff(rows) > 1) + 1
         return [
             np.column_stack([self.grid[part], values[part]])
-            for part in map(np.unique, np.split(kept, breaks))
+            for part in map(np.unique, np.split(stored, breaks))
         ]
 
     def extremes(self, values: Real) -> npt.NDArray[np.intp]:
-        """Return where the least and the greatest value of every group are, in order.
+        """Return the grid indices of the least and the greatest value of every group, in order.
 
         Parameters
         ----------
         values
-            (n,) on the grid; NaN where they are not known.
+            Values on the grid, shape (n,); NaN if unknown.
         """
         return np.unique(self._extremes(values)[1])
 
     def gaps(self, values: Real) -> npt.NDArray[np.intp]:
-        """Return both ends of each stretch between known values where nothing is known, in order.
+        """Return the grid indices of both ends of each gap between known values, in order.
 
         Parameters
         ----------
@@ -521,7 +521,7 @@ class Thinning:
         return np.unique(np.concatenate([first, last]))
 
     def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Return the groups in which anything is known, and the places of both extremes of each."""
+        """Return the groups with known values, and the grid indices of both extremes of each."""
         grouped = values[self.groups]
         unknown = np.isnan(grouped)
         rows = np.flatnonzero(~unknown.all(axis=1))

@@ -1,4 +1,4 @@
-"""Charts over frequency: the growing frequency response with the nominal model, a spectrogram."""
+"""Charts over frequency: the growing frequency response with the nominal model, spectrogram."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,16 +30,16 @@ _HELD: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
 
 class SweepResponse:
-    """Estimate of torque over angle: Welch's, with the segments that `analyze` takes by default.
+    """Welch estimate of torque over angle, with the default segments of `analyze`.
 
     Parameters
     ----------
     subject
         The session.
     last_hz
-        Up to where the response is wanted.
+        Highest frequency of the response.
     every
-        Estimate only every so many of `analyze`'s bins, as far as the segments allow.
+        Divisor of the number of `analyze`'s bins, as far as the segments allow.
     """
 
     def __init__(self, subject: "Subject", last_hz: float, *, every: int = 1) -> None:
@@ -54,19 +54,19 @@ class SweepResponse:
         self._rest_rad: float | None = None
 
     def feed(self, samples: npt.NDArray[Any]) -> None:
-        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
+        """Add samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
         ticks = samples["tick"].astype(np.int64) - self._first
         before = int(np.searchsorted(ticks, 0))
         if before:
             self._at_rest.append(samples["angle_rad"][:before].copy())
         if before == len(samples):
             return
-        # A constant angle asks no torque of the beam, but would leak into the lowest bins.
+        # A constant angle causes no torque of the beam, but would leak into the lowest bins.
         if self._rest_rad is None:
             self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
             self._at_rest = []
         swept = samples[before:]
-        # What is held from an earlier tick is not a measurement: the gap is filled like any other.
+        # A stale reading is not a measurement: its gap is filled like any other.
         known = np.where(swept["status"] & _HELD, np.nan, 1.0)
         self._running.feed(
             ticks[before:],
@@ -76,16 +76,16 @@ class SweepResponse:
         )
 
     def estimate(self) -> RunningEstimate | None:
-        """Return the estimate so far, None as long as there are too few samples."""
+        """Return the estimate so far; None while there are too few samples."""
         return self._running.estimate()
 
 
 # Frequency response
 
 FIRST_HZ: Final = 0.5
-"""Lowest frequency shown: below it the antenna's torque is lost in the sensor's noise."""
+"""Lowest frequency shown: below it the torque is lower than the sensor's noise."""
 LAST_HZ: Final = 60.0
-"""Highest frequency shown: beyond what the paper's chirp excites, and the third mode."""
+"""Highest frequency shown: above the band of the reference paper's chirp and the third mode."""
 
 OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
 MAGNITUDE: Final = "/frequency_response/magnitude"
@@ -101,27 +101,27 @@ SIZES: Final = {
 
 MEASURED_KEY: Final = Key("measured", SKY_BLUE)
 UNCERTAIN_KEY: Final = Key("low coherence", GREY)
-"""Key of the measured response where its coherence is below `LOW_COHERENCE`."""
+"""Key of the measured response with a coherence below `LOW_COHERENCE`."""
 MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
 LAST_KEY: Final = Key("last session", PURPLE)
 """Key of the response of the last session of the same specimen."""
 COHERENCE_KEY: Final = Key("coherence", GREEN)
 NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
-"""Key of the bands that the reference has not excited, as far as the estimate has used it."""
+"""Key of the bands that the reference has not excited so far."""
 
 LOW_COHERENCE: Final = 0.8
-"""Coherence below which a response is drawn grey: there the random error of its magnitude is more
-than 0.35/√n, with n averages (J. S. Bendat and A. G. Piersol, Random Data, 4th ed., Table 9.6)."""
+"""Coherence below which a response is drawn grey: the random error of its magnitude is then above
+0.35/√n, with n averages (J. S. Bendat and A. G. Piersol, Random Data, 4th ed., Table 9.6)."""
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 
 _NARROW: Final = 700.0
-"""Width up to which a chart has no room for a legend of five entries, in points."""
+"""Width up to which a chart cannot hold a legend of five entries, in points."""
 _SHADES: Final = ("not_estimated_below", "not_estimated_above")
 _GROUPS: Final = 200
-"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
+"""Groups of points along the axis, each drawn as two points: enough for the pixels of a view."""
 _PHASE_FROM_DEG: Final = -90.0
-"""Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
+"""Start of the phase axis: phases near 0 and 180 degrees do not wrap here."""
 PHASE_AXIS: Final = Axis(
     "Phase (degrees)",
     _PHASE_FROM_DEG,
@@ -132,9 +132,9 @@ COHERENCE_AXIS: Final = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8
 _STEP_DB: Final = 20.0
 _MODEL_STEP_HZ: Final = 0.01
 _FAINT: Final = Damping(zeta=3e-4)
-"""Damping that gives the highest magnitude of the axis where the beam's is not known."""
+"""Damping for the upper end of the magnitude axis if the beam's is unknown."""
 _DEEPEST_DB: Final = 140.0
-"""Largest range of an axis below the highest magnitude."""
+"""Largest range of a magnitude axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,9 +146,9 @@ class LastResponse:
     session, specimen
         Names of that session and of its specimen.
     frequency_hz
-        Shape (n,), increasing.
+        Increasing frequencies, shape (n,).
     response
-        Torque over angle in N·m/rad, complex, shape (n,); NaN where it was not estimated.
+        Torque over angle in N·m/rad, complex, shape (n,); NaN if not estimated.
     """
 
     session: str
@@ -173,7 +173,7 @@ class ResponseCharts:
     subject
         The session.
     last
-        Response of the last session, drawn beneath this one's.
+        Response of the last session, drawn beneath the present one.
     """
 
     def __init__(self, subject: "Subject", last: LastResponse | None = None) -> None:
@@ -183,9 +183,9 @@ class ResponseCharts:
         model_db = magnitude_db(model)
         magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         known = subject.damping is not None
-        beside = ((MODEL_KEY,) if known else ()) + ((LAST_KEY,) if last else ())
-        keys = (MEASURED_KEY, UNCERTAIN_KEY, *beside)
-        # The title of the view says what it is.
+        extra_keys = ((MODEL_KEY,) if known else ()) + ((LAST_KEY,) if last else ())
+        keys = (MEASURED_KEY, UNCERTAIN_KEY, *extra_keys)
+        # The title of the view names the quantity.
         short = replace(magnitude, title="dB re 1 N·m/rad")
         self._graphs = (
             *(
@@ -220,11 +220,11 @@ class ResponseCharts:
         self._note = NO_COHERENCE_YET
 
     def chart(self, entity: str) -> Chart:
-        """Return the chart that Rerun keeps at a place."""
+        """Return the chart with an entity path."""
         return next(graph.chart for graph in self._graphs if graph.chart.entity == entity)
 
     def draw_frames(self, stream: "RecordingStream") -> None:
-        """Draw what stays as it is."""
+        """Draw the static parts of the charts."""
         for graph in self._graphs:
             graph.chart.draw_frame(stream)
             for name in _SHADES:
@@ -244,14 +244,14 @@ class ResponseCharts:
                 )
 
     def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
-        """Take what is known of the response at a time of the session.
+        """Update the charts with the response at a time of the session.
 
         Parameters
         ----------
         t_ns
             Time since the start of the session.
         estimate
-            The response so far.
+            Response so far.
         """
         response = estimate.response.without_delays(**self._delays_s)
         grid = response.frequency_hz
@@ -267,9 +267,9 @@ class ResponseCharts:
         self._curves, self._uncertain = {}, {}
         for graph in self._graphs:
             values, entity = graph.values(response), graph.chart.entity
-            # Of the coherence itself all is certain.
-            sure = trusted if graph.of_response else excited
-            self._curves[entity] = strips(np.where(sure, values, np.nan))
+            # The coherence itself is always reliable.
+            reliable = trusted if graph.of_response else excited
+            self._curves[entity] = strips(np.where(reliable, values, np.nan))
             if graph.of_response:
                 self._uncertain[entity] = strips(np.where(excited, values, np.nan))
         ends = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
@@ -278,12 +278,12 @@ class ResponseCharts:
         self._note = missing if response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
-        """Draw what was last taken, at its time."""
+        """Draw the last update, at its time."""
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
         for graph in self._graphs:
             chart = graph.chart
             if graph.of_response:
-                # Beneath the whole curve, so that no gap is left where it changes its colour.
+                # The whole curve lies beneath, so that there is no gap at a change of colour.
                 below = self._uncertain.get(chart.entity, ())
                 chart.draw_curve(stream, "uncertain", below, UNCERTAIN_KEY)
             curve = self._curves.get(chart.entity, ())
@@ -294,12 +294,12 @@ class ResponseCharts:
         self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
 
     def as_last(self, subject: "Subject") -> LastResponse | None:
-        """Return what was last taken as the response of an earlier session; None without any.
+        """Return the last update as the response of an earlier session; None without an update.
 
         Parameters
         ----------
         subject
-            The session of these charts.
+            Session of these charts.
         """
         if self._known is None:
             return None
@@ -307,7 +307,7 @@ class ResponseCharts:
 
 
 def _curves_of(last: LastResponse, graphs: "Sequence[_Graph]") -> dict[str, Sequence[Real]]:
-    """Return the curves of a response by the entities of the charts that show it."""
+    """Return the curves of a response, by the entities of its charts."""
     thinning = response_thinning(last.frequency_hz)
     return {
         graph.chart.entity: thinning.strips(graph.of_response(last.response))
@@ -317,14 +317,14 @@ def _curves_of(last: LastResponse, graphs: "Sequence[_Graph]") -> dict[str, Sequ
 
 
 def magnitude_db(response: Complex) -> Real:
-    """Magnitude in dB re 1 N·m/rad."""
+    """Return the magnitude in dB re 1 N·m/rad."""
     with np.errstate(divide="ignore"):
         magnitude: Real = 20.0 * np.log10(np.abs(response))
     return magnitude
 
 
 def phase_deg(response: Complex) -> Real:
-    """Phase in degrees, from −90 to below 270.
+    """Return the phase in degrees, from −90 to below 270.
 
     Examples
     --------
@@ -354,12 +354,12 @@ def _coherence(response: "FrequencyResponse") -> Real:
 def nominal_response(
     beam: Beam, damping: Damping, tool_inertia_kg_m2: float
 ) -> tuple[Real, Complex]:
-    """Return the response that the sensor would measure of a beam, in the band that is shown.
+    """Return the model response of a beam at the sensor, in the band that is shown.
 
     Parameters
     ----------
     beam, damping
-        The specimen.
+        Model of the specimen.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
 
@@ -374,24 +374,24 @@ def nominal_response(
 
 
 def response_thinning(frequency_hz: Real) -> Thinning:
-    """Return the groups of frequencies of which a response's extremes are shown.
+    """Return the decimation of a response for the charts.
 
     Parameters
     ----------
     frequency_hz
-        (n,), increasing; what is outside of the band that is shown is left out.
+        Increasing frequencies, shape (n,). Those outside the band of the charts are dropped.
     """
     return Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
-    """Return the axis of a magnitude: whole steps of 20 dB, 140 dB at the most.
+    """Return a magnitude axis in steps of 20 dB, at most 140 dB long.
 
     Parameters
     ----------
     lowest_db, highest_db
-        Values that the axis holds, in dB re 1 N·m/rad. Where they are too far apart, it begins
-        above the lowest.
+        Range of the values, in dB re 1 N·m/rad. If it is too large, the axis begins above the
+        lowest value.
     """
     last = _STEP_DB * np.ceil(highest_db / _STEP_DB)
     first = max(_STEP_DB * np.floor(lowest_db / _STEP_DB), last - _DEEPEST_DB)
@@ -402,7 +402,7 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
 def response_chart(
     entity: str, size: tuple[float, float], band_hz: tuple[float, float], y: Axis, *keys: Key
 ) -> Chart:
-    """Return a chart over frequency, with a logarithmic axis.
+    """Return a chart with a logarithmic frequency axis.
 
     Parameters
     ----------
@@ -424,7 +424,7 @@ def response_chart(
 
 def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
     size = SIZES[entity]
-    if LAST_KEY not in keys or size[0] > _NARROW:  # there is room for one more
+    if LAST_KEY not in keys or size[0] > _NARROW:  # there is room for another entry
         keys = (*keys, NOT_ESTIMATED_KEY)
     return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)
 
@@ -436,14 +436,14 @@ SIZE: Final = (1280.0, 677.0)
 """Width and height of the canvas, in points."""
 
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
-"""Levels, in dB re 1 N·m, at the two ends of the colours."""
+"""Levels in dB re 1 N·m at the two ends of the colour scale."""
 MOST_COLUMNS: Final = 300
-"""Columns of the image: more are merged, the highest level kept."""
+"""Limit of the image's columns: further ones are merged, with the highest level."""
 
 _BAR = 28.0
-"""Width of the bar of colours, in points."""
-_BESIDE = 120.0
-"""Room for the bar and its labels."""
+"""Width of the colour bar, in points."""
+_BAR_MARGIN = 120.0
+"""Margin for the colour bar and its labels, in points."""
 
 
 class SpectrogramChart:
@@ -454,14 +454,14 @@ class SpectrogramChart:
     subject
         The session.
     frequency_hz
-        (m,) of the columns' levels, evenly spaced from 0.
+        Frequencies of the levels, shape (m,), evenly spaced from 0.
     step_s
         Time between columns.
 
     Attributes
     ----------
     chart
-        Chart on which it is drawn.
+        Chart of the spectrogram.
     """
 
     def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
@@ -479,7 +479,7 @@ class SpectrogramChart:
             height,
             Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
             Axis("Frequency (Hz)", 0.0, end_hz, steps(0.0, end_hz, 8)),
-            right=_BESIDE,
+            right=_BAR_MARGIN,
         )
         self._bar = Chart(
             f"{SPECTROGRAM}/bar",
@@ -489,65 +489,60 @@ class SpectrogramChart:
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
             left=width - _BAR - 24.0,
         )
-        # Row 0 is on top. Without the mean of the torque, which is not a motion.
+        # Row 0 is at the top. The mean torque is omitted, because it is no motion.
         self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
         self._filled = 0
         self._t_ns = 0
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
-        """Levels that have been taken, 0–255, (frequencies from the highest down, times)."""
+        """Levels so far, 0–255, shape (frequencies, times), from the highest frequency down."""
         return self._image[:, : self._filled]
 
     def draw_frame(self, stream: "RecordingStream") -> None:
-        """Draw what stays as it is: the axes, and the bar that tells what the colours mean."""
-        corners = self.chart.place([0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last])
-        _place_image(stream, f"{SPECTROGRAM}/levels", corners, self._image.shape)
-        corners = self._bar.place([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
+        """Draw the static parts: the axes and the colour bar."""
+        corners = self.chart.to_canvas(
+            [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
+        )
+        _position_image(stream, f"{SPECTROGRAM}/levels", corners, self._image.shape)
+        corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
         bar = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
-        _place_image(stream, f"{SPECTROGRAM}/colors", corners, bar.shape)
+        _position_image(stream, f"{SPECTROGRAM}/colors", corners, bar.shape)
         _send_image(stream, f"{SPECTROGRAM}/colors", bar, static=True)
         self.chart.draw_frame(stream)
         self._bar.draw_frame(stream)
 
     def update(self, t_ns: int, columns: Sequence[tuple[float, Real]]) -> None:
-        """Take columns of the spectrogram.
+        """Add columns of the spectrogram.
 
         Parameters
         ----------
         t_ns
             Time since the start of the session.
         columns
-            The middle of each column's window in s, and its levels (m,) in dB re 1 N·m.
+            Middle of each column's window in s, with its levels (m,) in dB re 1 N·m.
         """
         self._t_ns = t_ns
         for time_s, level_db in columns:
             slot = min(max(int(time_s / self._slot_s), 0), self._image.shape[1] - 1)
-            share = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
-            column = (255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+            fraction = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
+            column = (255.0 * np.clip(fraction, 0.0, 1.0)).astype(np.uint8)
             np.maximum(self._image[:, slot], column, out=self._image[:, slot])
             self._filled = max(self._filled, slot + 1)
 
     def draw(self, stream: "RecordingStream") -> None:
-        """Draw what has been taken so far."""
+        """Draw the spectrogram so far."""
         if self._filled:
             stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
             _send_image(stream, f"{SPECTROGRAM}/levels", self.image)
 
 
-def _place_image(
+def _position_image(
     stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
 ) -> None:
-    """Log the place of an image of levels (0–255), and its colours.
+    """Log position and colour map of an image of levels (0–255).
 
-    Parameters
-    ----------
-    stream, entity
-        Stream and entity to log to.
-    corners
-        Bottom left and top right on the canvas, (2, 2).
-    shape
-        Rows and columns of the image.
+    `corners` has its bottom left and top right on the canvas, (2, 2); `shape` its rows and columns.
     """
     import rerun as rr
 

@@ -1,8 +1,7 @@
-"""Plots over time: which curves, in which units and colours.
+"""Plots over time: their curves, units and colours.
 
-Colours are red, green and blue from 0 to 255. Those of Okabe and Ito (2008) are told apart with any
-colour vision; used here are the ones that stand out from Rerun's dark background and from its light
-one.
+Colours are red, green and blue from 0 to 255. Those of Okabe and Ito (2008) are distinguishable
+with any colour vision. The ones used here contrast with Rerun's dark and light backgrounds.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,9 +26,9 @@ GREEN: Color = (0, 158, 115)
 VERMILION: Color = (213, 94, 0)
 PURPLE: Color = (204, 121, 167)
 RED: Color = (229, 57, 53)
-"""For alarms and nothing else."""
+"""Colour of alarms only."""
 GREY: Color = (130, 130, 130)
-"""For frames, grids and tick labels, and for a curve of minor interest."""
+"""Colour of frames, grids, tick labels, and curves of minor interest."""
 
 
 # Plots over time
@@ -40,14 +39,14 @@ Records = npt.NDArray[Any]
 Values = npt.NDArray[np.float64]
 
 APPLICATION_ID: Final = "rigd"
-"""Rerun keeps one layout for each application."""
+"""Name of the application, for which Rerun stores one layout."""
 
 TIMELINE: Final = "session_time"
-"""Time since the start of the session, from ``t_ns``."""
+"""Timeline of the time since the start of the session, from ``t_ns``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class PlotCurve:
     """One curve of a plot.
 
     Attributes
@@ -70,41 +69,41 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves over time that share an axis.
+    """Curves over time with a common axis.
 
     Attributes
     ----------
     component
-        Rerun's name of their values; it ends in the unit.
+        Component name of the values in Rerun, which ends in the unit.
     title
         Title of the axis, with its unit.
     curves
         Curves from the lowest to the topmost.
     span
-        The ends of the axis, where they are the same for every session.
+        Ends of a fixed axis; None: the axis fits the values.
     least_span
-        Shortest axis, in the unit of the curves: noise and single steps are not drawn as large as
-        the signal.
+        Least length of the axis, in the unit of the curves, so that noise is not drawn as large as
+        a signal.
     """
 
     component: str
     title: str
-    curves: tuple[Curve, ...]
+    curves: tuple[PlotCurve, ...]
     span: tuple[float, float] | None = None
     least_span: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Plots whose values come together.
+    """Plots whose values come from the same records.
 
     Attributes
     ----------
     entity
-        Where Rerun keeps them. One place for all of them: what sending costs is the number of
-        places, hardly that of the values.
+        Entity path of the values in Rerun. All plots have the same, because the cost of sending
+        depends on the number of entities.
     plots
-        Plots that are made of each record.
+        Plots of each record.
     """
 
     entity: str
@@ -112,7 +111,7 @@ class Source:
 
     @property
     def ticks(self) -> str:
-        """Entity in Rerun of the invisible values that stretch the axes."""
+        """Entity path in Rerun of the invisible points that extend the axes."""
         return f"{self.entity}/ticks"
 
     def columns(self, records: Records) -> dict[str, Values]:
@@ -134,7 +133,7 @@ def send_columns(
     Parameters
     ----------
     stream
-        Takes them.
+        Stream to send to.
     entity
         Entity path in Rerun.
     t_ns
@@ -151,7 +150,7 @@ def send_columns(
 
 
 def _column(component: str, values: Values) -> "ComponentColumn":
-    """Values (n, k) as Rerun's column of k scalars a row."""
+    """Return values (n, k) as Rerun's column of k scalars per row."""
     import rerun as rr
 
     rows, width = values.shape
@@ -163,10 +162,10 @@ def _column(component: str, values: Values) -> "ComponentColumn":
     )
 
 
-def _axes(field: str, symbol: str, unit: str) -> tuple[Curve, ...]:
-    """Return the curves of the sensor's three axes, from fields named like ``f{}_n``."""
+def _axes(field: str, symbol: str, unit: str) -> tuple[PlotCurve, ...]:
+    """Return the curves of the sensor's three axes; `field` is a pattern such as ``f{}_n``."""
     return tuple(
-        Curve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
+        PlotCurve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
         for axis, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
     )
 
@@ -175,9 +174,9 @@ ANGLE = Plot(
     "angle_mrad",
     "Motor angle (mrad)",
     (
-        # Wider, for it lies under the measured angle.
-        Curve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
-        Curve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
+        # Wider, because it lies under the measured angle.
+        PlotCurve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
+        PlotCurve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
     ),
     least_span=4.0,
 )
@@ -185,7 +184,7 @@ TRACKING_ERROR = Plot(
     "tracking_error_mrad",
     "Tracking error, reference − measured (mrad)",
     (
-        Curve(
+        PlotCurve(
             "tracking error (mrad)",
             VERMILION,
             lambda r: 1e3 * (r["angle_reference_rad"] - r["angle_rad"]),
@@ -196,13 +195,13 @@ TRACKING_ERROR = Plot(
 COUPLING_TORQUE = Plot(
     "coupling_torque_nm",
     "Coupling torque, tared (N·m)",
-    (Curve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
+    (PlotCurve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
     least_span=0.1,
 )
 TORQUE_COMMAND = Plot(
     "torque_command_nm",
     "Torque command, after limits (N·m)",
-    (Curve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
+    (PlotCurve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
     least_span=0.1,
 )
 FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"), least_span=1.0)
@@ -213,8 +212,8 @@ LOOP = Plot(
     "loop_us",
     "Wake-up latency and execution time of the loop (µs)",
     (
-        Curve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
-        Curve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
+        PlotCurve("wake-up latency (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
+        PlotCurve("execution time (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
     ),
     least_span=100.0,
 )
@@ -228,8 +227,8 @@ AGES = Plot(
     "ages_ms",
     "Measurement latency (ms)",
     (
-        Curve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
-        Curve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
+        PlotCurve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
+        PlotCurve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
     ),
     least_span=1.0,
 )
@@ -240,9 +239,9 @@ FAULTY_TICKS = Plot(
     "faulty_ticks",
     "Missed, late and lost (ticks since the start)",
     (
-        Curve("missed (ticks)", VERMILION, lambda r: r["missed_ticks"]),
-        Curve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
-        Curve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
+        PlotCurve("missed (ticks)", VERMILION, lambda r: r["missed_ticks"]),
+        PlotCurve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
+        PlotCurve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
     ),
     least_span=10.0,
 )
@@ -250,37 +249,37 @@ BACKLOG = Plot(
     "backlog_samples",
     "Backlog of the recorder, dropped by the viewer (samples)",
     (
-        Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
-        Curve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
+        PlotCurve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
+        PlotCurve("dropped by the viewer (samples)", GREY, lambda r: r["view_dropped"]),
     ),
     least_span=100.0,
 )
 BUS_LOAD = Plot(
     "bus_load_percent",
     "Bus load (%)",
-    (Curve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
+    (PlotCurve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
     span=(0.0, 105.0),
 )
 BUS_ERRORS = Plot(
     "bus_errors",
     "Bus errors since the devices were connected (count)",
-    (Curve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
+    (PlotCurve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
     least_span=10.0,
 )
 SENSOR_STATUS = Plot(
     "sensor_status",
     "Status word of the sensor (0: OK)",
-    (Curve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
+    (PlotCurve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
 )
 DISK = Plot(
     "disk_free_gb",
     "Free on the disk (GB)",
-    (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
+    (PlotCurve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
     least_span=1.0,
 )
 OF_A_BUS: Final = frozenset(plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS))
-"""Components of the plots of which there is nothing without a bus."""
+"""Components of the plots that have no values without a bus."""
 OF_REAL_TIME: Final = frozenset(plot.component for plot in (LOOP, AGES))
-"""Components of the plots of which there is nothing under the virtual clock."""
+"""Components of the plots that have no values with the virtual clock."""
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
 """Plots drawn from health records."""

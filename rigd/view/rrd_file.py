@@ -1,6 +1,6 @@
-"""Rerun's files, and its SDK's environment.
+"""Rerun files, and the environment of Rerun's SDK.
 
-Quick to import: the command line names a file before it draws anything.
+This module is quick to import, because the command line checks a file before it draws anything.
 """
 
 import contextlib
@@ -23,11 +23,11 @@ SUFFIX: Final = ".rrd"
 _MAGIC: Final = b"RRF"
 _TRIAL_BYTES: Final = 1 << 20
 _OS_ERROR: Final = re.compile(r"os error (\d+)")
-"""The system's error number in the SDK's messages, whose sentences are not for the operator."""
+"""Pattern of the system's error number in messages of the SDK."""
 
 
 def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment without what is meant for Rerun: ``RERUN=off`` and so on."""
+    """Return an environment without the variables of Rerun, such as ``RERUN=off``."""
     return {
         name: value
         for name, value in environment.items()
@@ -36,9 +36,9 @@ def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def settle_sdk() -> None:
-    """Prepare this process's environment for the SDK; to be called before it is imported.
+    """Prepare this process's environment for the SDK; call it before the SDK is imported.
 
-    What it has to say of a server that is gone or of a full disk is told by us.
+    It silences the SDK's log, because the callers report a lost server or a full disk themselves.
     """
     for name in os.environ.keys() - without_settings(os.environ).keys():
         del os.environ[name]
@@ -46,17 +46,17 @@ def settle_sdk() -> None:
 
 
 class RrdFileError(FailureError):
-    """A file of Rerun's cannot be written, or is none."""
+    """A Rerun file cannot be written, or a file is no Rerun file."""
 
 
 @contextlib.contextmanager
 def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
-    """Give a recording that is written to a file, which has its name once all is in it.
+    """Provide a recording that is written to a file, which gets its name when it is complete.
 
     Raises
     ------
     RrdFileError
-        If there is something of that name, or the file cannot be written.
+        If the name is in use, or the file cannot be written.
     """
     settle_sdk()
     import rerun as rr
@@ -68,11 +68,11 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
     try:
-        with _told(path, part):
+        with _write_errors(path, part):
             path.parent.mkdir(parents=True, exist_ok=True)
             stream.save(part)
         yield stream
-        with _told(path, part):
+        with _write_errors(path, part):
             stream.flush()
             stream.disconnect()
             rename_new(part, path)
@@ -82,13 +82,13 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
 
 
 def check_new(path: Path) -> None:
-    """Raise RrdFileError if something has that name, or it is not a name of such a file."""
+    """Raise RrdFileError if a path exists or does not have the suffix of a Rerun file."""
     if path.suffix != SUFFIX:
         raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
     try:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
-        return  # the folder is made, or why not is told, when the file is written
+        return  # writing creates the folder, or reports why it cannot
     except OSError as error:
         raise RrdFileError(
             f"{path} cannot be written: {error.strerror}. Choose another name."
@@ -99,7 +99,7 @@ def check_new(path: Path) -> None:
 
 
 def check_rrd_file(path: Path) -> None:
-    """Raise RrdFileError if a file is not a Rerun recording, as far as its beginning tells."""
+    """Raise RrdFileError if a file does not begin as a Rerun recording does."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
@@ -117,8 +117,8 @@ def check_rrd_file(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _told(path: Path, part: Path) -> Iterator[None]:
-    """Say what kept a file from being written."""
+def _write_errors(path: Path, part: Path) -> Iterator[None]:
+    """Translate errors of writing a file into RrdFileError."""
     try:
         yield
     except FileExistsError:
@@ -129,12 +129,12 @@ def _told(path: Path, part: Path) -> Iterator[None]:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
         number = _OS_ERROR.search(str(error))
-        cause = os.strerror(int(number[1])) if number else _why_not(part)
+        cause = os.strerror(int(number[1])) if number else _write_failure(part)
         raise RrdFileError(f"{path} cannot be written: {cause}.") from None
 
 
-def _why_not(part: Path) -> str:
-    """Find out by trying why a file does not grow; the SDK may only say that it gave up."""
+def _write_failure(part: Path) -> str:
+    """Return the reason why a file cannot grow, by a trial; the SDK may not report it."""
     try:
         with part.open("ab") as file:
             file.write(bytes(_TRIAL_BYTES))

@@ -1,10 +1,10 @@
-"""The operator's page: a server on loopback, in its own process beside the daemon.
+"""The operator's page: a server on loopback, in a separate process.
 
-It speaks to the daemon by the public control socket only (docs/control_socket.md) and reads session
-files; loop, recorder and daemon do not depend on it. `run_page` is its program: `_server` puts the
-routes together, `_access` says who may do what, `_link` follows the daemon, `_live` sends to the
-pages that are open what `_signals` makes of the signals, `_library` serves sessions, downloads and
-reports. The page itself is in `static`.
+It uses only the daemon's public control socket (docs/control_socket.md) and reads session files.
+Loop, recorder and daemon do not depend on it. `run_page` is its program. `_server` has the routes,
+`_access` the permissions, and `_link` the connection to the daemon. `_live` sends messages to the
+open pages, `_signals` prepares the signals, and `_library` serves sessions, downloads and reports.
+The page itself is in `static`.
 """
 
 import lazy_loader as lazy

@@ -1,4 +1,4 @@
-"""Program of the page's process; the daemon starts it and gives it its job."""
+"""Program of the page's process, which the daemon starts."""
 
 from rigd.web import run_page
 

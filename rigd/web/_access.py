@@ -1,9 +1,9 @@
-"""Access to the page: who may read, who may act, and what a page in another tab cannot do.
+"""Access to the page: permissions to read and to act, and protection against other pages.
 
-Everybody who reaches the port may read; acting needs the token of the printed address. Any page on
-the internet can have its own name lead to loopback (DNS rebinding), and can send requests there:
-hence a name of this computer as Host, the same origin, a header that no form can send, and no
-cross-origin permission of any kind.
+Any user of the port may read; acting needs the token of the printed address. Any page on the
+internet can resolve its own name to loopback (DNS rebinding) and send requests there. Requests
+therefore need a name of this computer as Host, the same origin, and a header that no form can send,
+and there are no cross-origin permissions.
 """
 
 import asyncio
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 LIVE: Final = "/api/live"
-"""Address of what happens; there is a limit to the pages that are open there."""
+"""Path of the live messages, with a limit on the open pages."""
 ICON: Final = "/favicon.ico"
-"""Picture that any page may have."""
+"""Path of the icon, which any page may load."""
 _OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost"})
 _OWN_HEADER: Final = "X-Rigd"
 _FREE_COMMANDS: Final = frozenset({"stop", "predict"})
-"""Who sees that something goes wrong may stop it; a prediction moves nothing."""
+"""Commands without a token: any observer may stop the rig, and a prediction moves nothing."""
 
 _READ_S: Final = 5.0
-"""Time for the body of a request."""
+"""Timeout of a request's body."""
 _SILENT_S: Final = 10.0
-"""Time for the first request of a connection."""
-_LOOK_S: Final = 0.5
+"""Timeout of a connection's first request."""
+_POLL_S: Final = 0.5
 _MOST_CONNECTIONS: Final = 96
 
 _POLICY: Final = "; ".join(
@@ -59,7 +59,7 @@ REPORT_POLICY: Final = "; ".join(
         "sandbox allow-popups allow-downloads",
     )
 )
-"""For reports, which are one file each, with their style in it: no scripts, an origin of none."""
+"""Policy of reports, which are single files with inline style: no scripts, and no origin."""
 _HEADERS: Final = {
     "Content-Security-Policy": _POLICY,
     "X-Content-Type-Options": "nosniff",
@@ -70,8 +70,8 @@ _HEADERS: Final = {
 }
 
 
-class Access:
-    """Checks each request before anything else sees it.
+class WebAccess:
+    """Access control, which checks each request first.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Access:
 
     @web.middleware
     async def guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Answer a request that may be answered, under the page's policy."""
+        """Handle a permitted request; return refusals and errors as JSON."""
         try:
             refusal = _refusal(request)
             response = await handler(request) if refusal is None else refusal
@@ -92,7 +92,7 @@ class Access:
             response = refused(error.status, error.reason)
         except UserError as error:
             response = refused(400, str(error))
-        except Exception as error:  # told to who asked, not to the terminal
+        except Exception as error:  # reported to the client, not on the terminal
             response = refused(500, f"The page's server failed: {error!r}")
         return response
 
@@ -103,21 +103,21 @@ class Access:
             response.headers.setdefault(name, value)
 
     def may_act(self, request: web.Request) -> bool:
-        """Whether a request has the token."""
+        """Return whether a request has the token."""
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
         return scheme == "Bearer" and hmac.compare_digest(
             given.encode(errors="surrogateescape"), self._token
         )
 
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
-        """Whether a command of the control socket may be passed on.
+        """Return whether a request may send a command to the control socket.
 
         Parameters
         ----------
         request
-            Request that brought it.
+            Request with the command.
         command, parameters
-            Its members. A prediction of a file would have the daemon read that file.
+            Members of the command. A prediction from a file makes the daemon read that file.
         """
         if self.may_act(request):
             return True
@@ -128,7 +128,7 @@ class Access:
 
 
 async def object_of(request: web.Request) -> dict[str, Any]:
-    """Return the JSON object that a request brings.
+    """Return the JSON object in a request's body.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ async def object_of(request: web.Request) -> dict[str, Any]:
     Raises
     ------
     HTTPException
-        If it brings something else, or takes its time.
+        If the body is no JSON object, or does not arrive in time.
     """
     try:
         given = json.loads(await asyncio.wait_for(request.read(), _READ_S))
@@ -152,7 +152,7 @@ async def object_of(request: web.Request) -> dict[str, Any]:
 
 
 def refused(status: int, text: str) -> web.Response:
-    """Return a refusal, as the page shows it.
+    """Return a refusal for the page.
 
     Parameters
     ----------
@@ -165,15 +165,15 @@ def refused(status: int, text: str) -> web.Response:
 
 
 def _refusal(request: web.Request) -> web.Response | None:
-    """Refuse what no page of ours sends."""
+    """Return the refusal of a request that this server's page would not send; None if permitted."""
     host = request.headers.get("Host", "")
-    # From another port through a tunnel; the name is what tells a page of somebody else.
+    # The port may differ because of a tunnel, but the name must be local.
     if _name_of(host) not in _OWN_NAMES:
         return refused(403, "Open this page as http://127.0.0.1:PORT/.")
     origin = request.headers.get("Origin")
     if origin is not None and origin != f"http://{host}":
         return refused(403, "Requests from other pages are refused.")
-    # A report is in a sandbox, which makes it a page of another origin; its browser wants an icon.
+    # A sandboxed report counts as another origin, and its browser requests the icon.
     site = request.headers.get("Sec-Fetch-Site", "same-origin")
     if site not in ("same-origin", "none") and request.path != ICON:
         return refused(403, "Requests from other pages are refused.")
@@ -187,7 +187,7 @@ def _refusal(request: web.Request) -> web.Response | None:
 
 
 def _name_of(host: str) -> str:
-    """Return the name in a Host header; empty if it is not a plain name and port."""
+    """Return the name in a Host header; empty if it is not just a name and a port."""
     try:
         split = urlsplit(f"//{host}")
         port = split.port
@@ -201,39 +201,39 @@ def _name_of(host: str) -> str:
 
 
 class Connections:
-    """Bounds the connections: their number, and the time for which one may say nothing.
+    """Limits of the number of connections and of their time without a request.
 
     Attributes
     ----------
     serving
-        Makes the protocols of connections, and knows those there are; set before there are any.
+        Server of the connections; set it before the first one.
     """
 
     serving: web.Server
 
     def __init__(self) -> None:
         self._silent: dict[RequestHandler, float] = {}
-        """Connections without a request so far, and until when each has to make one."""
+        """Deadlines of the connections that have sent no request yet."""
         self._pages: set[RequestHandler] = set()
 
-    def look_after(self) -> None:
-        """Close those that say nothing, from now on."""
+    def close_silent(self) -> None:
+        """Close connections that send no request in time, periodically from now on."""
         now_s, open_now = time.monotonic(), set(self.serving.connections)
         self._silent = {each: end_s for each, end_s in self._silent.items() if each in open_now}
         for protocol, end_s in self._silent.items():
             if end_s < now_s and protocol.transport is not None:
                 protocol.transport.abort()
-        asyncio.get_running_loop().call_later(_LOOK_S, self.look_after)
+        asyncio.get_running_loop().call_later(_POLL_S, self.close_silent)
 
     def welcome(self) -> asyncio.Protocol:
-        """Make the protocol of a new connection; the oldest that is not an open page makes room."""
+        """Return the protocol of a new connection; the oldest one without a page may close."""
         open_now = [
             (each, each.transport)
             for each in self.serving.connections
             if each.transport is not None and not each.transport.is_closing()
         ]
         too_many = max(0, len(open_now) - _MOST_CONNECTIONS + 1)
-        # The last client may want to stop the rig.
+        # The newest client may want to stop the rig.
         for transport in [each[1] for each in open_now if each[0] not in self._pages][:too_many]:
             transport.abort()
         protocol = self.serving()
@@ -241,8 +241,8 @@ class Connections:
         return protocol
 
     @web.middleware
-    async def heard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Take note that a connection has made a request, and of those that are open pages."""
+    async def note_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Register the request of a connection, and connections of open pages."""
         self._silent.pop(request.protocol, None)
         if request.path != LIVE:
             return await handler(request)

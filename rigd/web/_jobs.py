@@ -1,6 +1,6 @@
 """Jobs of the page: reports, campaigns and exports by `analyze`, at idle priority.
 
-They stand still while a session runs, and end with the page however that ends.
+They are suspended while a session runs, and end with the page's process, however that ends.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, give_way
 Document = dict[str, Any]
 
 MOST_JOBS: Final = 16
-"""Jobs that may wait."""
+"""Limit of the waiting jobs."""
 _PROGRAM: Final = (*OWN_PYTHON, "-m", "analysis")
-_MORTAL: Final = """
+_DIE_WITH_PAGE: Final = """
 import os, signal, sys
 from rigd.runtime import end_with, killed_first
 
@@ -29,20 +29,20 @@ killed_first()
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
 os.execv(sys.argv[2], sys.argv[2:])
 """
-"""Program that becomes another one, which ends with the process that is named first, or if memory
-runs out."""
-_LOOK_S: Final = 0.2
-_MOST_SAID: Final = 1000
+"""Program that executes another one, which ends with the process of its first argument, and first
+of all if memory runs out."""
+_POLL_S: Final = 0.2
+_MOST_STDERR_BYTES: Final = 1000
 _MOST_LINES: Final = 3
 
 
 class JobError(Exception):
-    """A job cannot be taken, or failed; the message is for the operator."""
+    """A job is refused or failed; the message is for the operator."""
 
 
 @dataclass(slots=True)
-class Job:
-    """Something that `analyze` makes."""
+class AnalysisJob:
+    """One job of `analyze`."""
 
     number: int
     kind: str
@@ -50,17 +50,17 @@ class Job:
     arguments: Sequence[str]
     """Command line of `analyze`."""
     id: str = ""
-    """Session it is about, if it is one."""
+    """Session of the job; empty for several sessions."""
     address: str = ""
-    """Where its result is served."""
+    """Path at which the result is served."""
     state: str = "waiting"
     error: str = ""
     dropped: bool = False
-    """A session has begun; its result is no longer waited for."""
+    """Whether it was dropped because a session has begun."""
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
     def document(self) -> Document:
-        """Tell the page how it stands."""
+        """Return the state of the job as a message for the page."""
         return {
             "type": "job",
             "number": self.number,
@@ -73,64 +73,66 @@ class Job:
 
 
 class Jobs:
-    """One job after the other, none of which disturbs a session.
+    """Queue of jobs, which run one after the other without disturbing a session.
 
     Parameters
     ----------
     folder
-        Folder of the sessions, in which they are run.
-    tell
+        Folder of the sessions and working directory of the jobs.
+    publish
         Called with each change of a job.
 
     Attributes
     ----------
     paused
-        A session runs.
+        Whether a session runs.
     """
 
-    def __init__(self, folder: Path, tell: Callable[[Document], None]) -> None:
-        self.paused = True  # until the daemon has said that no session runs
+    def __init__(self, folder: Path, publish: Callable[[Document], None]) -> None:
+        self.paused = True  # until the daemon reports that no session runs
         self._folder = folder
-        self._tell = tell
-        self._waiting: asyncio.Queue[Job] = asyncio.Queue(MOST_JOBS)
-        self._underway: dict[int, Job] = {}
+        self._publish = publish
+        self._waiting: asyncio.Queue[AnalysisJob] = asyncio.Queue(MOST_JOBS)
+        self._unfinished: dict[int, AnalysisJob] = {}
         self._count = 0
 
     @property
     def addresses(self) -> set[str]:
-        """Where results will be served of jobs that wait or run."""
-        return {job.address for job in self._underway.values()}
+        """Paths of the results of waiting and running jobs."""
+        return {job.address for job in self._unfinished.values()}
 
-    def put(self, kind: str, arguments: Sequence[str], session: str = "", address: str = "") -> Job:
+    def put(
+        self, kind: str, arguments: Sequence[str], session: str = "", address: str = ""
+    ) -> AnalysisJob:
         """Queue a job.
 
         Parameters
         ----------
         kind, arguments, session, address
-            See `Job`.
+            See `AnalysisJob`.
 
         Raises
         ------
         JobError
-            If too many wait already.
+            If too many jobs wait.
         """
         self._count += 1
-        job = Job(self._count, kind, arguments, session, address)
+        job = AnalysisJob(self._count, kind, arguments, session, address)
         try:
             self._waiting.put_nowait(job)
         except asyncio.QueueFull:
             raise JobError(f"{MOST_JOBS} jobs are waiting already; try again later.") from None
-        self._underway[job.number] = job
-        self._say(job)
+        self._unfinished[job.number] = job
+        self._publish_state(job)
         return job
 
-    async def await_or_drop(self, job: Job) -> None:
-        """Wait for the end of a job; a session that begins ends it.
+    async def await_or_drop(self, job: AnalysisJob) -> None:
+        """Wait for the end of a job; drop it if a session begins.
 
         Parameters
         ----------
         job
-            One that is queued; ``dropped`` says that it was ended.
+            Queued job, whose ``dropped`` is true if it was dropped.
         """
         while not job.done.is_set():
             if self.paused:
@@ -138,42 +140,43 @@ class Jobs:
                 if job.state == "waiting":
                     return
             with suppress(TimeoutError):
-                await asyncio.wait_for(job.done.wait(), _LOOK_S)
+                await asyncio.wait_for(job.done.wait(), _POLL_S)
 
     async def run(self) -> None:
-        """Do what is queued, until cancelled."""
+        """Run the queued jobs until cancelled."""
         while True:
             job = await self._waiting.get()
             while self.paused:
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(_POLL_S)
             if not job.dropped:
                 job.state = "running"
-                self._say(job)
+                self._publish_state(job)
                 try:
                     await self._perform(job)
                     job.state = "done"
                 except (JobError, OSError) as error:
                     job.state, job.error = "failed", str(error)
                 job.done.set()
-                self._say(job)
-            del self._underway[job.number]
+                self._publish_state(job)
+            del self._unfinished[job.number]
 
-    def _say(self, job: Job) -> None:
-        """Tell how a job stands; who waits for an export is answered."""
+    def _publish_state(self, job: AnalysisJob) -> None:
+        """Publish the state of a job, except of an export, whose request waits for it."""
         if job.kind != "export":
-            self._tell(job.document())
+            self._publish(job.document())
 
-    async def _perform(self, job: Job) -> None:
+    async def _perform(self, job: AnalysisJob) -> None:
         process = await asyncio.create_subprocess_exec(
-            *(*OWN_PYTHON, "-c", _MORTAL, str(os.getpid())),
+            *(*OWN_PYTHON, "-c", _DIE_WITH_PAGE, str(os.getpid())),
             *(*_PROGRAM, *job.arguments),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env=os.environ | SINGLE_THREADED,
-            # With its workers it is suspended and ended as one; no session of its own, for if the
-            # page ends the system wakes and ends (SIGHUP) suspended groups of the same one only.
+            # A group, so that it is suspended and killed together with its workers. In the page's
+            # session, because when the page ends the system resumes and ends (SIGHUP) suspended
+            # groups of the same session only.
             process_group=0,
         )
         give_way(process.pid)
@@ -186,14 +189,18 @@ class Jobs:
                 if self.paused is not stopped:
                     stopped = self.paused
                     _signal(process.pid, signal.SIGSTOP if stopped else signal.SIGCONT)
-                await asyncio.wait((ending,), timeout=_LOOK_S)
-            _, said = ending.result()
+                await asyncio.wait((ending,), timeout=_POLL_S)
+            _, stderr = ending.result()
         finally:
             if process.returncode is None:
                 _signal(process.pid, signal.SIGKILL)
                 await asyncio.wait((ending,))
         if process.returncode != 0:
-            words = said.decode(errors="replace").strip()[-_MOST_SAID:].splitlines()[-_MOST_LINES:]
+            words = (
+                stderr.decode(errors="replace")
+                .strip()[-_MOST_STDERR_BYTES:]
+                .splitlines()[-_MOST_LINES:]
+            )
             why = " ".join(words) or f"exit code {process.returncode}"
             raise JobError(f"The {job.kind} was not made: {why}")
 

@@ -1,6 +1,6 @@
 """Sessions on the page: the library's rows, quick looks, reports and downloads.
 
-A session is named by its file's stem; no address of the page has a path in it.
+The name of a session is the stem of its file. No address of the page contains a path.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from aiohttp import web
 
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session.quick_look import LOOK_SUFFIX, last_look, read_look
-from rigd.web._access import REPORT_POLICY, Access, object_of, refused
+from rigd.web._access import REPORT_POLICY, WebAccess, object_of, refused
 from rigd.web._jobs import JobError, Jobs
 
 Document = dict[str, Any]
@@ -32,32 +32,32 @@ _SESSION_RUNS: Final = "A session runs; files are converted when it has ended."
 
 
 class Library:
-    """Serves what lies in the sessions' folder, and nothing else.
+    """Server of the files in the sessions' folder only.
 
     Parameters
     ----------
     folder
         Folder of the session files.
     access
-        Says who may have something made.
+        Permission to create reports.
     jobs
-        Makes reports and exports.
+        Queue for reports and exports.
     """
 
-    def __init__(self, folder: Path, access: Access, jobs: Jobs) -> None:
+    def __init__(self, folder: Path, access: WebAccess, jobs: Jobs) -> None:
         self._folder = folder
         self._access = access
         self._jobs = jobs
         self._exporting = asyncio.Lock()
         self._listing = asyncio.Lock()
-        """Lists are made one at a time: they may be slow, and many may be asked for."""
+        """Lock for one list at a time, because lists may be slow and requests many."""
 
     def routes(self) -> list[web.RouteDef]:
-        """Return the addresses that are served."""
+        """Return the routes of the library."""
         return [
             web.get("/api/sessions", self._list),
             web.get("/api/sessions/{id}/file.{ending}", self._file),
-            web.get("/api/sessions/{id}/look", self._look),
+            web.get("/api/sessions/{id}/look", self._quick_look),
             web.get("/api/sessions/{id}/report/", self._report),
             web.get("/api/sessions/{id}/report/{name}", self._report),
             web.post("/api/sessions/{id}/report", self._make_report),
@@ -73,33 +73,33 @@ class Library:
         Parameters
         ----------
         **filters
-            As of `rigd.library.list_sessions`.
+            As for `rigd.library.list_sessions`.
         """
         async with self._listing:
             return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
-        """Return the specimens of all sessions, the last one first."""
+        """Return the specimens of all sessions, the latest first."""
         return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
 
     async def last_response(self, specimen: str, but: str) -> Document | None:
-        """Return the response of the last session of a specimen, as the page is told it.
+        """Return the response of the last session of a specimen, as a message for the page.
 
         Parameters
         ----------
         specimen
-            Its name; without one, of the last session without one.
+            Name of the specimen; empty: of the last session without a name.
         but
-            The session that is left out: the one that runs.
+            Session to exclude, because it is running.
         """
         found = await asyncio.to_thread(
             partial(last_look, self._folder, specimen, but=but, usable=itemgetter("response"))
         )
         if found is None:
             return None
-        path, look = found
+        path, quick_look = found
         where = {"type": "last", "path": str(path), "specimen": specimen}
-        return {**look["response"], **where, "id": path.stem}
+        return {**quick_look["response"], **where, "id": path.stem}
 
     # Rows
 
@@ -113,27 +113,31 @@ class Library:
         shown = rows[offset : offset + min(limit, _MOST_ROWS)]
         return web.json_response({"total": len(rows), "sessions": [row.as_dict() for row in shown]})
 
-    async def _look(self, request: web.Request) -> web.Response:
-        look = self._look_of(self._session(request).stem)
+    async def _quick_look(self, request: web.Request) -> web.Response:
+        quick_look = self._read_quick_look(self._session(request).stem)
         return (
             refused(404, "There is no quick look of it.")
-            if look is None
-            else web.json_response(look)
+            if quick_look is None
+            else web.json_response(quick_look)
         )
 
     async def _responses(self, request: web.Request) -> web.Response:
-        """Return fitted models and measured responses of several sessions, for an overlay."""
+        """Return fitted models and measured responses of several sessions for comparison."""
         ids = [name for name in request.query.get("ids", "").split(",") if name]
         if not 1 <= len(ids) <= _MOST_CURVES:
             return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
         responses, errors = [], []
         for name in ids:
-            look = self._look_of(self._path(name).stem)
-            if look is None or look["response"] is None:
+            quick_look = self._read_quick_look(self._path(name).stem)
+            if quick_look is None or quick_look["response"] is None:
                 errors.append(f"{name}: there is no quick look of it, and so no response.")
             else:
-                about = {"id": name, "specimen": look["specimen"], "model": look["model"]}
-                responses.append({**about, **look["response"]})
+                about = {
+                    "id": name,
+                    "specimen": quick_look["specimen"],
+                    "model": quick_look["model"],
+                }
+                responses.append({**about, **quick_look["response"]})
         return web.json_response({"responses": responses, "errors": errors})
 
     # Downloads
@@ -147,7 +151,7 @@ class Library:
             return refused(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
             return refused(409, _SESSION_RUNS)
-        # A browser has few connections to a server: none is to wait here for others.
+        # A browser has few connections to a server, so none may wait here for another.
         if self._exporting.locked():
             return refused(409, "Another file is being converted; try again when it is done.")
         async with self._exporting:
@@ -163,7 +167,7 @@ class Library:
                     return refused(409, _SESSION_RUNS)
                 if job.error:
                     return refused(409, job.error)
-                # It is open, and may be sent after the folder has gone.
+                # The open file can be sent after its folder is deleted.
                 return web.Response(body=out.open("rb"), headers=_download_headers(out.name))
 
     # Reports
@@ -182,7 +186,7 @@ class Library:
         return self._page_of(folder, request.match_info.get("file", REPORT_PAGE))
 
     def _page_of(self, folder: Path, name: str) -> web.StreamResponse:
-        """Serve one file of a report, which must be a plain one in its folder."""
+        """Return one file of a report, which must be a regular file in its folder."""
         if not _REPORT_FILES.fullmatch(name):
             return refused(404, "There is no such file.")
         path = (folder / name).resolve()
@@ -208,7 +212,7 @@ class Library:
             or not all(isinstance(name, str) for name in ids)
         ):
             return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
-        paths = sorted({str(self._path(name)) for name in ids})  # as they were recorded
+        paths = sorted({str(self._path(name)) for name in ids})  # in the order of recording
         folder = self._free("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
         return self._queue("campaign", arguments, "", _served_at(folder))
@@ -221,7 +225,7 @@ class Library:
         return web.json_response({"ok": True, "job": job.number}, status=202)
 
     def _free(self, name: str) -> Path:
-        """Return a folder of that name that is not there yet, and that no campaign will make."""
+        """Return an unused folder name, which no waiting campaign will create either."""
         number, path = 1, self._folder / name
         while path.exists() or _served_at(path) in self._jobs.addresses:
             number += 1
@@ -239,7 +243,7 @@ class Library:
         Raises
         ------
         HTTPNotFound
-            If there is no plain file of that name in the folder.
+            If the folder has no regular file of that name.
         """
         path = self._inside(f"{name}.mcap")
         if not path.is_file():
@@ -247,35 +251,35 @@ class Library:
         return path
 
     def _inside(self, name: str) -> Path:
-        """Return what has a name in the folder; nothing leads out of it.
+        """Return the path of a name in the folder.
 
         Raises
         ------
         HTTPNotFound
-            If the name is a path, or a link that leads elsewhere.
+            If the name is a path, or a link out of the folder.
         """
         with suppress(OSError, ValueError):
             path = self._folder / name
             plain = Path(name).name == name and not name.startswith(".") and name.isprintable()
-            path.lstat()  # or there is none, or its name is too long
+            path.lstat()  # raises if it does not exist or the name is too long
             if plain and path.resolve().parent == self._folder.resolve():
                 return path
         raise web.HTTPNotFound(reason="There is no such session.")
 
-    def _look_of(self, name: str) -> Document | None:
-        """Return the quick look of a session, if there is one that can be read."""
+    def _read_quick_look(self, name: str) -> Document | None:
+        """Return the quick look of a session; None if there is none or it is unreadable."""
         with suppress(web.HTTPNotFound):
             return read_look(self._inside(f"{name}{LOOK_SUFFIX}"))
         return None
 
 
 def _served_at(folder: Path) -> str:
-    """Address of a campaign's report."""
+    """Return the path at which a campaign's report is served."""
     return f"/api/campaign/{folder.name}/"
 
 
 def _download_headers(name: str) -> dict[str, str]:
-    # A session's name may hold anything that a file's name may.
+    # The name of a session may contain any character of file names.
     plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
     return {
         "Content-Disposition": f'attachment; filename="{plain}"',

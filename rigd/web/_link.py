@@ -1,4 +1,4 @@
-"""The page's connection to the daemon: by the public control socket, made again when it is lost."""
+"""The page's connection to the daemon's control socket, restored when it is lost."""
 
 import asyncio
 import json
@@ -13,12 +13,12 @@ Document = dict[str, Any]
 _Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 _STATUS_S: Final = 1.0
-"""Time from one question for the status to the next, where signals come meanwhile."""
+"""Period of status requests while signals arrive."""
 _ALIVE_S: Final = 0.4
-"""Likewise, where they do not."""
+"""Period of status requests while no signals arrive."""
 _SILENT_S: Final = 0.85
-"""A daemon from which nothing is heard for so long is told of."""
-_LOOK_S: Final = 0.1
+"""Time without a message after which the daemon is reported as silent."""
+_POLL_S: Final = 0.1
 _RETRY_S: Final = 0.5
 _CONNECT_S: Final = 5.0
 _ANSWER_S: Final = 90.0
@@ -28,7 +28,7 @@ _CROWD_PAUSE_S: Final = 0.1
 
 
 class DaemonError(Exception):
-    """The daemon cannot be asked; the message is for the operator."""
+    """The daemon does not reply; the message is for the operator."""
 
 
 class BusyError(Exception):
@@ -36,7 +36,7 @@ class BusyError(Exception):
 
 
 class DaemonLink:
-    """Follows one daemon, and passes requests on.
+    """Connection to one daemon, which receives its events and passes requests on.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class DaemonLink:
     on_message
         Called with each event, and with each status reply.
     on_lost
-        Called with the reason when the daemon is not heard any more.
+        Called with the reason when the daemon is no longer received.
     """
 
     def __init__(
@@ -54,80 +54,80 @@ class DaemonLink:
         self._path = path
         self._on_message = on_message
         self._on_lost = on_lost
-        self._asking = asyncio.Event()
+        self._status_requested = asyncio.Event()
         self._held: _Connection | None = None
         self._held_series: float = 0
         self._ended: float = 0
-        """The last series that has ended; infinite where its end may not have been heard."""
+        """Last series that has ended; infinite if the message of its end may have been lost."""
         self._commanding = asyncio.Lock()
         self._stops = 0
-        self._heard_s = 0.0
+        self._last_received_s = 0.0
         self._silent = False
-        self._told_signals = False
+        self._signals_received = False
 
     async def run(self) -> None:
-        """Follow the daemon, until cancelled."""
+        """Receive the daemon's events until cancelled."""
         while True:
             try:
                 await self._follow()
             except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
-                self._note_end(math.inf)
+                self._register_end(math.inf)
                 self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
             await asyncio.sleep(_RETRY_S)
 
     def ask_for_status(self) -> None:
-        """Have the status come soon: something has changed."""
-        self._asking.set()
+        """Request the status soon, because something has changed."""
+        self._status_requested.set()
 
     def note_stop(self) -> None:
-        """Take note of a stop: what has not been sent yet will not be."""
+        """Register a stop, which cancels requests that are not sent yet."""
         self._stops += 1
 
     async def ask(self, request: Document) -> Document:
-        """Pass a request on and return the reply.
+        """Send a request and return the reply.
 
-        A session that was started keeps its connection until its series ends, and with it the
-        control; further requests that need it take the same one.
+        The connection that started a series stays open until its end, and with it the control.
+        Further requests that need control use the same connection.
 
         Parameters
         ----------
         request
-            As docs/control_socket.md has it.
+            Request of docs/control_socket.md.
 
         Raises
         ------
         BusyError
-            If another request is being answered, or a stop came before this one was sent.
+            If another request is pending, or a stop came before this one was sent.
         DaemonError
             If there is no reply.
         """
         if request.get("command") == "predict":
-            return await self._ask_anew(request)
-        # A start that waited here would begin after a stop, of which the daemon would know nothing.
+            return await self._ask_on_new_connection(request)
+        # A start that waited here could begin after a stop, which the daemon would not notice.
         if self._commanding.locked():
             raise BusyError("Another request is being answered; try again in a moment.")
         async with self._commanding:
             held = self._held
             if held is not None and (held[0].at_eof() or held[1].is_closing()):
-                self._let_go()
+                self._release_control()
             try:
                 if self._held is None:
-                    reply = await self._ask_anew(request)
+                    reply = await self._ask_on_new_connection(request)
                 else:
                     reply = await _exchange(self._held, request)
                 if request.get("command") == "start" and reply.get("ok"):
                     self._held_series = reply["series"]
             except DaemonError:
-                # Not sent again: it may have been obeyed.
-                self._let_go()
+                # Not sent again, because it may have been executed.
+                self._release_control()
                 raise
             finally:
                 if self._held_series <= self._ended:
-                    self._let_go()
+                    self._release_control()
             return reply
 
-    async def _ask_anew(self, request: Document) -> Document:
-        """Ask over a new connection; a daemon that has too many clients is asked again."""
+    async def _ask_on_new_connection(self, request: Document) -> Document:
+        """Send a request on a new connection; repeat it while the daemon has too many clients."""
         stops = self._stops
         for attempt in range(_CROWD_TRIES):
             if attempt:
@@ -154,70 +154,73 @@ class DaemonLink:
         return await asyncio.wait_for(opening, _CONNECT_S)
 
     async def _follow(self) -> None:
-        """Read what one connection brings, to its end."""
+        """Receive the messages of one connection until it ends."""
         reader, writer = await self._connect()
-        self._heard_s, self._ended = time.monotonic(), 0  # a new daemon counts from 0
-        beside = [
-            asyncio.create_task(self._keep_asking(writer)),
-            asyncio.create_task(self._note_silence()),
+        self._last_received_s, self._ended = (
+            time.monotonic(),
+            0,
+        )  # a new daemon numbers its series from 0
+        tasks = [
+            asyncio.create_task(self._poll_status(writer)),
+            asyncio.create_task(self._report_silence()),
         ]
         try:
             writer.write(b'{"command": "watch", "signals": true}\n')
             while True:
                 self._take(await reader.readline())
         finally:
-            for task in beside:
+            for task in tasks:
                 task.cancel()
             writer.close()
 
     def _take(self, line: bytes) -> None:
         if not line:
             raise DaemonError(_GONE)
-        self._heard_s, self._silent = time.monotonic(), False
+        self._last_received_s, self._silent = time.monotonic(), False
         message = json.loads(line)
         if message.get("reply") == "watch" and not message.get("ok"):
             raise DaemonError(str(message.get("error")))
         if message.get("event") == "signals":
-            self._told_signals = True
+            self._signals_received = True
         elif message.get("event") == "series":
-            self._note_end(message["series"])
+            self._register_end(message["series"])
         if "event" in message or message.get("reply") == "status":
             self._on_message(message)
 
-    async def _note_silence(self) -> None:
-        """Tell of a daemon from which nothing has come for a while."""
+    async def _report_silence(self) -> None:
+        """Report a daemon that has been silent for a while."""
         while True:
-            left_s = self._heard_s + _SILENT_S - time.monotonic()
+            left_s = self._last_received_s + _SILENT_S - time.monotonic()
             if left_s <= 0.0 and not self._silent:
                 self._silent = True
-                self._on_lost(f"The daemon has said nothing for {_SILENT_S:g} s.")
-            await asyncio.sleep(max(left_s, _LOOK_S))
+                self._on_lost(f"The daemon has sent nothing for {_SILENT_S:g} s.")
+            await asyncio.sleep(max(left_s, _POLL_S))
 
-    async def _keep_asking(self, writer: asyncio.StreamWriter) -> None:
+    async def _poll_status(self, writer: asyncio.StreamWriter) -> None:
         while True:
             writer.write(b'{"command": "status"}\n')
-            self._asking.clear()
-            # Where no signals come, nothing else shows that the daemon is alive.
-            pause_s = _STATUS_S if self._told_signals else _ALIVE_S
-            self._told_signals = False
+            self._status_requested.clear()
+            # Without signals only the status shows that the daemon is alive.
+            pause_s = _STATUS_S if self._signals_received else _ALIVE_S
+            self._signals_received = False
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._asking.wait(), pause_s)
+                await asyncio.wait_for(self._status_requested.wait(), pause_s)
 
-    def _note_end(self, series: float) -> None:
-        """Give control back after a series, but not under a request that is being answered."""
+    def _register_end(self, series: float) -> None:
+        """Release control after a series, unless a request is pending."""
         self._ended = series
         if not self._commanding.locked():
-            self._let_go()
+            self._release_control()
 
-    def _let_go(self) -> None:
-        """Give control back."""
+    def _release_control(self) -> None:
+        """Release control, by closing its connection."""
         held, self._held = self._held, None
         if held is not None:
             held[1].close()
 
 
 async def _exchange(link: _Connection, request: Document) -> Document:
-    """Send a request and wait for its reply."""
+    """Send a request and return its reply."""
     reader, writer = link
     try:
         writer.write(json.dumps(request).encode() + b"\n")

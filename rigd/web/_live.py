@@ -1,4 +1,4 @@
-"""Messages to the pages that are open: each has a queue, so a slow one delays no other."""
+"""Messages to the open pages: each has its own queue, so that a slow page delays no other."""
 
 import asyncio
 import json
@@ -14,21 +14,21 @@ Document = dict[str, Any]
 
 MOST_PAGES: Final = 24
 _MOST_WAITING: Final = 200
-"""Messages for a page, some 5 s of a session; then it is dropped, and may come again."""
-_MOST_SAID: Final = 1024
+"""Limit of a page's queue, about 5 s of a session; beyond it the page is dropped."""
+_MOST_MESSAGE_BYTES: Final = 1024
 _HEARTBEAT_S: Final = 10.0
 _MOST_EVENTS: Final = 200
 
 
-class Page:
-    """One open page.
+class OpenPage:
+    """Connection to one open page.
 
     Parameters
     ----------
     socket
-        Its WebSocket, ready to be written to.
+        WebSocket of the page, ready for writing.
     transport
-        Its connection.
+        Transport of the connection.
     """
 
     def __init__(self, socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
@@ -38,7 +38,7 @@ class Page:
         self._woken = asyncio.Event()
 
     def put(self, text: str) -> None:
-        """Have a message sent; a page that does not read is dropped."""
+        """Queue a message; drop the page if its queue is full."""
         if len(self._waiting) >= _MOST_WAITING:
             self.drop()
             return
@@ -46,52 +46,52 @@ class Page:
         self._woken.set()
 
     def drop(self) -> None:
-        """Close its connection now."""
+        """Close the connection at once."""
         self._waiting.clear()
         if self._transport is not None:
             self._transport.abort()
 
     async def write(self) -> None:
-        """Send what waits, until cancelled or the page is gone."""
+        """Send the queued messages until cancelled or the page is gone."""
         with suppress(ConnectionError, RuntimeError):
             while True:
                 await self._woken.wait()
                 self._woken.clear()
                 while self._waiting:
-                    # Together: each send costs more than what is sent.
+                    # In one message, because the cost of a message hardly depends on its size.
                     text = "\n".join(self._waiting)
                     self._waiting.clear()
                     await self._socket.send_str(text)
 
-    async def stop_when(
-        self, asked: asyncio.Event, stop: Callable[[], Awaitable[Document]]
+    async def stop_on_request(
+        self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
     ) -> None:
-        """Stop each time that it is asked for, one at a time, and tell the page what came of it."""
+        """Execute each requested stop, one at a time, and send the result to the page."""
         while True:
-            await asked.wait()
-            asked.clear()
+            await stop_requested.wait()
+            stop_requested.clear()
             self.put(_text({"type": "stop", **await stop()}))
 
 
 class Pages:
-    """All open pages, and what one that is opened now has to know."""
+    """All open pages, and the last log lines for new pages."""
 
     def __init__(self) -> None:
-        self._pages: set[Page] = set()
+        self._pages: set[OpenPage] = set()
         self._events: deque[Document] = deque(maxlen=_MOST_EVENTS)
 
     def __len__(self) -> int:
         return len(self._pages)
 
     def send(self, document: Document | None) -> None:
-        """Send a message to all of them; None: there is nothing to send."""
+        """Send a message to all pages; None is ignored."""
         if document is not None and self._pages:
             text = _text(document)
             for page in list(self._pages):
                 page.put(text)
 
     def note(self, level: str, text: str) -> None:
-        """Send a line of the log, and keep it for pages that are opened later."""
+        """Send a log line, and store it for pages that open later."""
         event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": text}
         self._events.append(event)
         self.send(event)
@@ -109,39 +109,41 @@ class Pages:
         request
             Request for a WebSocket.
         first
-            Messages that it gets at once.
+            First messages for the page.
         stop
-            What its message ``stop`` has done; the result is sent to it as ``stop``.
+            Called for each message ``stop`` of the page, which gets the result as ``stop``.
         """
         if len(self._pages) >= MOST_PAGES:
             raise web.HTTPServiceUnavailable(reason=f"There are {MOST_PAGES} open pages already.")
         socket = web.WebSocketResponse(
-            heartbeat=_HEARTBEAT_S, compress=False, max_msg_size=_MOST_SAID
+            heartbeat=_HEARTBEAT_S, compress=False, max_msg_size=_MOST_MESSAGE_BYTES
         )
         await socket.prepare(request)
-        page = Page(socket, request.transport)
+        page = OpenPage(socket, request.transport)
         for document in (*first, *self._events):
             page.put(_text(document))
         self._pages.add(page)
-        asked = asyncio.Event()
-        beside = [
+        stop_requested = asyncio.Event()
+        tasks = [
             asyncio.create_task(page.write()),
-            asyncio.create_task(page.stop_when(asked, stop)),
+            asyncio.create_task(page.stop_on_request(stop_requested, stop)),
         ]
         try:
-            # A browser's requests may wait behind its downloads; this does not. Whatever else
-            # comes is the end.
-            while (said := await socket.receive()).type is WSMsgType.TEXT and said.data == "stop":
-                asked.set()
+            # Unlike a request, this does not wait for downloads of the browser. Any other message
+            # ends the connection.
+            while (
+                message := await socket.receive()
+            ).type is WSMsgType.TEXT and message.data == "stop":
+                stop_requested.set()
         finally:
             self._pages.discard(page)
-            for task in beside:
+            for task in tasks:
                 task.cancel()
             page.drop()
         return socket
 
     def drop_all(self) -> None:
-        """Close all connections."""
+        """Close the connections of all pages."""
         for page in list(self._pages):
             page.drop()
 

@@ -1,4 +1,4 @@
-"""Server of the page: its routes, what it tells the pages of the daemon, and its program."""
+"""Server of the page: its routes, its messages to the open pages, and its program."""
 
 import asyncio
 import json
@@ -24,7 +24,7 @@ from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
 from rigd.view import Subject, sweep_of
-from rigd.web._access import ICON, LIVE, Access, Connections, object_of, refused
+from rigd.web._access import ICON, LIVE, Connections, WebAccess, object_of, refused
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
@@ -36,7 +36,7 @@ Document = dict[str, Any]
 _LOOPBACK: Final = "127.0.0.1"
 _COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
 _STOPS: Final = 4
-"""Stops that are passed on at a time; no other work takes their threads."""
+"""Limit of simultaneous stops, which have their own threads."""
 _LONGEST_REQUEST: Final = 65_536
 _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
@@ -47,29 +47,29 @@ _FAILED: Final = "The page's server has failed; the daemon starts it again."
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
 
-class PageServer:
-    """The page of one rig.
+class OperatorPageServer:
+    """Server of one rig's page.
 
     Parameters
     ----------
     job
-        What the daemon tells of the rig: see `rigd.daemon._page`.
+        Data of the rig from the daemon: see `rigd.daemon._page`.
 
     Attributes
     ----------
     pages
-        The pages that are open.
+        Open pages.
     """
 
     def __init__(self, job: Document) -> None:
         self._job = job
         self._socket = Path(job["socket"])
-        self._access = Access(job["token"])
+        self._access = WebAccess(job["token"])
         self.pages = Pages()
         self._jobs = Jobs(Path(job["folder"]), self.pages.send)
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
         self._stopping = ThreadPoolExecutor(_STOPS, "stop")
-        self._link = DaemonLink(self._socket, self._take, self._lose)
+        self._link = DaemonLink(self._socket, self._take, self._report_loss)
         self._excitations = dict(_excitations())
         self._nominal = self._nominal_of(job)
         self._specimens: list[str] = []
@@ -81,10 +81,10 @@ class PageServer:
         self._response: SessionResponse | None = None
         self._shown: Document | None = None
         self._last: Document | None = None
-        self._finding: set[asyncio.Task[None]] = set()
+        self._searches: set[asyncio.Task[None]] = set()
 
     def application(self) -> web.Application:
-        """Return the routes."""
+        """Return the application with its routes."""
         application = web.Application(
             middlewares=[self._access.guard], client_max_size=_LONGEST_REQUEST
         )
@@ -102,19 +102,19 @@ class PageServer:
         return application
 
     async def run(self) -> None:
-        """Follow the daemon and work on jobs, until cancelled."""
+        """Follow the daemon and run jobs until cancelled."""
         await asyncio.gather(
             self._link.run(), self._jobs.run(), self._estimate(), self._find_specimens()
         )
 
     def end(self, reason: str) -> None:
-        """Tell the pages that this is the end."""
-        self._lose(reason)
+        """Report the end of this server to the pages."""
+        self._report_loss(reason)
 
     # Requests
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
-        """Serve a file of the page."""
+        """Return a static file of the page."""
         name = request.match_info.get(
             "name", "index.html" if request.path == "/" else "favicon.svg"
         )
@@ -125,7 +125,7 @@ class PageServer:
         return web.FileResponse(path, headers=shared if request.path == ICON else None)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        """Serve a page that is open."""
+        """Send live messages to an open page."""
         hello = {
             "type": "hello",
             "profile": self._job["profile"],
@@ -144,7 +144,7 @@ class PageServer:
         return await self.pages.follow(request, filter(None, known), self._stop_for_page)
 
     async def _command(self, request: web.Request) -> web.Response:
-        """Pass a request on to the daemon."""
+        """Send a command to the daemon and return its reply."""
         given = await object_of(request)
         command = given.get("command")
         if not isinstance(command, str) or command not in _COMMANDS:
@@ -166,13 +166,13 @@ class PageServer:
         return web.json_response(reply, status=status)
 
     async def _stop(self) -> Document:
-        """Have the daemon stop: it is asked again and again, and then sent a signal."""
+        """Stop the daemon's session, if need be by a signal, and return the reply."""
         self._link.note_stop()
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._stopping, stop_session, self._socket)
 
     async def _stop_for_page(self) -> Document:
-        """Have the daemon stop; a failure is a refusal."""
+        """Stop the daemon's session; return a failure as a refusal."""
         try:
             return await self._stop()
         except (DaemonGoneError, RefusedByDaemonError) as error:
@@ -180,10 +180,10 @@ class PageServer:
         finally:
             self._link.ask_for_status()
 
-    # What the daemon tells
+    # Messages of the daemon
 
     def _take(self, message: Document) -> None:
-        """Take a message of the daemon, and tell the pages."""
+        """Handle a message of the daemon, and send its content to the pages."""
         if self._lost is not None:
             self._lost = None
             self._link.ask_for_status()
@@ -193,7 +193,8 @@ class PageServer:
         elif event == "signals":
             self._take_signals(message)
         elif event == "fit":
-            self._link.ask_for_status()  # which has the last one, for pages opened later too
+            # The status contains the last fit, also for pages that open later.
+            self._link.ask_for_status()
         elif event == "message":
             self.pages.note(message["level"], message["text"])
         else:
@@ -202,7 +203,7 @@ class PageServer:
             if event != "progress":
                 self._link.ask_for_status()
             if event == "session":
-                self._begin_finding(self._find_specimens())
+                self._start_search(self._find_specimens())
             elif event == "quick_look":
                 self.pages.note("info", "\n".join(QuickLook.of_event(message).lines))
 
@@ -217,7 +218,7 @@ class PageServer:
         self.pages.send(self._status)
 
     def _begin(self, path: str, series: Document) -> None:
-        """Make ready for the response of a session."""
+        """Prepare the frequency response of a new session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
         self._nominal = self._nominal_of(plan)
         first, end = sweep_of(plan["segments"])
@@ -237,12 +238,12 @@ class PageServer:
                     self._job["torque_delay_s"],
                 )
             )
-        self.pages.send(self._nominal)  # whereupon they forget the other responses
+        self.pages.send(self._nominal)  # the pages then clear the other responses
         specimen = str(series["notes"].get("specimen", ""))
-        self._begin_finding(self._find_last(specimen, Path(path).stem))
+        self._start_search(self._find_last(specimen, Path(path).stem))
 
     def _nominal_of(self, specimen: Document) -> Document:
-        """Return the nominal model of the beam that a job or a plan names."""
+        """Return the message with the nominal model of the beam of a job or plan."""
         beam, damping = Beam(**specimen["beam"]), Damping(**specimen["damping"])
         return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
 
@@ -257,15 +258,15 @@ class PageServer:
             self._gauges = {"type": "gauges", **event["gauges"], "frequency_hz": frequency_hz}
             self.pages.send(self._gauges)
 
-    def _lose(self, reason: str) -> None:
-        """Tell the pages that the daemon is not heard."""
+    def _report_loss(self, reason: str) -> None:
+        """Report to the pages that the daemon is lost."""
         if self._lost is None or self._lost["reason"] != reason:
             self._lost = {"type": "lost", "reason": reason}
             self.pages.send(self._lost)
         self._status = None
 
     async def _estimate(self) -> None:
-        """Tell the response of the session that runs, now and then."""
+        """Send the response of the running session periodically."""
         while True:
             await asyncio.sleep(_RESPONSE_S)
             if self._response is not None and self.pages:
@@ -273,11 +274,11 @@ class PageServer:
                 self._shown = shown or self._shown
                 self.pages.send(shown)
 
-    def _begin_finding(self, finding: Awaitable[None]) -> None:
-        """Look something up in the library, without waiting for it."""
+    def _start_search(self, finding: Awaitable[None]) -> None:
+        """Start a search in the library without waiting for it."""
         task = asyncio.ensure_future(finding)
-        self._finding.add(task)
-        task.add_done_callback(self._finding.discard)
+        self._searches.add(task)
+        task.add_done_callback(self._searches.discard)
 
     async def _find_specimens(self) -> None:
         with suppress(OSError, ValueError):
@@ -291,7 +292,7 @@ class PageServer:
 
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
-    """Return the options of each excitation, as its function has and describes them."""
+    """Yield name and options of each excitation, from its signature and docstring."""
     for name, function in KINDS.items():
         described = _descriptions(cleandoc(function.__doc__ or ""))
         yield (
@@ -311,7 +312,7 @@ def _excitations() -> Iterator[tuple[str, list[Document]]]:
 
 
 def _descriptions(text: str) -> dict[str, str]:
-    """Return what a docstring says of each argument."""
+    """Return the descriptions of the parameters in a docstring, by name."""
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
     entries = re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section[1], re.MULTILINE) if section else []
     return {
@@ -327,11 +328,11 @@ def _descriptions(text: str) -> dict[str, str]:
 def run_page() -> None:
     """Serve the page until standard input ends; its first line is the job.
 
-    Standard output gets the port, and why the page ends by itself, a line each.
+    Standard output gets one line with the port, and one with the reason if the page fails.
     """
     ignore()
-    # A terminal that is held (Ctrl-S) would hold all pages with it, and anybody who sends nonsense
-    # would fill the journal.
+    # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
+    # journal.
     logging.disable()
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
@@ -342,49 +343,49 @@ async def _run(job: Document) -> None:
     try:
         server, _, listening = await open_page(job)
     except OSError as error:
-        _say(error=f"port {job['port']} cannot be had: {error.strerror}")
+        _report(error=f"port {job['port']} cannot be had: {error.strerror}")
         return
-    _say(port=port_of(listening))
+    _report(port=port_of(listening))
     running = asyncio.create_task(server.run())
     gone = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
     await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
     failed = running.done()
     if failed:
-        _say(error=f"unexpected error ({running.exception()!r})")
-    # The successor of this process, or of a daemon that has ended, may want the port.
+        _report(error=f"unexpected error ({running.exception()!r})")
+    # The successor of this process or of the daemon may need the port.
     listening.close()
     server.end(_FAILED if failed else "The daemon has ended; start it with rigd serve.")
     await asyncio.sleep(_GRACE_S)
-    # An ordinary exit would wait for clients that still read, and for the thread that reads stdin.
+    # A regular exit would wait for reading clients and for the thread that reads stdin.
     os._exit(1 if failed else 0)
 
 
-def _say(**told: Any) -> None:  # noqa: ANN401 - what JSON has
-    """Tell the daemon, which reads standard output."""
-    print(json.dumps(told), flush=True)  # noqa: T201
+def _report(**message: Any) -> None:  # noqa: ANN401 - what JSON has
+    """Send a message to the daemon, which reads standard output."""
+    print(json.dumps(message), flush=True)  # noqa: T201
 
 
-async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.Server]:
-    """Listen on the port of a job, or on another one if that may be.
+async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
+    """Listen on the port of a job, or on a free one if the job permits it.
 
     Parameters
     ----------
     job
-        As of :class:`PageServer`, with ``port`` and ``any_port``.
+        As for :class:`OperatorPageServer`, with ``port`` and ``any_port``.
 
     Returns
     -------
     tuple
-        Server, to be run; what answers for it; its listening socket.
+        Server, to be run; application runner; listening socket.
 
     Raises
     ------
     OSError
-        If the port cannot be had.
+        If the port is not available.
     """
-    server, connections = PageServer(job), Connections()
+    server, connections = OperatorPageServer(job), Connections()
     application = server.application()
-    application.middlewares.append(connections.heard)
+    application.middlewares.append(connections.note_request)
     runner = web.AppRunner(
         application,
         access_log=None,
@@ -404,7 +405,7 @@ async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.S
         if not job["any_port"]:
             raise
         listening = await loop.create_server(connections.welcome, _LOOPBACK, 0)
-    connections.look_after()
+    connections.close_silent()
     return server, runner, listening
 
 

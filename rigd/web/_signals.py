@@ -1,6 +1,6 @@
-"""What the page shows of a running record: strips of the last seconds, the growing response.
+"""Signals of a running record for the page: strips of the last seconds, and the growing response.
 
-Both are made from the blocks of signals that the daemon tells, which may have gaps.
+Both are computed from the daemon's blocks of signals, which may have gaps.
 """
 
 import base64
@@ -21,10 +21,10 @@ Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
 
 STRIP_S: Final = 0.05
-"""Time that a point of a strip stands for."""
-_KEPT_S: Final = 10.0
+"""Duration of a point of a strip."""
+_STORED_S: Final = 10.0
 _EVERY: Final = 4
-"""One bin in four of the 1/160 Hz of `analyze` is shown: still two in a segment's resolution."""
+"""Every fourth bin of `analyze` (1/160 Hz) is shown: still two per resolution of a segment."""
 _DIGITS: Final = 6
 _FED_AT_ONCE: Final = 20
 _NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
@@ -41,16 +41,16 @@ _SAMPLE: Final = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Signals of some ticks, one after the other; what is not known is NaN."""
+    """Signals of consecutive ticks; unknown values are NaN."""
 
     first_tick: int
     rate_hz: float
     values: Real
-    """Angle (rad), its reference (rad) and coupling torque (N·m), (3, n)."""
+    """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n)."""
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "Block":
-        """Take it out of the daemon's event ``signals``."""
+        """Return the block in the daemon's event ``signals``."""
         data = b"".join(base64.b64decode(event[name]) for name in _NAMES)
         values = np.frombuffer(data, dtype="<f4").reshape(len(_NAMES), -1).astype(np.float64)
         return cls(event["first_tick"], event["rate_hz"], values)
@@ -63,19 +63,19 @@ class Strips:
     """Envelopes of the last 10 s of angle and torque, in points of 0.05 s."""
 
     def __init__(self) -> None:
-        self._points: deque[tuple[float | None, ...]] = deque(maxlen=round(_KEPT_S / STRIP_S))
+        self._points: deque[tuple[float | None, ...]] = deque(maxlen=round(_STORED_S / STRIP_S))
         self._next = 0
-        """Number of the point that is not told yet, since the start of the session."""
+        """Number of the next point, since the start of the session."""
         self._rest: list[Real] = []
         self._end = 0
-        """Tick that is expected next."""
+        """Next expected tick."""
 
     def feed(self, block: Block) -> Document | None:
-        """Take a block; return the points that it completes as the page is told them."""
+        """Add a block; return the message with the points that it completes; None without any."""
         ticks = max(1, round(STRIP_S * block.rate_hz))
         values = block.values
         missing = block.first_tick - self._end
-        if missing < 0 or missing > _KEPT_S * block.rate_hz:
+        if missing < 0 or missing > _STORED_S * block.rate_hz:
             self._points.clear()
             self._next = block.first_tick // ticks
             self._rest = []
@@ -90,7 +90,7 @@ class Strips:
         if count == 0:
             return None
         bins = waiting[:, : count * ticks].reshape(3, count, ticks)
-        # Without those functions' warning of points of which nothing is known.
+        # Unlike nanmin and nanmax, these do not warn of points without known values.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
         extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DIGITS)
         points = [tuple(_known(column)) for column in extremes.T]
@@ -99,7 +99,7 @@ class Strips:
         return _strip(first, points)
 
     def last(self) -> Document | None:
-        """Return all points that are kept, for a page that has just been opened."""
+        """Return the message with all stored points, for a new page."""
         points = list(self._points)
         return _strip(self._next - len(points), points) if points else None
 
@@ -126,7 +126,7 @@ def _known(values: Real) -> list[float | None]:
 
 
 class SessionResponse:
-    """The response of the session that runs, as far as the sweep has come.
+    """Frequency response of the running session, up to the present frequency of the sweep.
 
     Parameters
     ----------
@@ -143,13 +143,13 @@ class SessionResponse:
         self._reached_hz = 0.0
 
     def feed(self, block: Block) -> None:
-        """Take a block; what is not known of it is left out."""
+        """Add a block; its unknown values are ignored."""
         self._waiting.append(block)
         if len(self._waiting) >= _FED_AT_ONCE:
             self._feed_sweep()
 
     def _feed_sweep(self) -> None:
-        """Feed what waits: a call for many blocks costs no more than one for a single block."""
+        """Process the waiting blocks: a call costs about the same for many blocks as for one."""
         if not self._waiting:
             return
         values = np.concatenate([block.values for block in self._waiting], axis=1)
@@ -167,7 +167,7 @@ class SessionResponse:
             self._fresh = True
 
     def document(self) -> Document | None:
-        """Return the response as the page is told it; None if nothing new is known."""
+        """Return the message with the response; None if there is nothing new."""
         self._feed_sweep()
         estimate = self._sweep.estimate() if self._fresh else None
         self._fresh = False
@@ -175,7 +175,7 @@ class SessionResponse:
             return None
         reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
         if estimate.final and reached_hz < self._reached_hz:
-            return None  # the last whole segment ends before the sweep does
+            return None  # the last complete segment ends before the sweep
         self._reached_hz = reached_hz
         response = estimate.response.without_delays(
             input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
@@ -184,13 +184,13 @@ class SessionResponse:
         if self._thinning is None:
             self._thinning = response_thinning(grid)
         shown = np.where(estimate.excited, response.response, np.nan)
-        # A gap is told by its ends, of which nothing is known: no line is drawn across.
+        # The unknown values at both ends of a gap interrupt the line.
         size = np.abs(shown)
-        kept = np.union1d(self._thinning.extremes(size), self._thinning.gaps(size))
+        shown_points = np.union1d(self._thinning.extremes(size), self._thinning.gaps(size))
         coherence = None
         if response.coherence is not None:
-            coherence = _known(np.round(response.coherence[kept], 4))
-        return _curve(grid[kept], shown[kept]) | {
+            coherence = _known(np.round(response.coherence[shown_points], 4))
+        return _curve(grid[shown_points], shown[shown_points]) | {
             "type": "response",
             "coherence": coherence,
             "reached_hz": round(reached_hz, 3),
@@ -198,18 +198,18 @@ class SessionResponse:
 
 
 def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) -> Document:
-    """Return what the sensor measures of the nominal beam, as the page is told it.
+    """Return the message with the nominal beam's response at the sensor.
 
     Parameters
     ----------
     beam, damping
-        The specimen as the profile has it.
+        Specimen of the profile.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     """
     grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
-    kept = response_thinning(grid).extremes(np.abs(model))
-    return {"type": "nominal", **_curve(grid[kept], model[kept])}
+    shown_points = response_thinning(grid).extremes(np.abs(model))
+    return {"type": "nominal", **_curve(grid[shown_points], model[shown_points])}
 
 
 def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:

@@ -165,7 +165,7 @@ def ended():
 def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     assert (
         "Its control process, which alone moves the motor, has ended"
-        in client_module.what_is_left(ended, os.getuid())
+        in client_module.describe_remains(ended, os.getuid())
     )
     monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.3)
     control = subprocess.Popen(
@@ -176,19 +176,19 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
     try:
         while not Path(f"/proc/{control.pid}/cmdline").read_bytes():
             time.sleep(0.001)  # its program is being loaded, and has no arguments yet
-        said = client_module.what_is_left(ended, os.getuid())
+        said = client_module.describe_remains(ended, os.getuid())
         assert f"control process {control.pid} still runs" in said
         assert "STO" in said
     finally:
         control.kill()
         control.communicate()
-    assert "may still be running" in client_module.what_is_left(os.getpid(), os.getuid())
+    assert "may still be running" in client_module.describe_remains(os.getpid(), os.getuid())
 
 
 def test_a_process_that_is_dead_but_not_buried_is_gone():
     process = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    assert "The daemon is gone." in client_module.what_is_left(process.pid, os.getuid())
+    assert "The daemon is gone." in client_module.describe_remains(process.pid, os.getuid())
     process.wait()
 
 

@@ -391,7 +391,7 @@ def test_signals_go_to_those_who_asked_for_them(served, monkeypatch):
     monkeypatch.setattr(signal_blocks, "_ABANDONED_S", 1e9)  # however slow the computer is
 
     async def scenario(served):
-        telling = asyncio.create_task(served.operated.service.tell_signals())
+        telling = asyncio.create_task(served.operated.service.stream_signals())
         plain, watcher = await served.connect(), await served.connect()
         await plain.ask({"command": "watch"})
         await watcher.ask({"command": "watch", "signals": True})

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 from operated_daemons import CommandError, Peer
 
-from rigd.daemon._states import IllegalTransitionError, State, StateMachine
+from rigd.daemon._states import DaemonState, DaemonStateMachine, IllegalTransitionError
 from rigd.devices.contracts import DeviceError
 
 MOST_CALLS = 3000
@@ -165,7 +165,7 @@ def make_machine(operate):
         def torque_only_in_a_session(self):
             assert self.world.wrong == []
             assert all(drive.safe for drive in self.world.drives)
-            assert self.operated.state in (State.READY, State.FAULT)
+            assert self.operated.state in (DaemonState.READY, DaemonState.FAULT)
             if self.operated.state == "ready":
                 assert self.operated.rig.connected
 
@@ -192,33 +192,33 @@ def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(ope
 @pytest.mark.parametrize(
     ("path", "wrong"),
     [
-        ((), State.RUNNING),
-        ((), State.STOPPING),
-        ((State.READY,), State.STOPPING),
-        ((State.READY, State.RUNNING), State.IDLE),
-        ((State.READY, State.RUNNING, State.STOPPING), State.RUNNING),
-        ((State.FAULT,), State.RUNNING),
-        ((State.FAULT,), State.STOPPING),
+        ((), DaemonState.RUNNING),
+        ((), DaemonState.STOPPING),
+        ((DaemonState.READY,), DaemonState.STOPPING),
+        ((DaemonState.READY, DaemonState.RUNNING), DaemonState.IDLE),
+        ((DaemonState.READY, DaemonState.RUNNING, DaemonState.STOPPING), DaemonState.RUNNING),
+        ((DaemonState.FAULT,), DaemonState.RUNNING),
+        ((DaemonState.FAULT,), DaemonState.STOPPING),
     ],
 )
 def test_what_leads_nowhere(path, wrong):
     told = []
-    machine = StateMachine(told.append)
+    machine = DaemonStateMachine(told.append)
     for state in path:
         machine.move(state, "test")
     with pytest.raises(IllegalTransitionError):
         machine.move(wrong, "test")
-    assert machine.state is (path[-1] if path else State.IDLE)
+    assert machine.state is (path[-1] if path else DaemonState.IDLE)
     assert len(told) == len(path)
 
 
 def test_the_history_is_bounded_and_knows_since_when():
     clock = iter(range(10_000))
-    machine = StateMachine(utc_ns=lambda: next(clock))
+    machine = DaemonStateMachine(utc_ns=lambda: next(clock))
     assert machine.since_utc_ns == 0
     for _ in range(100):
-        machine.move(State.READY, "in")
-        machine.move(State.IDLE, "out")
+        machine.move(DaemonState.READY, "in")
+        machine.move(DaemonState.IDLE, "out")
     assert len(machine.history) == 50
     assert machine.since_utc_ns == 200
     assert machine.history[-1].reason == machine.reason == "out"

@@ -7,7 +7,7 @@ import pytest
 from online_fits import online_fit
 from operated_daemons import parse_request
 
-from rigd.daemon._series import SeriesTeller, ServedSeries
+from rigd.daemon._series import SeriesReporter, ServedSeries
 from rigd.engine.shared_state import Event, Phase
 from rigd.runner.session import SessionProgress, SessionResult
 
@@ -17,9 +17,9 @@ def told():
     """A series that was started, who tells of it, and the events that were published."""
     request = b'{"command": "start", "excitation": "chirp", "watch_fit": true}'
     series, events = ServedSeries(1, parse_request(request), running=True), []
-    teller = SeriesTeller(series, events.append, lambda: True)
-    teller.begins(1, Path("1.mcap"))
-    return series, teller, events
+    reporter = SeriesReporter(series, events.append, lambda: True)
+    reporter.begins(1, Path("1.mcap"))
+    return series, reporter, events
 
 
 def result(**members):
@@ -32,8 +32,8 @@ def result(**members):
 
 def shown(told, fit):
     """What clients are told of a fit, as it stands in the status."""
-    series, teller, _ = told
-    teller.update(SessionProgress(Phase.RUNNING, 9, 0, 0, (fit,)), [])
+    series, reporter, _ = told
+    reporter.update(SessionProgress(Phase.RUNNING, 9, 0, 0, (fit,)), [])
     return series.as_document()["fit"]
 
 
@@ -52,11 +52,11 @@ def test_what_clients_are_told_of_a_fit_is_bounded(told):
 
 
 def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
-    series, teller, events = told
+    series, reporter, events = told
     assert series.as_document()["fit"] is None
     row = Event(0, "info", "  8.0 s 0.910 ± 0.010 %", notable=True)
     fits = (online_fit(6.0, 2.0), online_fit(8.0))
-    teller.update(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
+    reporter.update(SessionProgress(Phase.RUNNING, 9, 0, 0, fits), [row])
     assert [event["event"] for event in events] == ["message", "fit", "fit"]
     assert events[0]["notable"]
     assert [event["duration_s"] for event in events[1:]] == [6.0, 8.0]
@@ -67,20 +67,20 @@ def test_each_fit_is_an_event_and_the_last_one_stands_in_the_status(told):
     # The result has nothing that was for the moment only, and says how a search ended.
     final = online_fit(9.0, search=False) | {"search": {"reason": "Reached.", "pieces": []}}
     del final["text"]
-    teller.ended(result(fit=final), look_follows=True)
+    reporter.ended(result(fit=final), look_follows=True)
     assert events[-1]["fit"]["search"] == {"reason": "Reached."}
     assert events[-1]["look_follows"]
     document = series.as_document()
     assert document["fit"]["text"] == fits[-1]["text"]
     assert document["fit"]["duration_s"] == 9.0
     assert "fit" not in document["sessions"][0]
-    teller.begins(2, Path("2.mcap"))
+    reporter.begins(2, Path("2.mcap"))
     assert series.as_document()["fit"] is None
 
 
 def test_a_session_without_fits_is_told_as_before(told):
-    series, teller, events = told
-    teller.ended(result(), look_follows=False)
+    series, reporter, events = told
+    reporter.ended(result(), look_follows=False)
     assert "fit" not in events[-1]
     assert not events[-1]["look_follows"]
     assert series.as_document()["fit"] is None
@@ -90,8 +90,8 @@ def test_a_session_without_fits_is_told_as_before(told):
     ("outcome", "level"), [("complete", "info"), ("stopped", "warning"), ("fault", "error")]
 )
 def test_how_a_session_ended_is_one_message_of_its_level(told, outcome, level):
-    _, teller, events = told
-    teller.ended(result(outcome=outcome), look_follows=False)
+    _, reporter, events = told
+    reporter.ended(result(outcome=outcome), look_follows=False)
     message, session = events
     assert (message["level"], message["session"]) == (level, session["number"])
     assert message["text"].startswith(f"{outcome.capitalize()}: ")

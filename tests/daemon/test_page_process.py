@@ -131,7 +131,7 @@ import rigd.web._server as server
 async def run(self):
     raise RuntimeError("such a thing")
 
-server.PageServer.run = run
+server.OperatorPageServer.run = run
 server.run_page()
 """
 

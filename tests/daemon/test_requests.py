@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from operated_daemons import RequestError, Start, parse_request
+from operated_daemons import RequestError, StartRequest, parse_request
 
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 
@@ -26,7 +26,7 @@ def test_plain_commands(command):
 
 def test_a_start_has_the_parameters_of_its_excitation():
     request = parse(START | {"parameters": {"amplitude_rad": 1, "stop_hz": 20.5}, "repeat": 3})
-    assert isinstance(request, Start)
+    assert isinstance(request, StartRequest)
     assert request.parameters == {"amplitude_rad": 1.0, "stop_hz": 20.5}
     assert request.repeat == 3
     request = parse(
@@ -188,7 +188,7 @@ def test_whatever_a_start_asks_for_is_made_or_refused(kind, parameters, more):
     ).encode()
     try:
         request = parse_request(line)
-        assert isinstance(request, Start)
+        assert isinstance(request, StartRequest)
         make_excitation(request.excitation, request.parameters, 100.0)
     except (RequestError, ExcitationError) as error:
         assert str(error)

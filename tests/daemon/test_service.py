@@ -508,10 +508,10 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     seen = []
 
     def look(drive):
-        operated.service.look()
+        operated.service.poll_status()
         seen.append(operated.service.status())
 
-    operated.service.look()  # from now on it sees the samples
+    operated.service.poll_status()  # from now on it sees the samples
     operated.world.countdown, operated.world.then = 1200, look
     operated.ask("start", **SHORT)
     (status,) = seen
@@ -539,7 +539,7 @@ def test_while_the_drive_is_off_a_session_is_not_said_to_run(operated):
 
     def look(drive):
         assert not drive.enabled
-        operated.service.look()
+        operated.service.poll_status()
         seen.append(operated.service.status())
 
     operated.world.countdown, operated.world.then = 100, look

@@ -10,7 +10,7 @@ from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine import shared_memory_fd
 from rigd.engine.channels import DESCRIPTORS, create_channels
-from rigd.engine.control_process import attend
+from rigd.engine.control_process import run_control
 from rigd.engine.messages import Finished, SessionJob
 from rigd.engine.reference import put_reference
 from rigd.engine.shared_state import Phase, Word, read_events
@@ -165,7 +165,7 @@ class Session:
     def obey(self, *orders):
         """Attend to the rig from connecting to closing, with these orders in between."""
         self.parent.orders = list(orders)
-        attend(
+        run_control(
             self.profile,
             self.devices,
             self.clock,

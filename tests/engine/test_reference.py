@@ -142,7 +142,7 @@ def test_a_piece_without_room_is_refused():
 )
 def test_a_piece_that_does_not_begin_and_end_at_rest_is_refused(piece_rad):
     writer, _, board = growing()
-    with pytest.raises(ValueError, match="a piece from"):
+    with pytest.raises(ValueError, match="a segment from"):
         writer.append(np.array(piece_rad) / UNIT_RAD)
     assert board[Word.PLANNED] == 0
 

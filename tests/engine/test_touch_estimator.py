@@ -50,7 +50,7 @@ def followed():
         follower = TouchFollower(SimpleNamespace(follow=lambda: Growing(asked)), job)
         for first, last in zip([0, *ends], ends, strict=False):
             follower.take(samples(first, last, *touches, off=off and last == ends[-1]))
-            while some := follower.told():
+            while some := follower.reports():
                 told += some
         return asked, told
 

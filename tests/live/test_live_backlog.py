@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from rigd.engine.shared_state import Word
-from rigd.live.publisher import LOOK_S, Backlog, Vitals
+from rigd.live.publisher import POLL_S, Backlog, Vitals
 
 
 def drawing(name):
@@ -20,7 +20,7 @@ def test_everything_goes_out_in_order_and_once():
     backlog = Backlog(most_samples=100)
     assert not backlog
     backlog.put([drawing("a"), drawing("b")], 50)
-    backlog.owe([drawing("note")])
+    backlog.put_required([drawing("note")])
     backlog.put([drawing("c")], 50)
     drawings, samples = backlog.take()
     assert (names(drawings), samples) == (["note", "a", "b", "c"], 100)
@@ -31,7 +31,7 @@ def test_everything_goes_out_in_order_and_once():
 
 def test_the_oldest_samples_make_room_and_are_counted():
     backlog = Backlog(most_samples=100)
-    backlog.owe([drawing("note")])
+    backlog.put_required([drawing("note")])
     for number in range(5):
         backlog.put([drawing(number)], 40)
     assert backlog.dropped == 120
@@ -48,9 +48,9 @@ def test_the_newest_stay_however_many_they_are():
 
 def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
     backlog = Backlog(most_samples=100)
-    backlog.owe([drawing("note")])
+    backlog.put_required([drawing("note")])
     backlog.put([drawing("a")], 1)
-    backlog.forgive()
+    backlog.drop_required()
     assert names(backlog.take()[0]) == ["a"]
 
 
@@ -69,7 +69,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
         board[word] = value
     for _ in range(5):
         channels.samples.publish()
-    health = Vitals(channels).look(0.0, view_dropped=11)
+    health = Vitals(channels).read(0.0, view_dropped=11)
     assert (health.missed_ticks, health.late_ticks, health.lost_ticks) == (3, 7, 2)
     assert (health.disk_free_mb, health.recorder_lag_ticks, health.view_dropped) == (12_000, 5, 11)
     assert health.bus_load_percent == pytest.approx(34.5)
@@ -79,7 +79,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
 def test_vitals_of_what_there_is_not_are_not_known(channels):
     for word in (Word.BUS_LOAD_PPM, Word.BUS_ERRORS, Word.SENSOR_STATUS):
         channels.board[word] = -1
-    health = Vitals(channels).look(0.0, view_dropped=0)
+    health = Vitals(channels).read(0.0, view_dropped=0)
     assert health.disk_free_mb is None
     assert (health.bus_load_percent, health.bus_errors, health.sensor_status) == (None, None, None)
     assert health.rate_hz is None
@@ -88,9 +88,9 @@ def test_vitals_of_what_there_is_not_are_not_known(channels):
 def test_counts_of_the_session_before_are_not_taken_for_this_ones(channels):
     channels.board[Word.MISSED] = 5
     vitals = Vitals(channels)
-    assert vitals.look(0.0, view_dropped=0).missed_ticks == 0
+    assert vitals.read(0.0, view_dropped=0).missed_ticks == 0
     channels.board[Word.GO] = 1
-    assert vitals.look(1.0, view_dropped=0).missed_ticks == 5
+    assert vitals.read(1.0, view_dropped=0).missed_ticks == 5
 
 
 def test_the_rate_is_that_of_the_last_second(channels):
@@ -98,12 +98,12 @@ def test_the_rate_is_that_of_the_last_second(channels):
     board[Word.GO] = 1
     rates = []
     for look in range(20):
-        now_s = look * LOOK_S
+        now_s = look * POLL_S
         assert vitals.due(now_s)
         board[Word.SCHEDULED] = round(1000 * now_s if look < 10 else 1250 + 500 * now_s)
-        rates.append(vitals.look(now_s, view_dropped=0).rate_hz)
-        assert not vitals.due(now_s + 0.9 * LOOK_S)
+        rates.append(vitals.read(now_s, view_dropped=0).rate_hz)
+        assert not vitals.due(now_s + 0.9 * POLL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
     board[Word.SCHEDULED] = 10
-    assert vitals.look(6.0, view_dropped=0).rate_hz is None, "another session has begun"
+    assert vitals.read(6.0, view_dropped=0).rate_hz is None, "another session has begun"

@@ -10,7 +10,7 @@ import threading
 import pytest
 from processes import sockets
 
-from rigd.live._page import PageServer, kept_here
+from rigd.live._page import ViewerPageServer, confine_to_loopback
 
 
 def get(port: int, path: str, host: str | None = None):
@@ -63,7 +63,7 @@ def test_links_to_other_computers_are_left_out():
         '<head><link rel="icon" href="favicon.ico" /><link rel="preconnect"\n'
         ' href="https://fonts.example" crossorigin /></head><body>x</body>'
     )
-    kept = kept_here(page)
+    kept = confine_to_loopback(page)
     assert 'href="favicon.ico"' in kept
     assert "fonts.example" not in kept
     assert kept.count("live.json") == 1
@@ -72,7 +72,7 @@ def test_links_to_other_computers_are_left_out():
 @pytest.fixture
 def page():
     """A page of nothing."""
-    server = PageServer(0, lambda: None, lambda: 0)
+    server = ViewerPageServer(0, lambda: None, lambda: 0)
     yield server
     server.close()
 

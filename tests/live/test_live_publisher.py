@@ -238,7 +238,7 @@ def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher,
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
         producer,
-        first=f"from rigd.live import _feed as feed; feed._MOST_STALLED_LOOKS = 20; {own_port}",
+        first=f"from rigd.live import _feed as feed; feed._MOST_STALLED_POLLS = 20; {own_port}",
     )
     frozen = publisher.server_pid
     os.kill(frozen, signal.SIGSTOP)

@@ -36,7 +36,7 @@ def test_the_board_tells_every_state_of_a_session(channels):
         for name, value in words.items():
             board[Word[name]] = value
         board.beat(Word.SUPERVISOR_BEAT)
-        return states.look(0.0)
+        return states.read(0.0)
 
     assert state(PHASE=Phase.OFF) == preparing()
     assert state(PHASE=Phase.TARING) == preparing("Taring.")
@@ -54,20 +54,20 @@ def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
     for _ in range(100):
         now_s += PERIOD_S
         board.beat(Word.SUPERVISOR_BEAT)
-        assert states.look(now_s) == RUNNING
+        assert states.read(now_s) == RUNNING
     hung_s = now_s
-    while states.look(now_s) != SUPERVISOR_SILENT:
+    while states.read(now_s) != SUPERVISOR_SILENT:
         now_s += PERIOD_S
     assert now_s - hung_s < 0.8
     board.beat(Word.SUPERVISOR_BEAT)
-    assert states.look(now_s + PERIOD_S) == RUNNING
+    assert states.read(now_s + PERIOD_S) == RUNNING
     board[Word.PHASE] = Phase.OFF
     for _ in range(20):
         now_s += PERIOD_S
-        state = states.look(now_s)
+        state = states.read(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
     board[Word.GO] = 0  # before a record nobody need be there at once
-    assert states.look(now_s + PERIOD_S) == preparing()
+    assert states.read(now_s + PERIOD_S) == preparing()
 
 
 def words(columns) -> list[str]:

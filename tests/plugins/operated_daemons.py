@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from rich.console import Console
 
 from rigd.cli.status_view import status_table
-from rigd.daemon._protocol import CommandError, RequestError, Start, parse_request
+from rigd.daemon._protocol import CommandError, RequestError, StartRequest, parse_request
 from rigd.daemon._service import Service
 from rigd.daemon._states import Peer
 from rigd.devices import WhatMoves, open_devices
@@ -27,7 +27,7 @@ from rigd.runner import _rig as rig_module
 from rigd.runtime import StopRequest
 from rigd.session import SessionError, SessionWriter
 
-__all__ = ["CommandError", "Operated", "Peer", "RequestError", "Start", "parse_request"]
+__all__ = ["CommandError", "Operated", "Peer", "RequestError", "StartRequest", "parse_request"]
 
 _ENDED = object()
 

@@ -213,7 +213,7 @@ _PARTS = {
     "list_sessions": (_library, "list_sessions"),
     "response": (_server, "SessionResponse"),
     "program": (_jobs, "_PROGRAM"),
-    "poll_s": (_jobs, "_LOOK_S"),
+    "poll_s": (_jobs, "_POLL_S"),
     "give_way": (_jobs, "give_way"),
 }
 """Limits and parts of the page's server that tests replace."""

@@ -43,12 +43,12 @@ def test_tick_labels_sit_where_values_are(x, y, width, height):
     assert len(labels) == len(x.ticks) + len(y.ticks)
     for text, across, down in labels[: len(x.ticks)]:
         value = float(text.replace("−", "-"))
-        assert chart.place(value, y.first)[0] == pytest.approx(across, abs=0.01 * width)
+        assert chart.to_canvas(value, y.first)[0] == pytest.approx(across, abs=0.01 * width)
         assert left - 1e-6 <= across <= right + 1e-6
         assert down > bottom
     for text, across, down in labels[len(x.ticks) :]:
         value = float(text.replace("−", "-"))
-        assert chart.place(x.first, value)[1] == pytest.approx(down, abs=0.01 * height)
+        assert chart.to_canvas(x.first, value)[1] == pytest.approx(down, abs=0.01 * height)
         assert top - 1e-6 <= down <= bottom + 1e-6
         assert across < left
 
@@ -62,11 +62,11 @@ def test_equal_ratios_are_equally_long(axis, fractions):
 def test_a_chart_counts_up_where_the_canvas_counts_down():
     chart = Chart("/c", 800.0, 400.0, Axis("", 0.0, 10.0, ()), Axis("", -1.0, 1.0, ()))
     left, top, right, bottom = chart.frame
-    assert chart.place([0.0, 10.0, 5.0], [-1.0, 1.0, 0.0]) == pytest.approx(
+    assert chart.to_canvas([0.0, 10.0, 5.0], [-1.0, 1.0, 0.0]) == pytest.approx(
         np.array([[left, bottom], [right, top], [(left + right) / 2, (top + bottom) / 2]])
     )
     # What lies beyond stays on the edge.
-    assert chart.place([-5.0, 99.0], [-9.0, 9.0]) == pytest.approx(
+    assert chart.to_canvas([-5.0, 99.0], [-9.0, 9.0]) == pytest.approx(
         np.array([[left, bottom], [right, top]])
     )
 

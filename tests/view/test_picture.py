@@ -100,7 +100,7 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
     expected, _ = estimate(record, WelchSettings())
     expected_db = 20 * np.log10(abs(expected.response))
     chart = picture.response_charts.chart(MAGNITUDE)
-    at = chart.place(expected.frequency_hz, expected_db)
+    at = chart.to_canvas(expected.frequency_hz, expected_db)
     inside = (points[:, 0] > at[0, 0]) & (points[:, 0] < at[-1, 0])
     assert 300 < inside.sum() <= 400
     nearest = abs(at[:, 0] - points[inside, :1]).argmin(axis=1)

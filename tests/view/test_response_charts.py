@@ -109,7 +109,7 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     after = shown([charts.draw])
     chart = charts.chart(MAGNITUDE)
     left, _, right, _ = chart.frame
-    at_20_hz = chart.place(20.0, chart.y.first)[0]
+    at_20_hz = chart.to_canvas(20.0, chart.y.first)[0]
 
     def shaded(found, name) -> tuple[float, float]:
         shade = found[f"{MAGNITUDE}/not_estimated_{name}"]

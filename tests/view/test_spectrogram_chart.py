@@ -44,20 +44,22 @@ def test_a_tone_is_where_and_when_it_was_and_as_loud(tone):
     corner, size = placed(found[f"{SPECTROGRAM}/levels"])
     rows, columns = np.nonzero(image > 128)
     at = corner + size * np.column_stack([columns + 0.5, rows + 0.5])
-    assert at[:, 1] == pytest.approx(chart.place(0.0, 25.0)[1], abs=45.0)
+    assert at[:, 1] == pytest.approx(chart.to_canvas(0.0, 25.0)[1], abs=45.0)
     loudest_row = int(image.max(axis=1).argmax())
     assert corner[1] + size[1] * (loudest_row + 0.5) == pytest.approx(
-        chart.place(0.0, 25.0)[1], abs=size[1]
+        chart.to_canvas(0.0, 25.0)[1], abs=size[1]
     )
-    assert at[:, 0].min() == pytest.approx(chart.place(20.0, 0.0)[0], abs=1.1 * size[0])
-    assert at[:, 0].max() == pytest.approx(chart.place(30.0, 0.0)[0], abs=1.1 * size[0])
+    assert at[:, 0].min() == pytest.approx(chart.to_canvas(20.0, 0.0)[0], abs=1.1 * size[0])
+    assert at[:, 0].max() == pytest.approx(chart.to_canvas(30.0, 0.0)[0], abs=1.1 * size[0])
     level_db = LOWEST_DB + (HIGHEST_DB - LOWEST_DB) * image.max() / 255.0
     assert level_db == pytest.approx(-20.0, abs=0.6)  # of an amplitude of 0.1 N·m
     # The image ends where the session is, and inside the frame.
     left, top, _, bottom = chart.frame
     assert corner == pytest.approx([left, top])
     assert corner[1] + size[1] * image.shape[0] < bottom
-    assert corner[0] + size[0] * image.shape[1] == pytest.approx(chart.place(39.5, 0.0)[0], abs=5.0)
+    assert corner[0] + size[0] * image.shape[1] == pytest.approx(
+        chart.to_canvas(39.5, 0.0)[0], abs=5.0
+    )
 
 
 def test_the_bar_has_the_colours_of_the_levels(tone):

@@ -214,7 +214,7 @@ from rigd.web import _jobs
 
 ignore()
 _jobs._PROGRAM = (sys.executable, "-c")
-_jobs._LOOK_S = 0.02
+_jobs._POLL_S = 0.02
 
 async def work():
     jobs = _jobs.Jobs(pathlib.Path(), lambda _: None)
@@ -296,7 +296,7 @@ def test_a_report_and_a_campaign_are_queued_with_the_token(
 ):
     replace_in_page(program=(sys.executable, "-c", "pass"))
     told = []
-    monkeypatch.setattr(served.server._jobs, "_tell", told.append)
+    monkeypatch.setattr(served.server._jobs, "_publish", told.append)
     status, _, body = served.ask("POST", "/api/sessions/first/report", ACTING, b"{}")
     assert (status, json.loads(body)["ok"]) == (202, True)
     ids = json.dumps({"ids": ["first", "second"]}).encode()
@@ -312,7 +312,7 @@ def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch, replace_in_p
     making = "import os, sys; os.mkdir(sys.argv[-1])"  # at its end, and never over another
     replace_in_page(program=(sys.executable, "-c", making))
     told = []
-    monkeypatch.setattr(served.server._jobs, "_tell", told.append)
+    monkeypatch.setattr(served.server._jobs, "_publish", told.append)
     ids = json.dumps({"ids": ["first", "second"]}).encode()
     served.daemon.status["state"] = "running"
     try:

@@ -259,7 +259,7 @@ def test_a_daemon_that_falls_silent_or_goes_is_told_within_a_second(served, page
             return lost, took_s, gone, gone_s
 
     lost, took_s, gone, gone_s = pages.run(scenario)
-    assert "has said nothing" in lost["reason"]
+    assert "has sent nothing" in lost["reason"]
     assert "rigd serve" in gone["reason"]
     assert took_s < 1.5
     assert gone_s < 1.0
