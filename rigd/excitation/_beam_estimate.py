@@ -302,9 +302,9 @@ class BeamEstimate:
         for (number, pole), row in zip(shown.items(), moved, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales
-            for place, name in enumerate(self.names):
+            for index, name in enumerate(self.names):
                 if name.endswith(f"_{number}"):
-                    gradient[place] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
+                    gradient[index] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
             found.append(EstimatedMode(number, pole, gradient))
         return tuple(found)
 

@@ -25,7 +25,7 @@ from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
-    SHARE_OF_LIMITS,
+    LIMIT_FRACTION,
     Excitation,
     ExcitationError,
     assemble,
@@ -41,7 +41,7 @@ Complex = NDArray[np.complex128]
 _EASINGS: Final = 8
 _CLOSE_ENOUGH: Final = 1.005
 
-LEAST_SHARE: Final = 0.5
+LEAST_TIME_FRACTION: Final = 0.5
 """Least share of an equal part of the time for every band: a mode is never left out."""
 
 SAME_MODE: Final = 1.1
@@ -225,7 +225,7 @@ _POINTS: Final = 64
 """Frequencies in a band at which the information is computed."""
 
 _ROUNDS: Final = 500
-_RIDGE: Final = 1e-12
+_REGULARISATION: Final = 1e-12
 """Relative ridge on the information: few bands leave some parameter combinations undetermined."""
 
 
@@ -270,7 +270,7 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def shares_of_time(
+def time_fractions(
     bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview
 ) -> Real:
     """Split the time over bands so that the damping comes out most precisely.
@@ -295,15 +295,15 @@ def shares_of_time(
     rates, wanted = _information_rates(bands, amplitudes_rad, rig, damping)
     scale = np.sqrt(np.einsum("bii->i", rates))
     rates = rates / np.outer(scale, scale)
-    shares = np.full(len(bands), 1.0 / len(bands))
+    fractions = np.full(len(bands), 1.0 / len(bands))
     for _ in range(_ROUNDS):
-        information = np.tensordot(shares, rates, axes=1)
-        covariance = np.linalg.inv(information + _RIDGE * np.eye(len(scale)))
+        information = np.tensordot(fractions, rates, axes=1)
+        covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(scale)))
         lines = covariance[:wanted]
         of_bands = np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:wanted]
-        shares = shares * np.sqrt(of_bands.sum(axis=1))
-        shares /= shares.sum()
-    return shares
+        fractions = fractions * np.sqrt(of_bands.sum(axis=1))
+        fractions /= fractions.sum()
+    return fractions
 
 
 def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
@@ -419,18 +419,18 @@ def modes(
     first, end = segments["sweep"]
     bands = _bands(Path(path), stop_hz, widths, rate_hz)
     fades = 2 * round(taper_s * rate_hz)
-    if fades < 2 or LEAST_SHARE * (end - first) / len(bands) < fades:
+    if fades < 2 or LEAST_TIME_FRACTION * (end - first) / len(bands) < fades:
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
             f"both ends of {len(bands)} sweeps; choose at least "
-            f"{2.0 * taper_s * len(bands) / LEAST_SHARE:g} s, or a taper_s from {2 / rate_hz:g} s."
+            f"{2.0 * taper_s * len(bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from {2 / rate_hz:g} s."
         )
     lengths = _lengths(np.full(len(bands), 1.0 / len(bands)), end - first)
     amplitudes_rad = [amplitude_rad] * len(bands)
     sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
     if rig is not None:
         eased_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
-        lengths = _lengths(_at_least(shares_of_time(bands, eased_rad, rig)), end - first)
+        lengths = _lengths(_at_least(time_fractions(bands, eased_rad, rig)), end - first)
         sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
         amplitudes_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
@@ -482,30 +482,30 @@ def _within_limits(
         eased_rad = amplitude_rad
         for _ in range(_EASINGS):
             so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
-            share = max(
+            fraction = max(
                 rig.share_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
             )
-            if share <= SHARE_OF_LIMITS * _CLOSE_ENOUGH:
+            if fraction <= LIMIT_FRACTION * _CLOSE_ENOUGH:
                 break
-            eased_rad *= SHARE_OF_LIMITS / share
+            eased_rad *= LIMIT_FRACTION / fraction
         amplitudes_rad.append(eased_rad)
         before_rad = np.concatenate([before_rad, eased_rad * sweep])
     return amplitudes_rad
 
 
-def _lengths(shares: Real, ticks: int) -> list[int]:
+def _lengths(fractions: Real, ticks: int) -> list[int]:
     """Split ticks by shares, without losing one to rounding."""
-    ends = np.round(np.cumsum(shares) * ticks).astype(int)
+    ends = np.round(np.cumsum(fractions) * ticks).astype(int)
     return [int(length) for length in np.diff(ends, prepend=0)]
 
 
-def _at_least(shares: Real) -> Real:
+def _at_least(fractions: Real) -> Real:
     """Raise shares to the least one, at the cost of the others in proportion."""
-    least = LEAST_SHARE / len(shares)
-    low = shares < least
-    for _ in shares:
-        rest = (1.0 - least * np.count_nonzero(low)) / shares[~low].sum()
-        raised = np.where(low, least, shares * rest)
+    least = LEAST_TIME_FRACTION / len(fractions)
+    low = fractions < least
+    for _ in fractions:
+        rest = (1.0 - least * np.count_nonzero(low)) / fractions[~low].sum()
+        raised = np.where(low, least, fractions * rest)
         low = raised <= least
     return raised
 

@@ -21,7 +21,7 @@ from rigd.excitation._fisher_information import (
     whitened_kernels,
 )
 from rigd.excitation._shortest_move import MovePlant
-from rigd.excitation._signals import SHARE_OF_LIMITS, ExcitationError
+from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Precision, Quantities
 
@@ -36,18 +36,18 @@ _FADE_S: Final = 0.25
 _SETTLING_S: Final = 0.25
 _TAIL_S: Final = 1.0
 """Ringing after a piece by which modes that it is not for are brought to rest."""
-LOOK_AHEAD_S: Final = 8.0
+HORIZON_S: Final = 8.0
 """How far a plan looks ahead: a mode tells of its damping only after it has swung for a while."""
 _HALF_WIDTH_HZ: Final = 0.5
 _OVER: Final = 2.0
 """Half the width of a sweep over a whole resonance, in its half-power half-widths."""
-_BESIDE: Final = 0.06
+_SIDE_OFFSET: Final = 0.06
 """Distance of the sweeps beside a mode, relative to its frequency: they tell of stiffness and tool
 inertia, without which the height of a resonance does not tell its damping."""
 _LINES: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
 """Steady sines of the forecast, in half-power half-widths from a mode."""
 _PHASES: Final = 8
-_SHARES: Final = (1.0, 0.8, 0.5)
+_FRACTIONS: Final = (1.0, 0.8, 0.5)
 """Shares of a piece that others are tried with in addition."""
 _ROUNDS: Final = 60
 _EFFICIENCY: Final = 0.7
@@ -182,7 +182,7 @@ class PieceSearch:
             )
         self.model = TorqueModel.of(estimate, plant.rate_hz, record.ringing.shape[1])
         self.samples = record.ahead.shape[1]
-        self.limits = SHARE_OF_LIMITS * np.array(
+        self.limits = LIMIT_FRACTION * np.array(
             [
                 max(plant.angle_rad - abs(start_rad), 1e-6),
                 plant.velocity_rad_s,
@@ -226,9 +226,13 @@ class PieceSearch:
             # Fades as long as the beat with the mode: a shorter one makes it swing as well.
             found += [
                 _Band(
-                    mode.number, (1.0 + step) * hz, 0.0, max(_FADE_S, 1.0 / (_BESIDE * hz)), False
+                    mode.number,
+                    (1.0 + step) * hz,
+                    0.0,
+                    max(_FADE_S, 1.0 / (_SIDE_OFFSET * hz)),
+                    False,
                 )
-                for step in (-_BESIDE, _BESIDE)
+                for step in (-_SIDE_OFFSET, _SIDE_OFFSET)
                 if (1.0 + step) * hz < BAND_HZ
             ]
         return found
@@ -236,7 +240,8 @@ class PieceSearch:
     def lines(self) -> tuple[Real, Real]:
         """Steady sines: frequencies (m,) in Hz, and the amplitudes (m,) of the angle in rad."""
         steps = [
-            (*(mode.damping_ratio * np.array(_LINES)), -_BESIDE, _BESIDE) for mode in self.modes
+            (*(mode.damping_ratio * np.array(_LINES)), -_SIDE_OFFSET, _SIDE_OFFSET)
+            for mode in self.modes
         ]
         frequency_hz = np.array(
             [
@@ -257,8 +262,8 @@ class PieceSearch:
         angle = turn @ answer.angle_rad
         lag = turn @ (pulse - answer.angle_rad) / angle
         own = turn @ (answer.torque_nm - answer.coupling_torque_nm) / angle
-        shares = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
-        return frequency_hz, 1.0 / (shares / self.limits[:, None]).max(axis=0)
+        fractions = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
+        return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
 
     def best(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
         """Return the best piece that fits into the time, of those that drive one of some modes."""
@@ -299,10 +304,10 @@ class PieceSearch:
         for _ in range(2):
             driven = {band.number for band, _ in found.parts}
             more = [
-                self.added(found, share, band, basis, turn)
+                self.added(found, fraction, band, basis, turn)
                 for band, basis in bases
                 if band.number not in driven
-                for share in _SHARES
+                for fraction in _FRACTIONS
                 for turn in range(0, _PHASES, 2)
             ]
             better = max(more, key=lambda each: each.value, default=found)
@@ -333,16 +338,16 @@ class PieceSearch:
         unit = sum(
             f * sweep.channels[:, ::_THINNED] for f, sweep in zip(factors, sweeps, strict=True)
         )
-        share = min(1.0, largest_factor(start.channels, unit))
+        fraction = min(1.0, largest_factor(start.channels, unit))
         weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
         return _Candidate(
             start.duration_s,
             (),
-            tuple((share * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
-            start.channels + share * unit,
-            start.weighted + share * weighted,
+            tuple((fraction * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
+            start.channels + fraction * unit,
+            start.weighted + fraction * weighted,
             start.swing
-            + share * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
+            + fraction * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
             0.0,
         )
 
@@ -391,8 +396,8 @@ class PieceSearch:
 
     def added(
         self,
-        beside: _Candidate,
-        share: float,
+        base: _Candidate,
+        fraction: float,
         band: _Band,
         basis: tuple[_Sweep, _Sweep],
         turn: int,
@@ -403,19 +408,19 @@ class PieceSearch:
         first, second = basis
         rings = self.ringing[:, : first.channels.shape[1] : _THINNED]
         unit = sine * first.channels[:, ::_THINNED] + cosine * second.channels[:, ::_THINNED]
-        before = rings + share * (beside.channels - rings)
+        before = rings + fraction * (base.channels - rings)
         amplitude_rad = largest_factor(before, unit)
-        swing = self.swing + share * (beside.swing - self.swing)
+        swing = self.swing + fraction * (base.swing - self.swing)
         swing += amplitude_rad * (sine * first.slope + cosine * second.slope)
-        weighted = self.held + share * (beside.weighted - self.held)
+        weighted = self.held + fraction * (base.weighted - self.held)
         weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
-        leading = beside.parts[0][0] if beside.parts else band
-        value = self.value(leading, weighted, swing, beside.duration_s)
+        leading = base.parts[0][0] if base.parts else band
+        value = self.value(leading, weighted, swing, base.duration_s)
         return _Candidate(
-            beside.duration_s,
-            (*((other, share * size) for other, size in beside.parts), (band, amplitude_rad)),
+            base.duration_s,
+            (*((other, fraction * size) for other, size in base.parts), (band, amplitude_rad)),
             (
-                *((share * factor, sweep) for factor, sweep in beside.terms),
+                *((fraction * factor, sweep) for factor, sweep in base.terms),
                 (amplitude_rad * sine, first),
                 (amplitude_rad * cosine, second),
             ),
@@ -434,8 +439,8 @@ class PieceSearch:
         rest = self.samples - first
         going_on = self.going_on(band)
         amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
-        place = 2 * [mode.number for mode in self.modes].index(band.number)
-        factors = going_on.per_amplitude @ amplitudes[place : place + 2]
+        index = 2 * [mode.number for mode in self.modes].index(band.number)
+        factors = going_on.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
         after = weighted[:, first:] + np.tensordot(factors, going_on.weighted[:, :, :rest], axes=1)
         return float(np.vdot(before, before) + np.vdot(after, after))
@@ -451,7 +456,7 @@ class PieceSearch:
     def going_on(self, band: _Band) -> _GoingOn:
         """Drive a mode as long as one looks ahead."""
         if band.middle_hz not in self._going_on:
-            duration_s = LOOK_AHEAD_S - DURATIONS_S[0]
+            duration_s = HORIZON_S - DURATIONS_S[0]
             sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
             weighted = np.stack([sweep.weighted for sweep in sweeps])
             mode = next(each for each in self.modes if each.number == band.number)
@@ -467,26 +472,26 @@ class PieceSearch:
             self._going_on[band.middle_hz] = _GoingOn(weighted, per_amplitude)
         return self._going_on[band.middle_hz]
 
-    def piece(self, chosen: _Candidate, time_left_s: float) -> Piece:
+    def segment(self, chosen: _Candidate, time_left_s: float) -> Piece:
         """Describe a piece, with what is expected of it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
         channels = chosen.total("channels")
         ringing = self.ringing[:, : channels.shape[1]]
         # Between the ticks that were looked at a peak is a little higher.
-        share = min(1.0, largest_factor(ringing, channels))
+        fraction = min(1.0, largest_factor(ringing, channels))
         now = covariance_of(self.record.after(None, 0), estimate)
-        after = covariance_of(self.record.after(share * chosen.total("rows"), samples), estimate)
+        after = covariance_of(self.record.after(fraction * chosen.total("rows"), samples), estimate)
         return Piece(
             name=_in_words(chosen),
-            reference_rad=share * chosen.total("reference_rad"),
-            angle_rad=share * chosen.total("angle_rad"),
+            reference_rad=fraction * chosen.total("reference_rad"),
+            angle_rad=fraction * chosen.total("angle_rad"),
             names=estimate.names,
             covariance=after,
             now=quantities.precisions(now),
             expected=quantities.precisions(after),
             forecast=self.forecast(time_left_s),
-            share_of_limits=SHARE_OF_LIMITS * float(np.abs(ringing + share * channels).max()),
+            share_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
         )
 
     def with_ring_up(self) -> float:
@@ -497,13 +502,15 @@ class PieceSearch:
         times_s = self.mixture.times_s
         needed_s = float(times_s.sum())
         grid = np.geomspace(1e-3, 1e3, 400)
-        told = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
+        gained = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
         for mode in self.modes:
             reach_hz = 1.5 * _LINES[-1] * mode.damping_ratio * mode.frequency_hz
             at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < reach_hz].sum())
             decay_s = -1.0 / mode.pole_rad_s.real
             if at_mode_s > 0.01 * needed_s:
-                needed_s += decay_s * float(np.interp(at_mode_s / decay_s, told, grid)) - at_mode_s
+                needed_s += (
+                    decay_s * float(np.interp(at_mode_s / decay_s, gained, grid)) - at_mode_s
+                )
         return needed_s
 
     def forecast(self, time_left_s: float) -> Forecast:
@@ -545,7 +552,7 @@ def best_mixture(
 ) -> Mixture:
     """Find the times of steady sines that reach everything asked soonest.
 
-    By multiplicative steps, as `shares_of_time`, with the multipliers of the quantities: by the
+    By multiplicative steps, as `time_fractions`, with the multipliers of the quantities: by the
     equivalence theorem all sines of the best mixture tell as much per second of the combinations
     that are returned, and no other tells more (V. V. Fedorov, Theory of optimal experiments, 1972).
 
@@ -563,8 +570,10 @@ def best_mixture(
         Factor by which all deviations may be larger than asked.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
-    asked = np.array([inf if each.impossible else each.asked_std for each in quantities.items])
-    wanted = quantities.gradients / (missed * asked[:, None])
+    target_stds = np.array(
+        [inf if each.impossible else each.asked_std for each in quantities.items]
+    )
+    wanted = quantities.gradients / (missed * target_stds[:, None])
     if not wanted.any():
         return Mixture(np.zeros(frequency_hz.size), wanted)
     multipliers = np.ones(len(wanted))
@@ -575,13 +584,15 @@ def best_mixture(
         variances = np.einsum("qi,qi->q", lines, wanted)
         multipliers = multipliers * np.maximum(variances, 1e-12) ** 0.5
         multipliers /= max(float(multipliers.sum()), 1e-300)
-        telling = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
-        times_s = times_s * np.sqrt(telling / max(float(times_s @ telling / times_s.sum()), 1e-300))
+        gain_rates = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
+        times_s = times_s * np.sqrt(
+            gain_rates / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
+        )
         # As long as it takes, or as is too long.
         times_s *= float(np.clip(np.sqrt(variances.max()), 0.5, 2.0))
         if times_s.sum() > _NEVER_S:
             break
-    worth = np.sqrt(multipliers / max(float(times_s @ telling / times_s.sum()), 1e-300))
+    worth = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
     return Mixture(times_s, worth[:, None] * lines)
 
 

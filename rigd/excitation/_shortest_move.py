@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rigd.excitation._residual_vibration import predict_end
 from rigd.excitation._signals import (
-    SHARE_OF_LIMITS,
+    LIMIT_FRACTION,
     Excitation,
     ExcitationError,
     assemble,
@@ -45,7 +45,7 @@ LONGEST_S: Final = 60.0
 
 _HELD_S: Final = 2e-3
 """Time for which an acceleration is held, where the move is not so long that it is more."""
-_MOST_PIECES: Final = 60
+_MOST_INTERVALS: Final = 60
 _CLOSE: Final = 1.03
 _NEARLY_ALL: Final = 0.93
 """The search ends at this ratio of a time that suffices to one that does not, or where the move
@@ -127,8 +127,8 @@ class Move:
     """Shape (n,): at the ticks after the start, relative to the angle there; the last one stays."""
     duration_s: float
     """Time of the reference."""
-    share: float
-    """Largest share of a limit that it is predicted to take; at most `SHARE_OF_LIMITS`."""
+    limit_fraction: float
+    """Largest share of a limit that it is predicted to take; at most `LIMIT_FRACTION`."""
     residual_nm: float
     """Coupling torque that the modes swing with afterwards in the linear loop: the sum of their
     amplitudes, each for a frequency that is wrong by its standard uncertainty."""
@@ -172,7 +172,7 @@ def shortest_move(
     T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
     the limits of the rig in place of an impulse's.
     """
-    search = _Search(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
+    search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
     acceleration = search.shortest()
     reference = from_acceleration(acceleration, plant.rate_hz)
     n = reference.size
@@ -180,7 +180,7 @@ def shortest_move(
     return Move(
         reference_rad=reference,
         duration_s=n / plant.rate_hz,
-        share=search.share(reference),
+        limit_fraction=search.limit_fraction(reference),
         residual_nm=_residual_nm(plant, reference, ringing),
         quintic_residual_nm=_residual_nm(plant, usual, ringing),
     )
@@ -198,7 +198,7 @@ def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> 
     return float(np.maximum(*left).sum())
 
 
-class _Search:
+class _MoveSearch:
     """Search for the shortest time; one linear programme for each that is tried."""
 
     def __init__(
@@ -220,10 +220,10 @@ class _Search:
             rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
         # What still rings is fed forward to the motor, and is in the sensor.
         self._limits = {
-            "torque": SHARE_OF_LIMITS * plant.peak_torque_nm - plant.friction_nm - rung_nm,
-            "velocity": SHARE_OF_LIMITS * plant.velocity_rad_s,
-            "tracking": SHARE_OF_LIMITS * plant.tracking_error_rad,
-            "coupling": SHARE_OF_LIMITS * plant.coupling_torque_nm - rung_nm,
+            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - rung_nm,
+            "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
+            "tracking": LIMIT_FRACTION * plant.tracking_error_rad,
+            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - rung_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -243,19 +243,19 @@ class _Search:
         most = round(LONGEST_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, found, share_short, share_found = 8, most + 1, inf, 0.0
+        too_short, found, fraction_short, fraction_found = 8, most + 1, inf, 0.0
         best: Real | None = None
         for _ in range(_MOST_ROUNDS):
-            share, acceleration = self._least_share(n)
-            if share <= 1.0:
-                found, share_found, best = n, share, acceleration
+            fraction, acceleration = self._least_limit_fraction(n)
+            if fraction <= 1.0:
+                found, fraction_found, best = n, fraction, acceleration
             else:
-                too_short, share_short = n, share
-            if share_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
+                too_short, fraction_short = n, fraction
+            if fraction_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
                 break
             if too_short >= most:
                 break
-            n = _next(too_short, found, share_short, share_found, n, share, self._order)
+            n = _next(too_short, found, fraction_short, fraction_found, n, fraction, self._order)
             n = min(n, most)
         if best is None:
             raise ExcitationError(
@@ -264,7 +264,7 @@ class _Search:
             )
         return best
 
-    def _least_share(self, n: int) -> tuple[float, Real | None]:
+    def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
         """Smallest share of the limits that a move of n ticks takes, and its accelerations (n,).
 
         Without a solution the share is infinite.
@@ -273,16 +273,16 @@ class _Search:
 
         plant, rate_hz = self._plant, self._plant.rate_hz
         held = max(1, round(_HELD_S * rate_hz))
-        pieces = min(ceil(n / held), _MOST_PIECES)
-        edges = np.round(np.linspace(0, n, pieces + 1)).astype(int)
+        intervals = min(ceil(n / held), _MOST_INTERVALS)
+        edges = np.round(np.linspace(0, n, intervals + 1)).astype(int)
         scale = plant.largest_acceleration_rad_s2
 
         zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
-        per_piece = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
+        per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
         steps = np.diff(edges) / rate_hz
         # The centre of a piece's held acceleration, as `from_acceleration` sums them up.
         left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
-        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_piece])
+        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_interval])
         goal = np.zeros(len(equal))
         goal[1] = self._distance_rad
         if self._ringing is not None:
@@ -290,18 +290,18 @@ class _Search:
         size = np.linalg.norm(equal, axis=1)
 
         limited, bounded, bounds = self._responses(n, edges, scale)
-        limited = np.concatenate([limited, np.eye(pieces)])
-        share_column = -np.ones((len(limited), 1))
+        limited = np.concatenate([limited, np.eye(intervals)])
+        fraction_column = -np.ones((len(limited), 1))
         none = np.zeros((len(bounded), 1))
-        least = np.block([[limited, share_column], [-limited, share_column], [bounded, none]])
+        least = np.block([[limited, fraction_column], [-limited, fraction_column], [bounded, none]])
         below = np.concatenate([np.zeros(2 * len(limited)), bounds])
         found = linprog(
-            np.append(np.zeros(pieces), 1.0),
+            np.append(np.zeros(intervals), 1.0),
             A_ub=least,
             b_ub=below,
             A_eq=np.column_stack([equal / size[:, None], np.zeros(len(equal))]),
             b_eq=goal / size,
-            bounds=[(None, None)] * pieces + [(0.0, None)],
+            bounds=[(None, None)] * intervals + [(0.0, None)],
             method="highs-ds",
         )
         if found.x is None or found.status != 0:
@@ -332,26 +332,26 @@ class _Search:
         end = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all pieces and what lies between them: a programme finds every gap.
         middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_PIECES // 2]
+        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_INTERVALS // 2]
         fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
         fine = fine.astype(int)
         coarse = fine[::2]
         unit = self._unit.up_to(end)
         rows = [
-            _over_pieces(unit[name], edges, coarse if name == "coupling" else fine)
+            _over_intervals(unit[name], edges, coarse if name == "coupling" else fine)
             * (scale / self._limits[name])
             for name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
             forward = np.copysign(scale, self._distance_rad)
-            backward = -forward * _over_pieces(unit["velocity"], edges, coarse)
+            backward = -forward * _over_intervals(unit["velocity"], edges, coarse)
             mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
             return np.concatenate(rows), backward, np.full(len(coarse), _BACKWARD * mean_rad_s)
-        angle = scale * _over_pieces(unit["angle"], edges, coarse)
+        angle = scale * _over_intervals(unit["angle"], edges, coarse)
         free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
         return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
 
-    def share(self, reference: Real) -> float:
+    def limit_fraction(self, reference: Real) -> float:
         """Largest share of a limit that a reference takes, at every tick."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
@@ -370,10 +370,10 @@ class _Search:
 def _next(
     too_short: int,
     found: int,
-    share_short: float,
-    share_found: float,
+    fraction_short: float,
+    fraction_found: float,
     n: int,
-    share: float,
+    fraction: float,
     order: int,
 ) -> int:
     """Choose the number of ticks to try next, from the shares of the limits on either side.
@@ -381,15 +381,15 @@ def _next(
     The share falls with a power of the time: about the third, and more where the modes set the
     time and not the distance.
     """
-    if share_found == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(share, 4.0) ** 0.3)))
-    if share_short == inf and n == found:
-        guess = round(n * max(share, 0.02) ** (0.08 if order > 1 else 0.22))
-    elif share_short == inf:
+    if fraction_found == 0.0:  # none has sufficed yet
+        return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
+    if fraction_short == inf and n == found:
+        guess = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
+    elif fraction_short == inf:
         guess = round((too_short * found) ** 0.5)
     else:
-        power = np.log(share_short / share_found) / np.log(found / too_short)
-        guess = round(1.004 * found * share_found ** (1.0 / power))
+        power = np.log(fraction_short / fraction_found) / np.log(found / too_short)
+        guess = round(1.004 * found * fraction_found ** (1.0 / power))
     return int(min(max(guess, too_short + 1), found - 1))
 
 
@@ -418,7 +418,7 @@ class _UnitResponse:
         return self._rows
 
 
-def _over_pieces(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
+def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
     """Response (ticks, pieces) to an acceleration of 1 in each piece."""
     since = ticks[:, None] - edges
     begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
@@ -454,16 +454,16 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     duration_s, longest_s = _BRAKING_S
     while duration_s <= longest_s:
         braking = braking_path(duration_s, plant.rate_hz)
-        share = 0.0
+        fraction = 0.0
         for tick in starts:
             path = braked(reference_rad, int(tick), braking)
             response = plant.respond(np.concatenate([path, held + path[-1]]))
-            share = max(share, float(np.abs(response.torque_nm).max()) / free_nm)
-            if share > 1.0:
+            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / free_nm)
+            if fraction > 1.0:
                 break
-        if share <= 1.0:
+        if fraction <= 1.0:
             return braking
-        duration_s *= min(max(share, 1.1), 1.5)
+        duration_s *= min(max(fraction, 1.1), 1.5)
     raise ExcitationError(
         f"The reference cannot be braked within {longest_s:g} s by motor.peak_torque_nm = "
         f"{plant.peak_torque_nm:g} N·m; lower its speed."
@@ -568,7 +568,7 @@ def move(
         "duration_s": planned.duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
-        "limits_share": planned.share,
+        "limits_share": planned.limit_fraction,
         "residual_nm": end.residual_nm,
         "residual_floor_nm": end.floor_nm,
         "frequency_residual_nm": planned.residual_nm,

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 SAMPLES_PER_PERIOD = 4
 """Fewest samples in a period of the reference: with less it is not a sine any more."""
 
-SHARE_OF_LIMITS = 0.9
+LIMIT_FRACTION = 0.9
 """Share of every limit that an excitation made for a rig is predicted to take; the rest is for a
 beam unlike the one it was made with."""
 

@@ -152,18 +152,18 @@ def touch(
     back_s = max(_PEAK_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s)
     back = still_path(back_s, rate_hz, plant.poles_rad_s)
     settle = np.zeros(ceil(settle_s * rate_hz))
-    stretch = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
-    check_ticks("The session", passes * stretch.size, rate_hz)
-    segments = lay_out_segments(rate_hz, rest_s, passes * stretch.size / rate_hz, ring_down_s)
+    single_pass = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
+    check_ticks("The session", passes * single_pass.size, rate_hz)
+    segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
     first = segments["sweep"][0]
     approach = Approach(
         passes=tuple(
             Pass(
                 begins=start + settle.size,
-                returns=start + stretch.size - back.size,
-                ends=start + stretch.size,
+                returns=start + single_pass.size - back.size,
+                ends=start + single_pass.size,
             )
-            for start in range(first, first + passes * stretch.size, stretch.size)
+            for start in range(first, first + passes * single_pass.size, single_pass.size)
         ),
         braking=braking,
         hold_ticks=hold_ticks,
@@ -184,7 +184,7 @@ def touch(
         "by_rad": by_rad,
         "braking_s": braking.duration_s,
     }
-    sweep = np.tile(stretch, passes)
+    sweep = np.tile(single_pass, passes)
     made = assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
     return replace(made, model=plant.model)
 

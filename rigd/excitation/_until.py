@@ -33,7 +33,7 @@ Real = NDArray[np.float64]
 PAUSE_S: Final = 0.5
 """Pause in which a fit is made, such as the first: it tells as much as the beam still rings."""
 _FADE_S: Final = 0.25
-_SHARE: Final = 0.8
+_SCAN_FRACTION: Final = 0.8
 """Share of the limits that the scan takes: the beam may be another than the profile says."""
 _AT_MODES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
 _SIZES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
@@ -154,7 +154,7 @@ def until(
     >>> session.search.planned_ticks, session.reference_rad.size
     (6500, 60000)
     """
-    asked = _parsed(targets)
+    requested = _parsed(targets)
     positive("at_most_s", at_most_s, "s")
     positive("amplitude_rad", amplitude_rad, "rad")
     within_a_turn("amplitude_rad", amplitude_rad)
@@ -186,11 +186,11 @@ def until(
     scan_rad[first:] = amplitude_rad * _scan(end - first, rate_hz, start_hz, stop_hz, beam)
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
-        _refuse_below_floor(rig, asked, uniformity, at_most_s, tip_slope_rad)
-        share = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
-        if share > _SHARE:
-            amplitude_rad *= _SHARE / share
-            scan_rad *= _SHARE / share
+        _refuse_below_floor(rig, requested, uniformity, at_most_s, tip_slope_rad)
+        fraction = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
+        if fraction > _SCAN_FRACTION:
+            amplitude_rad *= _SCAN_FRACTION / fraction
+            scan_rad *= _SCAN_FRACTION / fraction
     reference_rad = np.zeros(ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
@@ -216,7 +216,7 @@ def until(
             "sweep": (first, ticks),
         },
         search=PrecisionSearch(
-            asked, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
+            requested, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
         ),
     )
 
@@ -235,7 +235,7 @@ def _refuse_below_floor(
     below = [each for each in floors if each.below]
     if not below:
         return
-    said = "; ".join(
+    floors_text = "; ".join(
         f"{each.target} (standard deviation) is below the floor of "
         f"{with_share(each.std, each.value)}, {with_share(each.exact_std, each.value)} if the beam "
         "is exactly uniform"
@@ -243,7 +243,7 @@ def _refuse_below_floor(
     )
     raise ExcitationError(
         f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
-        f"(uniformity_percent), within {at_most_s:g} s: {said}. Request a larger standard "
+        f"(uniformity_percent), within {at_most_s:g} s: {floors_text}. Request a larger standard "
         "deviation, or one of the modes (--damping, --frequency), or state --uniformity 0 if the "
         "specimen is exactly uniform."
     )
@@ -269,14 +269,14 @@ def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | 
 
 def _parsed(targets: str) -> tuple[Target, ...]:
     """Read all that is asked."""
-    asked = []
+    requested = []
     for text in targets.split(";"):
         if text.strip():
             quantity, _, size = text.strip().partition(" ")
-            asked.append(parse_target(quantity, size))
-    if not asked:
+            requested.append(parse_target(quantity, size))
+    if not requested:
         raise ExcitationError(
             f"No precision is asked for; give that of one or more of {', '.join(QUANTITIES)}, such "
             f"as {_EXAMPLE}."
         )
-    return tuple(asked)
+    return tuple(requested)

@@ -26,7 +26,7 @@ from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
 from rigd.excitation._piece_search import (
-    LOOK_AHEAD_S,
+    HORIZON_S,
     SHORTEST_S,
     Piece,
     PieceSearch,
@@ -64,7 +64,7 @@ class DesignRig(Protocol):
 class Design:
     """A session of designed pieces, one after the other."""
 
-    pieces: tuple[Piece, ...]
+    segments: tuple[Piece, ...]
     """In the order in which they are played."""
     reference_rad: Real
     """Shape (n,): all of them."""
@@ -119,11 +119,11 @@ def next_piece(
     if not quantities.items:
         raise ExcitationError("No precision is asked for; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, LOOK_AHEAD_S)
+    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
     decision = PieceSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
-    return decision.piece(decision.best(time_left_s, driven), time_left_s)
+    return decision.segment(decision.best(time_left_s, driven), time_left_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +142,8 @@ class GeometryFloor:
     @property
     def below(self) -> bool:
         """Whether less than the floor is asked for, and the geometry is why it is out of reach."""
-        asked = self.target.std * (abs(self.value) if self.target.relative else 1.0)
-        return asked < self.std and self.std > _BY_GEOMETRY * self.exact_std
+        target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
+        return target_std < self.std and self.std > _BY_GEOMETRY * self.exact_std
 
 
 def geometry_floors(
@@ -284,22 +284,24 @@ def design_excitation(
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     left_s = duration_s
-    pieces: list[Piece] = []
-    while not pieces or (
-        left_s >= SHORTEST_S and not all(each.reached for each in pieces[-1].expected)
+    segments: list[Piece] = []
+    while not segments or (
+        left_s >= SHORTEST_S and not all(each.reached for each in segments[-1].expected)
     ):
         so_far_rad = np.concatenate([before_rad, angle_rad])
-        piece = next_piece(estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
-        pieces.append(piece)
-        reference_rad = np.concatenate([reference_rad, piece.reference_rad])
+        segment = next_piece(
+            estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
+        )
+        segments.append(segment)
+        reference_rad = np.concatenate([reference_rad, segment.reference_rad])
         # What one leaves in the loop is part of the next.
         angle_rad = plant.respond(reference_rad).angle_rad
-        left_s -= piece.reference_rad.size / plant.rate_hz
+        left_s -= segment.reference_rad.size / plant.rate_hz
     return Design(
-        pieces=tuple(pieces),
+        segments=tuple(segments),
         reference_rad=reference_rad,
         angle_rad=angle_rad,
         names=estimate.names,
-        covariance=pieces[-1].covariance,
-        expected=pieces[-1].expected,
+        covariance=segments[-1].covariance,
+        expected=segments[-1].expected,
     )

@@ -173,10 +173,10 @@ class Quantities:
         for target in targets:
             for one in _of_single_modes(target, modes):
                 value, gradient, impossible = _linearised(one, estimate, modes)
-                asked = one.std * abs(value) if one.relative else one.std
-                if asked == 0.0 and not impossible:
+                target_std = one.std * abs(value) if one.relative else one.std
+                if target_std == 0.0 and not impossible:
                     impossible = f"{one.name} is 0: a share of it is nothing"
-                items.append(Precision(one, value, inf, asked, impossible))
+                items.append(Precision(one, value, inf, target_std, impossible))
                 gradients.append(gradient)
         return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
 
@@ -189,8 +189,8 @@ class Quantities:
             Shape (k, k), of the free parameters.
         """
         variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
-        asked = np.array([inf if each.impossible else each.asked_std for each in self.items])
-        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / asked
+        target_std = np.array([inf if each.impossible else each.asked_std for each in self.items])
+        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / target_std
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:

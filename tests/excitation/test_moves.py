@@ -95,12 +95,12 @@ def test_the_shortest_move_leaves_no_vibration_and_keeps_the_limits(
 
 def test_the_shortest_move_is_not_much_slower_than_the_bound(plant):
     """A move of the same reach in 5 % less time has no solution within the limits."""
-    from rigd.excitation._shortest_move import _Search
+    from rigd.excitation._shortest_move import _MoveSearch
 
     move = shortest_move(plant, 0.5)
     assert move.duration_s < 0.55 * 2 * np.pi / abs(plant.poles_rad_s[0])
-    search = _Search(plant, 0.5, 0.0, 1, None)
-    assert search._least_share(round(0.95 * move.reference_rad.size))[0] > 1.0
+    search = _MoveSearch(plant, 0.5, 0.0, 1, None)
+    assert search._least_limit_fraction(round(0.95 * move.reference_rad.size))[0] > 1.0
 
 
 def test_a_robust_move_bears_frequencies_that_are_wrong(plant, profile, ring_down_nm):
