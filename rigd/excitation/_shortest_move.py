@@ -1,9 +1,9 @@
 """The shortest move that leaves no vibration within a rig's limits: a linear programme.
 
-For a given time the accelerations are found that take the smallest share of the limits of torque,
-speed, tracking error and sensor, and leave every mode at rest. The shortest time is the one at
-which that share is 1. The responses are those of the closed loop to a unit of acceleration, so that
-all limits are linear in the accelerations; Coulomb friction is taken off the torque.
+For a given duration the programme finds the accelerations that take the smallest fraction of the
+limits of torque, speed, tracking error and sensor, and leave every mode at rest. At the shortest
+duration that fraction is 1. The responses are those of the closed loop to a unit of acceleration:
+all limits are linear in the accelerations, and Coulomb friction is subtracted from the torque.
 """
 
 from collections.abc import Callable
@@ -41,27 +41,27 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 LONGEST_S: Final = 60.0
-"""A move that would take longer is refused."""
+"""A longer move is an error."""
 
 _HELD_S: Final = 2e-3
-"""Time for which an acceleration is held, where the move is not so long that it is more."""
+"""Least time for which an acceleration is held; longer in long moves."""
 _MOST_INTERVALS: Final = 60
 _CLOSE: Final = 1.03
 _NEARLY_ALL: Final = 0.93
-"""The search ends at this ratio of a time that suffices to one that does not, or where the move
-takes this part of what it may: a time shorter by 4 % would take more than all."""
+"""The search ends at this ratio of a sufficient time to an insufficient one, or where the move
+takes this fraction of the limits: a time shorter by 4 % would exceed them."""
 _MOST_ROUNDS: Final = 14
 _FARTHEST: Final = 0.98
-"""Part of the limit of the angle at which a move may end: what is left is for what surpasses it."""
+"""Fraction of the angle limit at which a move may end; the remainder is for overshoot."""
 _BACKWARD: Final = 0.01
-"""Part of its mean speed with which a robust move may go backward."""
+"""Fraction of its mean speed with which a robust move may go backward."""
 _LEAST_RAD: Final = 1e-3
 _BRAKING_STARTS: Final = 16
 _BRAKING_S: Final = (0.02, 5.0)
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference: arrays (n,)."""
+    """Response of the closed loop to a reference, as arrays (n,)."""
 
     @property
     def angle_rad(self) -> Real:
@@ -82,7 +82,7 @@ class Response(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MovePlant:
-    """What planning a motion needs to know of a rig."""
+    """Model of a rig for planning a motion."""
 
     rate_hz: float
     """Ticks a second."""
@@ -94,19 +94,19 @@ class MovePlant:
     poles_rad_s: Complex
     """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
     torque_per_state_nm_s: Real
-    """Shape (m,): amplitude of the coupling torque for what `modal_state` says of a mode."""
+    """Shape (m,): amplitude of the coupling torque per `modal_state` of a mode."""
     frequency_uncertainty: Real
     """Shape (m,): relative standard uncertainty of the modes' frequencies."""
     torque_noise_nm: float
     """Standard deviation of the noise of one reading of the coupling torque."""
     settling_s: float
-    """Time in which the loop follows up what the reference has done."""
+    """Time in which the loop catches up with the reference."""
     peak_torque_nm: float
     """Largest torque of the motor."""
     friction_nm: float
-    """Torque that compensates friction, on top of the linear response's."""
+    """Torque for friction, in addition to the linear response's."""
     largest_acceleration_rad_s2: float
-    """Bound of the reference's acceleration; what the loop's filters make of it counts."""
+    """Bound of the reference's acceleration, including the effect of the loop's filters."""
     velocity_rad_s: float
     """Limit of the speed."""
     tracking_error_rad: float
@@ -116,7 +116,7 @@ class MovePlant:
     angle_rad: float
     """Limit of the angle from the rig's zero, either way."""
     model: IdentifiedBeam | None = None
-    """Beam of an analysis; None: it is the profile's, or an estimate."""
+    """Beam of an analysis; None: the profile's, or an estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,12 +128,12 @@ class Move:
     duration_s: float
     """Time of the reference."""
     limit_fraction: float
-    """Largest share of a limit that it is predicted to take; at most `LIMIT_FRACTION`."""
+    """Largest predicted fraction of a limit; at most `LIMIT_FRACTION`."""
     residual_nm: float
-    """Coupling torque that the modes swing with afterwards in the linear loop: the sum of their
-    amplitudes, each for a frequency that is wrong by its standard uncertainty."""
+    """Residual coupling torque of the modes in the linear loop: the sum of their amplitudes, each
+    for a frequency that is wrong by its standard uncertainty."""
     quintic_residual_nm: float
-    """The same of a quintic that takes the same time."""
+    """The same for a quintic of the same duration."""
 
 
 def shortest_move(
@@ -155,22 +155,22 @@ def shortest_move(
     start_rad
         Angle of the start from the rig's zero.
     robust
-        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, so that frequencies that are
-        wrong by 1 % do no harm, and no turning back; the move takes longer.
+        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, to tolerate a 1 % frequency
+        error, and no turning back; the move takes longer.
     ringing
-        Shape (m,): state of the modes at the start as of `modal_state`, which the move takes out;
+        Shape (m,): state of the modes at the start as of `modal_state`, which the move cancels;
         None: they are at rest.
 
     Raises
     ------
     ExcitationError
-        If no move of at most `LONGEST_S` keeps the limits.
+        If no move of at most `LONGEST_S` stays within the limits.
 
     Notes
     -----
     W. E. Singhose and others describe input shapers as such zeros; the linear programme is that of
     T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
-    the limits of the rig in place of an impulse's.
+    the limits of the rig instead of an impulse's.
     """
     search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
     acceleration = search.shortest()
@@ -187,7 +187,7 @@ def shortest_move(
 
 
 def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
-    """Sum of the amplitudes of the modes left, each mode's frequency wrong by its uncertainty."""
+    """Sum the residual amplitudes of the modes, each frequency wrong by its uncertainty."""
     left = []
     for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
         poles = plant.poles_rad_s * (1.0 + off)
@@ -199,7 +199,7 @@ def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> 
 
 
 class _MoveSearch:
-    """Search for the shortest time; one linear programme for each that is tried."""
+    """Search for the shortest time, with one linear programme for each candidate."""
 
     def __init__(
         self,
@@ -218,7 +218,7 @@ class _MoveSearch:
         rung_nm = 0.0
         if ringing is not None:
             rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
-        # What still rings is fed forward to the motor, and is in the sensor.
+        # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
             "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - rung_nm,
             "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
@@ -259,15 +259,15 @@ class _MoveSearch:
             n = min(n, most)
         if best is None:
             raise ExcitationError(
-                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad keeps the "
-                "limits of the profile; choose a smaller angle, or look at limits.velocity_rad_s."
+                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad stays within "
+                "the limits of the profile; choose a smaller angle, or check limits.velocity_rad_s."
             )
         return best
 
     def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
-        """Smallest share of the limits that a move of n ticks takes, and its accelerations (n,).
+        """Return the smallest fraction of the limits for n ticks, and its accelerations (n,).
 
-        Without a solution the share is infinite.
+        The fraction is infinite without a solution.
         """
         from scipy.optimize import linprog
 
@@ -280,7 +280,7 @@ class _MoveSearch:
         zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
         per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
         steps = np.diff(edges) / rate_hz
-        # The centre of a piece's held acceleration, as `from_acceleration` sums them up.
+        # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
         left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
         equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_interval])
         goal = np.zeros(len(equal))
@@ -309,7 +309,7 @@ class _MoveSearch:
         return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return what still rings at the end of the start's state, row by row as of `zero_rows`."""
+        """Return the vibration of the initial state at the end, in the order of `zero_rows`."""
         assert self._ringing is not None
         rows: list[float] = []
         for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
@@ -321,16 +321,16 @@ class _MoveSearch:
         return rows
 
     def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
-        """Return rows over the pieces: shares of limits; and what has bounds, with these.
+        """Return rows over the intervals: fractions of limits; bounded quantities and their bounds.
 
-        A robust move from rest does not turn back: it goes nowhere but to its end, and the friction
-        of the motor, whose sign the controller takes from the reference, turns round nowhere. One
-        that takes out a vibration has to go to and fro, as the shortest does, within the limit of
+        A robust move from rest does not turn back: it goes directly to its end, and the friction
+        of the motor, whose sign the controller takes from the reference, does not reverse. One
+        that cancels a vibration has to go to and fro, as the shortest does, within the limit of
         the angle.
         """
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
-        # The ends of all pieces and what lies between them: a programme finds every gap.
+        # The ends of all intervals and the ticks between them: the solution exploits every gap.
         middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
         tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_INTERVALS // 2]
         fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
@@ -352,7 +352,7 @@ class _MoveSearch:
         return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
 
     def limit_fraction(self, reference: Real) -> float:
-        """Largest share of a limit that a reference takes, at every tick."""
+        """Return the largest fraction of a limit that a reference takes, over all ticks."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
         whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
@@ -376,10 +376,10 @@ def _next(
     fraction: float,
     order: int,
 ) -> int:
-    """Choose the number of ticks to try next, from the shares of the limits on either side.
+    """Choose the number of ticks to try next, from the fractions of the limits on either side.
 
-    The share falls with a power of the time: about the third, and more where the modes set the
-    time and not the distance.
+    The fraction falls with a power of the time: about the third, and more where the modes, not the
+    distance, determine the time.
     """
     if fraction_found == 0.0:  # none has sufficed yet
         return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
@@ -394,7 +394,7 @@ def _next(
 
 
 class _UnitResponse:
-    """Responses to a reference of acceleration 1, as long as needed."""
+    """Responses to a reference of acceleration 1, computed up to the needed length."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
@@ -402,7 +402,7 @@ class _UnitResponse:
         self._ticks = 0
 
     def up_to(self, ticks: int) -> dict[str, Real]:
-        """Return the rows at the first ticks at least."""
+        """Return the rows at least up to the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
@@ -419,7 +419,7 @@ class _UnitResponse:
 
 
 def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
-    """Response (ticks, pieces) to an acceleration of 1 in each piece."""
+    """Return the response (ticks, intervals) to an acceleration of 1 in each interval."""
     since = ticks[:, None] - edges
     begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
     return begun[:, :-1] - begun[:, 1:]
@@ -429,24 +429,24 @@ def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]
 
 
 def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
-    """Braking path that keeps the torque limit from wherever on a reference it starts.
+    """Return the shortest braking path that stays within the torque limit from any tick.
 
     Parameters
     ----------
     plant
         The rig.
     reference_rad
-        Shape (n,): the reference, from rest on, that may have to be braked.
+        Shape (n,): reference from rest, which may have to be braked.
 
     Raises
     ------
     ExcitationError
-        If none of at most 5 s does.
+        If no braking path of at most 5 s does.
 
     Notes
     -----
-    It is simulated with the closed loop from starts all along the reference. After them the torque
-    is linear in speed and acceleration of the reference there.
+    The closed loop is simulated from starts all along the reference. After them the torque is
+    linear in speed and acceleration of the reference at the start.
     """
     held = np.zeros(round(plant.settling_s * plant.rate_hz))
     starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
@@ -474,11 +474,11 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
 
 
 class MoveRig(Protocol):
-    """What planning a move needs of a rig."""
+    """Interface to a rig for which a move is planned."""
 
     @property
     def start_rad(self) -> float:
-        """Where the motor stands, from the rig's zero."""
+        """Present angle of the motor, from the rig's zero."""
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the rig for planning, with the beam of an analysis; without a path the profile's.
@@ -488,7 +488,7 @@ class MoveRig(Protocol):
         path
             Document of ``analyze --json``, or empty.
         use
-            What the beam is for.
+            Purpose of the beam.
         """
 
 
@@ -510,26 +510,26 @@ def move(
     rate_hz
         Ticks a second.
     angle_rad
-        Where to, from the rig's zero.
+        Final angle, from the rig's zero.
     by_rad
-        By how much, in place of `angle_rad`; either sign.
+        Distance, instead of `angle_rad`; either sign.
     path
         JSON written by ``analyze --json``, whose beam the move is planned for; empty: the
         profile's.
     robust
-        1: frequencies that are wrong by 1 % do no harm and the motor does not turn back, but the
-        move takes longer. 0: the shortest.
+        1: the move tolerates a 1 % frequency error and does not turn back, but takes longer.
+        0: the shortest.
     rest_s, ring_down_s
         Time before and after the move.
     rig
-        Rig that is moved.
+        The rig.
 
     Raises
     ------
     ExcitationError
         If not exactly one angle is given, or the move would leave the limits.
     IdentifiedBeamError
-        If the file is not what it should be, or has what a move does not take into account.
+        If the file is invalid, or has an effect that a move does not take into account.
     """
     if rig is None:
         raise ExcitationError("A move is planned for a rig; run it with its profile.")
@@ -581,6 +581,6 @@ def move(
 
 
 def _by_at_most(farthest_rad: float, start_rad: float) -> str:
-    """Say by how much the motor may move from where it stands."""
+    """Describe the largest allowed distance from the present angle."""
     low, high = -farthest_rad - start_rad, farthest_rad - start_rad
     return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

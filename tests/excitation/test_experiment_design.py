@@ -159,7 +159,7 @@ def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, sc
 
 
 def test_nothing_asked_and_nothing_to_drive_are_refused(rig, scanned):
-    with pytest.raises(ExcitationError, match="No precision is asked for"):
+    with pytest.raises(ExcitationError, match="No precision is requested"):
         next_piece(ESTIMATE, scanned, [], rig, 10.0)
     stiff = replace(ESTIMATE, beam=Beam(0.1, 4.7e-3, 0.090275))
     with pytest.raises(ExcitationError, match="no mode below 50 Hz"):
