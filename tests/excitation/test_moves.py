@@ -89,7 +89,7 @@ def test_the_shortest_move_leaves_no_vibration_and_keeps_the_limits(
     )
     assert np.abs(response.torque_nm).max() < 0.93 * profile.rig.motor.peak_torque_nm
     assert np.abs(response.velocity_rad_s).max() < 0.93 * profile.limits.velocity_rad_s
-    assert move.share < 0.93
+    assert move.limit_fraction < 0.93
     assert response.angle_rad[-1] == pytest.approx(distance_rad, abs=2e-3)
 
 
@@ -143,7 +143,7 @@ def test_moves_slow_down_for_the_limits(plant):
     ):
         slow = shortest_move(replace(plant, **{name: limit}), 1.0)
         assert slow.duration_s > 1.1 * fast.duration_s
-        assert slow.share < 0.95
+        assert slow.limit_fraction < 0.95
 
 
 def test_a_move_stays_within_the_angle(plant):
