@@ -16,7 +16,7 @@ from rigd.touch._explanations import (
     Explainer,
     Explanation,
 )
-from rigd.touch._physical import SOFTEST, STIFFEST, Touching, Window
+from rigd.touch._physical import SOFTEST, STIFFEST, Touching, WhitenedWindow
 from rigd.touch._posterior import Posterior
 from rigd.touch._results import Estimated, TouchEstimate
 
@@ -65,7 +65,7 @@ def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEs
         doubtful = explained.later_doubtful or explained.untried if best is rest else poor
         if clear and not doubtful:
             kind = best.kind
-        x_m, time_s = _place(explainer, rivals), _known(rivals, 1, offset)
+        x_m, time_s = _position(explainer, rivals), _known(rivals, 1, offset)
         if poor or explained.untried:
             x_m = _widened(explainer, x_m)
         history, instants, force_n = _forces(explainer, best, window)
@@ -107,32 +107,32 @@ def _roughly(explainer: Explainer) -> Estimated:
     return Estimated(explainer.blind.interval(_WIDE)[0], (high - low) / 4, (low, high))
 
 
-def _widened(explainer: Explainer, told: Estimated) -> Estimated:
+def _widened(explainer: Explainer, estimate: Estimated) -> Estimated:
     """Widen the interval of a point to all where any force could be."""
     *_, low, high = explainer.blind.interval()
-    low, high = min(low, told.interval_95[0]), max(high, told.interval_95[1])
-    return Estimated(told.value, max(told.std, (high - low) / 4), (low, high))
+    low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
+    return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
 
 
-def _place(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
+def _position(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
     """Point of touch, with what bounces leave unknown of it."""
-    told = _known(rivals, 0)
-    tip = told.value > NEAR_TIP * explainer.tables.model.beam.length_m
+    estimate = _known(rivals, 0)
+    tip = estimate.value > NEAR_TIP * explainer.tables.model.beam.length_m
     least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
     low, high = (
-        told.value + np.copysign(np.hypot(end - told.value, _TWO_SIDED_95 * least), sign)
-        for end, sign in zip(told.interval_95, (-1.0, 1.0), strict=True)
+        estimate.value + np.copysign(np.hypot(end - estimate.value, _TWO_SIDED_95 * least), sign)
+        for end, sign in zip(estimate.interval_95, (-1.0, 1.0), strict=True)
     )
     length = explainer.tables.model.beam.length_m
     return Estimated(
-        told.value,
-        float(np.hypot(told.std, least)),
+        estimate.value,
+        float(np.hypot(estimate.std, least)),
         (max(float(low), 0.0), min(float(high), length)),
     )
 
 
 def _forces(
-    explainer: Explainer, best: Explanation, window: Window
+    explainer: Explainer, best: Explanation, window: WhitenedWindow
 ) -> tuple[Real, Real, Estimated]:
     """Force in time and its peak, over what is likely."""
     rng = np.random.default_rng(2)
@@ -156,8 +156,8 @@ def _forces(
         force = np.abs(touching.predicted(rows, window, side)[1])
         peaks = force.max(axis=1)
     low, high = np.quantile(peaks[1:], (0.025, 0.975))
-    told = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
-    return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), told
+    estimate = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
+    return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), estimate
 
 
 def _rivals(best: Explanation, other: Explanation) -> bool:

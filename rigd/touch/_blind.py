@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import Window
+from rigd.touch._physical import WhitenedWindow
 
 Real = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class Blind:
             for table in (kernels.torque, kernels.shear)
         ]  # (places, samples, forces)
 
-    def scan(self, window: Window) -> BlindScan:
+    def scan(self, window: WhitenedWindow) -> BlindScan:
         """Likelihood over the places.
 
         Parameters
@@ -117,14 +117,14 @@ class Blind:
             diagonal = np.diagonal(factor, axis1=1, axis2=2)
             quadratic[i] = large - diagonal[:, n] ** 2
             found[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
-        size, place = np.unravel_index(np.argmax(found), found.shape)
+        size, position = np.unravel_index(np.argmax(found), found.shape)
         variance = _SIZES_N[size] ** 2
-        whole = variance * square[place] + np.eye(n)
-        force = variance * effects[place].T @ np.linalg.solve(whole, data)
+        whole = variance * square[position] + np.eye(n)
+        force = variance * effects[position].T @ np.linalg.solve(whole, data)
         return BlindScan(
             x_m=self._x_m,
             log_likelihood=found.max(axis=0),
-            chi2=float(quadratic[size, place]),
+            chi2=float(quadratic[size, position]),
             degrees=n,
             force_n=force,
             force_std_n=float(_SIZES_N[size]),

@@ -212,10 +212,10 @@ def shifted(table: Real, begin: Real, count: int) -> Real:
     held[:, before + columns :] = table[:, -1:]
     # Row k of what is taken: held[k, begin : begin + count + 3], copied in one piece.
     step, row = held.strides[1], held.strides[0]
-    pieces = np.ndarray(
+    blocks = np.ndarray(
         (rows, held.shape[1] - count - 2, count + 3), buffer=held, strides=(row, step, step)
     )
-    near = pieces[np.arange(rows), whole - 1 + before]
+    near = blocks[np.arange(rows), whole - 1 + before]
     value = near[:, :count] * (-u * (u - 1) * (u - 2) / 6)
     value += near[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
     value += near[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)
@@ -248,7 +248,7 @@ def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) 
     reverse = np.zeros((candidates, steps + length))
     reverse[:, :steps] = force[:, ::-1]
     row, column = reverse.strides
-    told = np.empty((candidates, len(kernels), samples))
+    summed = np.empty((candidates, len(kernels), samples))
     for first in range(0, samples, _SAMPLES):
         end = min(first + _SAMPLES, samples)
         reach = min(length, (end - 1) * every + 1)
@@ -258,5 +258,5 @@ def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) 
             offset=(steps - 1 - first * every) * column,
             strides=(row, 0, -every * column, column),
         )
-        told[:, :, first:end] = np.vecdot(tables[:, :, None, :reach], view)
-    return told
+        summed[:, :, first:end] = np.vecdot(tables[:, :, None, :reach], view)
+    return summed

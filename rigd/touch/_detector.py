@@ -95,7 +95,7 @@ class TouchDetector:
         "_last",
         "_mean_squares",
         "_measuring",
-        "_place",
+        "_slot",
         "_recent",
         "_squares",
         "_threshold",
@@ -122,7 +122,7 @@ class TouchDetector:
         width = signatures.shape[1]
         self._last = np.zeros(2 * width, np.float32)
         self._windows = [self._last[start : start + width] for start in range(2, width + 2, 2)]
-        self._place = 0
+        self._slot = 0
         self._mean_squares = [1.0] * len(self._windows)
         self._recent = 1.0
         self.noise = (1.0, 1.0)
@@ -190,16 +190,16 @@ class TouchDetector:
                 self._ticks += 1
             return False
         torque_noise, shear_noise = self.noise
-        last, place = self._last, self._place
+        last, slot = self._last, self._slot
         half = last.size >> 1
-        last[2 * place] = last[2 * place + half] = torque / torque_noise
-        last[2 * place + 1] = last[2 * place + 1 + half] = shear / shear_noise
+        last[2 * slot] = last[2 * slot + half] = torque / torque_noise
+        last[2 * slot + 1] = last[2 * slot + 1 + half] = shear / shear_noise
         compared, mean_squares = self._compared, self._mean_squares
-        self._compare(self._windows[place], compared)
+        self._compare(self._windows[slot], compared)
         # A touch must not raise the level against itself: those that reach back to it wait.
-        self._recent += _RECENT * (mean_squares[place] - self._recent)
-        mean_squares[place] = float(compared.dot(compared)) / compared.size
-        self._place = place + 1 if place + 1 < len(self._windows) else 0
+        self._recent += _RECENT * (mean_squares[slot] - self._recent)
+        mean_squares[slot] = float(compared.dot(compared)) / compared.size
+        self._slot = slot + 1 if slot + 1 < len(self._windows) else 0
         u, v = filter_.predicted
         u /= torque_noise
         v /= shear_noise

@@ -112,7 +112,7 @@ class GrowingEstimate:
             Whether a first answer is wanted: what one or two obstacles at rest do not explain is of
             unknown kind in it, since to try others takes a second.
         """
-        told = None
+        answer = None
         searched = record.angle_rad.size
         # What has explained the beginning comes first.
         for noticed_s in sorted(NOTICED_S, key=lambda each: each != self._explained_by):
@@ -125,14 +125,14 @@ class GrowingEstimate:
             ):
                 continue
             found = answer(here, here.explain(first=first), scan=scan)
-            if told is None or found.explained:
-                told = found
+            if answer is None or found.explained:
+                answer = found
             if found.explained:
                 self._explained_by = noticed_s
             if found.explained or first:
                 break
             searched = here.first
-        return told or self._untold(record)
+        return answer or self._without_answer(record)
 
     def _reaches(self, record: TouchRecord, noticed_s: float) -> bool:
         """Whether there are enough samples of the free beam."""
@@ -158,7 +158,7 @@ class GrowingEstimate:
         longer = self._explainer(record, longer_s)
         return longer.seems_to_begin < here.first and longer.misfit < 0.5 * here.misfit
 
-    def _untold(self, record: TouchRecord) -> TouchEstimate:
+    def _without_answer(self, record: TouchRecord) -> TouchEstimate:
         """Too few samples before the touch."""
         nothing = np.zeros(0)
         channels = 1 if record.shear_n is None else 2

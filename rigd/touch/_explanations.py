@@ -23,7 +23,7 @@ from rigd.touch._physical import (
     Prediction,
     Space,
     Touching,
-    Window,
+    WhitenedWindow,
     chi2_of,
     descend,
 )
@@ -46,7 +46,7 @@ _CLOUD = 96
 """Starts for a longer part of the record, from what a shorter one leaves likely."""
 NEAR_TIP = 0.8
 """Share of the length beyond which contacts are shorter, and steps finer."""
-_BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+_NEARBY_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
 _AT_TIP = 0.95
 """Beyond this share a longer record tells no more: its many short contacts fit anywhere."""
 
@@ -95,7 +95,7 @@ class Explained:
 
     explanations: list[Explanation]
     """An obstacle at rest comes first."""
-    window: Window
+    window: WhitenedWindow
     """The part of the record that they explain."""
     later_doubtful: bool
     """Later samples, which are left out, speak against an obstacle at rest."""
@@ -186,7 +186,7 @@ class Explainer:
             explanations.append(two)
         return Explained(explanations, window, later_doubtful=later_doubtful, untried=untried)
 
-    def _over_stages(self) -> tuple[Explanation, Window, Explanation | None, bool]:
+    def _over_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
         Returns what the longest one tells that is explained, or else the first one that is not, and
@@ -196,18 +196,18 @@ class Explainer:
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         stages.append(available_s)
-        before: tuple[Explanation, Window] | None = None
+        before: tuple[Explanation, WhitenedWindow] | None = None
         if self._at_rest is None:
-            starts = self._beside(_distinct(self._descended))
+            starts = self._with_neighbours(_distinct(self._descended))
         else:
-            rest, told_s = self._at_rest
-            stages = [seconds for seconds in stages if seconds > told_s]
+            rest, explained_s = self._at_rest
+            stages = [seconds for seconds in stages if seconds > explained_s]
             starts = self._further(rest)
-            self._take_along(starts, max([told_s, *stages[:1]]))
-            window = self.window(told_s)
+            self._take_along(starts, max([explained_s, *stages[:1]]))
+            window = self.window(explained_s)
             [chi2] = chi2_of(self.predicting(starts[:1]), window, starts[:1])
             before = replace(rest, chi2=float(chi2)), window
-            if self._enough(*before, told_s):
+            if self._enough(*before, explained_s):
                 stages = []
         for seconds in stages:
             self._take_along(starts, seconds)
@@ -228,17 +228,17 @@ class Explainer:
         assert before is not None  # there is one stage at least, or one of before
         return *before, None, False
 
-    def _enough(self, rest: Explanation, window: Window, seconds: float) -> bool:
+    def _enough(self, rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
         """Whether a longer part of the record would tell no more."""
-        place = rest.posterior.mean(0)
-        known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
+        x_m = rest.posterior.mean(0)
+        known = rest.posterior.std(0) < _WELL_KNOWN_M or x_m > _AT_TIP * self.edges[1]
         return seconds > FIRST_S and bool(known or not self.fits(rest, window))
 
     def _take_along(self, likeliest: Real, seconds: float) -> None:
         """Know what is uncertain of so long a part of the record."""
         if self._covered_s < seconds:
             self._covered_s = min(max(seconds, _COVERED_S), self.available / self.rate)
-            whole = Window.of(self.motion, self.quiet, self.end(self._covered_s))
+            whole = WhitenedWindow.of(self.motion, self.quiet, self.end(self._covered_s))
             self.deviations = deviations(self.tables, self.record, likeliest[:1], whole)
 
     def _further(self, rest: Explanation) -> Real:
@@ -252,9 +252,9 @@ class Explainer:
 
     # What candidates are compared with
 
-    def window(self, seconds: float) -> Window:
+    def window(self, seconds: float) -> WhitenedWindow:
         """Return the samples from before the touch to so long after the detection."""
-        return Window.of(self.motion, self.quiet, self.end(seconds), self.deviations)
+        return WhitenedWindow.of(self.motion, self.quiet, self.end(seconds), self.deviations)
 
     def end(self, seconds: float) -> int:
         """Return the sample so long after the detection, or the end of the record."""
@@ -296,9 +296,9 @@ class Explainer:
         return best
 
     @cached_property
-    def _first_samples(self) -> Window:
+    def _first_samples(self) -> WhitenedWindow:
         """What candidates of the grid are compared with: nothing uncertain is known of by then."""
-        return Window.of(self.motion, self.quiet, self.end(FIRST_S))
+        return WhitenedWindow.of(self.motion, self.quiet, self.end(FIRST_S))
 
     @cached_property
     def starts(self) -> Real:
@@ -317,13 +317,13 @@ class Explainer:
         predict = self.predicting(self.starts, first=True)
         return descend(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
-    def _beside(self, starts: Real) -> Real:
+    def _with_neighbours(self, starts: Real) -> Real:
         """Add starts beside the best ones near the tip, where the minima stand close together."""
         if np.median(starts[:, 0]) <= NEAR_TIP * self.tables.model.beam.length_m:
             return starts
-        beside = np.repeat(starts[None, :2], _BESIDE_M.size, axis=0)
-        beside[:, :, 0] = np.clip(beside[:, :, 0] + _BESIDE_M[:, None], *self.edges)
-        return np.vstack([starts, beside.reshape(-1, starts.shape[1])])
+        nearby = np.repeat(starts[None, :2], _NEARBY_M.size, axis=0)
+        nearby[:, :, 0] = np.clip(nearby[:, :, 0] + _NEARBY_M[:, None], *self.edges)
+        return np.vstack([starts, nearby.reshape(-1, starts.shape[1])])
 
     def _cloud(self, posterior: Posterior) -> Real:
         """Candidates of a longer window, from what a shorter one leaves likely."""
@@ -337,7 +337,7 @@ class Explainer:
         )
 
     def explained(
-        self, kind: str, predict: Prediction, window: Window, starts: Real, space: Space
+        self, kind: str, predict: Prediction, window: WhitenedWindow, starts: Real, space: Space
     ) -> Explanation:
         """Descend from starts, and sample around the minima."""
         if starts.shape[0] > 12:
@@ -349,7 +349,7 @@ class Explainer:
         self,
         kind: str,
         predict: Prediction,
-        window: Window,
+        window: WhitenedWindow,
         found: Descended,
         space: Space,
         doubt: float = 1.0,
@@ -381,7 +381,7 @@ class Explainer:
 
     # Other kinds
 
-    def fits(self, explanation: Explanation, window: Window, worse: float = _WORSE) -> bool:
+    def fits(self, explanation: Explanation, window: WhitenedWindow, worse: float = _WORSE) -> bool:
         """Whether no more is left than noise leaves, which is itself known from few samples."""
         return bool(explanation.chi2 < self.most(window.data.size, worse))
 
@@ -391,14 +391,14 @@ class Explainer:
         return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
 
     def _later_is_worse(
-        self, longer: Explanation, over: Window, shorter: Explanation, until: Window
+        self, longer: Explanation, over: WhitenedWindow, shorter: Explanation, until: WhitenedWindow
     ) -> bool:
         """Whether the shorter of two windows is explained, and not what the longer one adds."""
         added = over.data.size - until.data.size
         more = longer.chi2 - shorter.chi2
         return self.fits(shorter, until) and more > self.most(added, _WORSE_LATER)
 
-    def _changes(self, rest: Explanation, window: Window) -> bool:
+    def _changes(self, rest: Explanation, window: WhitenedWindow) -> bool:
         """Whether the obstacle at rest becomes likelier if it may move or give way."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
@@ -415,7 +415,7 @@ class Explainer:
         )
         return bool(found.chi2.min() < rest.chi2 - DOUBTFUL)
 
-    def _others(self, window: Window) -> list[Explanation]:
+    def _others(self, window: WhitenedWindow) -> list[Explanation]:
         """Obstacles that move or give way, and a knock."""
         blind, side = self.blind, self.side()
         likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
@@ -447,7 +447,7 @@ class Explainer:
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
 
-    def _two(self, rest: Explanation, window: Window) -> Explanation | None:
+    def _two(self, rest: Explanation, window: WhitenedWindow) -> Explanation | None:
         """Two obstacles, if they may explain more than one at rest does."""
         pairing = self.pairing()
         space = pairing.space(self.space(3))
@@ -475,7 +475,7 @@ class Explainer:
         """March obstacles whose fourth parameter is their rate or their mobility."""
         touching = Touching(kernels, self.tables.x_m, self.motion)
 
-        def predicted(candidates: Real, window: Window) -> Real:
+        def predicted(candidates: Real, window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
             return touching.predicted(candidates, window, side)[0]
@@ -498,8 +498,8 @@ class Explainer:
 def _distinct(found: Descended) -> Real:
     """Minima that are not worth the same as a better one beside them, the best first."""
     order = np.argsort(found.chi2)
-    kept: list[Real] = []
+    distinct: list[Real] = []
     for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:
-        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
-            kept.append(row)
-    return np.array(kept)
+        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in distinct):
+            distinct.append(row)
+    return np.array(distinct)

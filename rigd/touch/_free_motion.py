@@ -18,7 +18,7 @@ from rigd.beam import (
     poles,
     root_shear_ratio,
 )
-from rigd.touch._kernels import Line, chebyshev_nodes
+from rigd.touch._kernels import LaplaceLine, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
@@ -102,7 +102,7 @@ class FreeBeam:
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
         n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
-        self.line = Line(n, 1 / (FINER * rate_hz), _BAND)
+        self.line = LaplaceLine(n, 1 / (FINER * rate_hz), _BAND)
         s = self.line.s
         self._grid = grid = PointForceGrid(s, model.beam, model.damping)
         late = model.sensor_filter.response(s)
@@ -110,8 +110,8 @@ class FreeBeam:
         inertia = model.tool_inertia_kg_m2 * s * s
         self._torque: Complex = late * (grid.torque_per_angle() + inertia)
         self._shear: Complex = late * grid.shear_per_angle()
-        self.modes = Ringing.of(model, np.empty(0))
-        self._place(x_m)
+        self.modes = FreeVibration.of(model, np.empty(0))
+        self._set_positions(x_m)
         unit = np.zeros(3 * BEFORE)
         unit[BEFORE] = 1.0
         self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
@@ -125,10 +125,10 @@ class FreeBeam:
             Places where the displacement is wanted, shape (m,).
         """
         other = copy(self)
-        other._place(x_m)
+        other._set_positions(x_m)
         return other
 
-    def _place(self, x_m: Real) -> None:
+    def _set_positions(self, x_m: Real) -> None:
         """Take places; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
@@ -137,7 +137,7 @@ class FreeBeam:
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at(x_m / self.model.beam.length_m)
 
-    def per_sample(self, place: int, samples: int) -> Real:
+    def per_sample(self, index: int, samples: int) -> Real:
         """Displacement that one sample of the angle makes, in m/rad.
 
         Parameters
@@ -152,7 +152,7 @@ class FreeBeam:
         ndarray, shape (FINER · (BEFORE + samples),)
             On the fine steps, from `BEFORE` samples before it on: the spline looks ahead.
         """
-        response = (self._between[place] @ self._displacement) * self._sample
+        response = (self._between[index] @ self._displacement) * self._sample
         return self.line.in_time(response, FINER * (BEFORE + samples))
 
     def motion(
@@ -228,7 +228,7 @@ class FreeMotion:
     """Cholesky factor of the covariance of its q amplitudes."""
     turned: "Turned"
     """The angle that drives it."""
-    ringing: "Ringing"
+    ringing: "FreeVibration"
     """The free vibrations among them."""
     angle_noise_rad: float
     """Standard deviation of a sample of the angle."""
@@ -255,13 +255,13 @@ class Turned:
     speed_rad_s: float
 
     @classmethod
-    def of(cls, angle_rad: Real, rate_hz: float, line: Line) -> "Turned":
+    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "Turned":
         """Transform the samples of an angle."""
         rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
         return cls(line.transformed(rest), start_rad, speed_rad_s)
 
 
-def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]:
+def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
     """Angle on the steps of the line without the straight motion it begins with, and that."""
     from scipy.interpolate import CubicSpline
 
@@ -281,7 +281,7 @@ def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Ringing:
+class FreeVibration:
     """Free vibrations of the first modes, as columns of cosines and sines that decay."""
 
     poles: Complex
@@ -294,7 +294,7 @@ class Ringing:
     """Displacement at the places per amplitude, shape (modes, places)."""
 
     @classmethod
-    def of(cls, model: TouchModel, x_m: Real) -> "Ringing":
+    def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
         beam, damping = model.beam, model.damping
         most = 12
         found = poles(beam, damping, most)[:, 0]
@@ -311,7 +311,7 @@ class Ringing:
         whole = cls(found.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
         return whole.at(x_m / beam.length_m)
 
-    def at(self, shares: Real) -> "Ringing":
+    def at(self, fractions: Real) -> "FreeVibration":
         """Return the same vibrations at other places.
 
         Parameters
@@ -319,7 +319,7 @@ class Ringing:
         shares
             Places as shares of the length, shape (places,).
         """
-        shapes = np.stack([mode_shape(i + 1, shares) for i in range(self.poles.size)])
+        shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
         return replace(self, shapes=shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
@@ -368,13 +368,13 @@ class _Fitted:
             a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
             b = np.concatenate([e[:quiet] / s for e, s in zip(innovations, noise, strict=True)])
             normal = a.T @ a
-            ridge = 1e-9 * np.trace(normal) / normal.shape[0]
-            covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+            regularisation = 1e-9 * np.trace(normal) / normal.shape[0]
+            covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
             values = covariance @ (a.T @ b)
             left = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
             free = max(quiet - values.size / len(left), quiet / 2)
             noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / free)) for e in left]
         a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
         normal = a.T @ a
-        covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+        covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
         return cls(values, covariance, noise, left)

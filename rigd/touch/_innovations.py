@@ -33,7 +33,7 @@ Complex = NDArray[np.complexfloating]
 _MOST_MODES = 40
 _FASTEST = 0.42
 """Fastest mode that the filter follows, as a share of the rate; the taps stand for the others."""
-_LEAST_SHARE = 0.5
+_LEAST_FRACTION = 0.5
 """Imaginary part of a pole over its size: below, the ladder stands for it."""
 _LADDER = 10
 """Real poles for the branch cut of the fractional orders."""
@@ -220,8 +220,8 @@ class InnovationFilter:
         if missed:
             start_rad = self._angle_rad
             for tick in range(1, missed + 1):
-                share = tick / (missed + 1)
-                self._pass(start_rad + share * (turned_rad - start_rad), torque_nm, shear_n)
+                fraction = tick / (missed + 1)
+                self._pass(start_rad + fraction * (turned_rad - start_rad), torque_nm, shear_n)
         if wrench_stale:
             self._pass(turned_rad, torque_nm, shear_n)
         else:
@@ -315,7 +315,7 @@ def _fit(
 
 def _ringing(upper: Complex, rate_hz: float) -> NDArray[np.bool_]:
     """Tell which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
-    ringing: NDArray[np.bool_] = upper.imag > _LEAST_SHARE * np.abs(upper)
+    ringing: NDArray[np.bool_] = upper.imag > _LEAST_FRACTION * np.abs(upper)
     return ringing & (upper.imag < 2 * pi * _FASTEST * rate_hz)
 
 

@@ -32,7 +32,7 @@ _EDGE_M = 0.003
 """The places begin at this distance from the root; they end at the tip."""
 
 
-class Line:
+class LaplaceLine:
     """Line in the Laplace plane that carries functions of time on ``n`` steps.
 
     Parameters
@@ -50,8 +50,8 @@ class Line:
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
         shift = WRAPPED / (n * step_s)
-        kept = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(kept) / (n * step_s)
+        used = round(band * (n // 2)) + 1
+        self.s = shift + 2j * np.pi * np.arange(used) / (n * step_s)
         self._grown = np.exp(shift * step_s * np.arange(n))
 
     def transformed(self, samples: Real) -> Complex:
@@ -105,7 +105,7 @@ class Hat:
 
         self._steps = steps
         fine = step_s / _OVERSAMPLED
-        self.line = Line(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
+        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
         s = self.line.s
         hat = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine
         # Two steps later than it acts, so that the hat begins within the period.
@@ -267,7 +267,7 @@ _AT_ONCE = 8
 """Places evaluated at once: temporaries stay in cache."""
 
 
-def places(length_m: float, spacing_m: float) -> Real:
+def positions(length_m: float, spacing_m: float) -> Real:
     """Places along the beam up to its tip, equally spaced.
 
     Parameters
@@ -300,9 +300,9 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     from numpy.polynomial import chebyshev
 
     nodes = chebyshev.chebpts1(count)
-    share = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
-    at_nodes, at_places = (chebyshev.chebvander(each, count - 1) for each in (nodes, share))
-    between: Real = at_places @ np.linalg.inv(at_nodes)
+    scaled = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
+    at_nodes, at_positions = (chebyshev.chebvander(each, count - 1) for each in (nodes, scaled))
+    between: Real = at_positions @ np.linalg.inv(at_nodes)
     return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import Space, Touching, Window
+from rigd.touch._physical import Space, Touching, WhitenedWindow
 
 Real = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class Knocking:
     def __init__(self, touching: Touching, kernels: ContactKernels, every: int) -> None:
         self._touching, self._kernels, self._every = touching, kernels, every
 
-    def predicted(self, parameters: Real, window: Window) -> Real:
+    def predicted(self, parameters: Real, window: WhitenedWindow) -> Real:
         """Effect on the channels, shape (k, c, samples).
 
         Parameters
@@ -49,7 +49,7 @@ class Knocking:
         tables = (local.torque, local.shear)[: motion.noise.size]
         return self._touching.effects(tables, force, parameters[:, 1], window)
 
-    def starts(self, window: Window, latest: int, count: int) -> Real:
+    def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
         """Likeliest candidates of a grid, the peak of each being the best, shape (count, 4).
 
         Parameters
@@ -61,11 +61,11 @@ class Knocking:
         count
             How many.
         """
-        places = self._kernels.x_m[:: self._every]
+        positions = self._kernels.x_m[:: self._every]
         grid = np.stack(
             [
                 each.ravel()
-                for each in np.meshgrid(places, np.log(_DURATIONS_S), [1.0], indexing="ij")
+                for each in np.meshgrid(positions, np.log(_DURATIONS_S), [1.0], indexing="ij")
             ],
             axis=1,
         )

@@ -71,15 +71,15 @@ class TouchModel:
         beam, damping = self.beam, self.damping
         match name:
             case "bending_stiffness_n_m2":
-                share = 1 + by / beam.bending_stiffness_n_m2
+                factor = 1 + by / beam.bending_stiffness_n_m2
                 beam = replace(
                     beam,
-                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * share,
-                    density_kg_per_m=beam.density_kg_per_m * share,
+                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * factor,
+                    density_kg_per_m=beam.density_kg_per_m * factor,
                 )
             case "density_over_stiffness":
-                share = 1 + by / beam.density_over_stiffness
-                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * share)
+                factor = 1 + by / beam.density_over_stiffness
+                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * factor)
             case "zeta" | "gamma":
                 damping = replace(damping, **{name: max(getattr(damping, name) + by, 0.0)})
             case "alpha" | "lambda":
@@ -131,7 +131,7 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: share * values[name] for name, share in _ASSUMED.items()},
+            std={name: factor * values[name] for name, factor in _ASSUMED.items()},
         )
 
     @classmethod

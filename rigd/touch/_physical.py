@@ -26,7 +26,7 @@ PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n
 STIFFEST = log(1e6)
 SOFTEST = log(10.0)
 
-Prediction = Callable[[Real, "Window"], Real]
+Prediction = Callable[[Real, "WhitenedWindow"], Real]
 """Effect of candidates (k, p) on the channels in a window, shape (k, c, samples)."""
 
 
@@ -49,7 +49,7 @@ class Space:
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class WhitenedWindow:
     """The innovations that candidates are compared with, whitened."""
 
     motion: FreeMotion
@@ -66,7 +66,7 @@ class Window:
     @classmethod
     def of(
         cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
-    ) -> "Window":
+    ) -> "WhitenedWindow":
         """Whiten the samples from `first` on.
 
         Parameters
@@ -126,7 +126,7 @@ class Touching:
     def predicted(
         self,
         parameters: Real,
-        window: Window,
+        window: WhitenedWindow,
         side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
@@ -168,7 +168,7 @@ class Touching:
         tables = (local.torque, local.shear)[: motion.innovations.shape[0]]
         return self.effects(tables, force, instant, window), force
 
-    def passed_on(self, parameters: Real, window: Window, moved_m: Real) -> Real:
+    def passed_on(self, parameters: Real, window: WhitenedWindow, moved_m: Real) -> Real:
         """Effect on the channels of other free motions by way of the contact, (r, c, samples).
 
         Parameters
@@ -193,7 +193,7 @@ class Touching:
         tables = (local.torque, local.shear)[: self._motion.innovations.shape[0]]
         return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
 
-    def steps(self, instant: Real, window: Window) -> int:
+    def steps(self, instant: Real, window: WhitenedWindow) -> int:
         """How many steps lead from the earliest instant to the end of the window.
 
         Parameters
@@ -217,7 +217,7 @@ class Touching:
         """
         return float(self.approach(parameters[:1], parameters[1:2], 1)[1][0])
 
-    def effects(self, tables: tuple[Real, ...], force: Real, instant: Real, window: Window) -> Real:
+    def effects(self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow) -> Real:
         """Effect of forces on the channels in the window, shape (k, c, samples).
 
         Parameters
@@ -301,7 +301,7 @@ _SETTLED = 0.1
 
 def descend(
     predict: Prediction,
-    window: Window,
+    window: WhitenedWindow,
     starts: Real,
     space: Space,
     rounds: int = 12,
@@ -343,7 +343,7 @@ def descend(
         move = np.clip(move, -8 * space.scale, 8 * space.scale)
         trial = np.clip(at[rows] + move, space.low, space.high)
         linear = r + np.einsum("knp,kp->kn", j, trial - at[rows])
-        promised = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
+        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
         new_residual, new_jacobian = _linearised(predict, window, trial, space)
         new = np.einsum("kn,kn->k", new_residual, new_residual)
         gain = chi2[rows] - new
@@ -353,13 +353,13 @@ def descend(
         residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
         damping[rows] = np.where(better, damping[rows] / 6, damping[rows] * 8)
         # Where contacts begin and end the residuals have bends: short steps may promise and fail.
-        active[rows[np.where(better, gain, promised) < _SETTLED]] = False
+        active[rows[np.where(better, gain, predicted_gain) < _SETTLED]] = False
         if not active.any():
             break
     return Descended(at, chi2, jacobian)
 
 
-def _linearised(predict: Prediction, window: Window, at: Real, space: Space) -> tuple[Real, Real]:
+def _linearised(predict: Prediction, window: WhitenedWindow, at: Real, space: Space) -> tuple[Real, Real]:
     """Residuals (k, n) and their derivatives (k, n, p)."""
     width = at.shape[1]
     shifts = np.where(at + space.difference > space.high, -space.difference, space.difference)
@@ -401,7 +401,7 @@ class Starts:
             for table in (kernels.torque, kernels.shear)
         ]  # (places, steps, samples)
 
-    def marched(self, motion: FreeMotion, window: Window, latest: int) -> tuple[Real, Real]:
+    def marched(self, motion: FreeMotion, window: WhitenedWindow, latest: int) -> tuple[Real, Real]:
         """March all starts, and return them with their sums of squared residuals.
 
         Parameters
@@ -419,9 +419,9 @@ class Starts:
         starts = np.meshgrid(self._x_m, motion.t[samples], np.log(STIFFNESSES), indexing="ij")
         return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
-    def _chi2(self, motion: FreeMotion, window: Window, samples: NDArray[np.intp]) -> Real:
+    def _chi2(self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]) -> Real:
         """Return the sums of squared residuals, shape (places, instants, kinds)."""
-        places, kinds = self._x_m.size, STIFFNESSES.size
+        positions, kinds = self._x_m.size, STIFFNESSES.size
         length = window.end - int(samples[0])
         steps = self._ratio * length
         begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
@@ -434,23 +434,23 @@ class Starts:
         pressing = march(
             self._kernel[:, :steps],
             np.repeat(approach, kinds, axis=1),
-            np.tile(STIFFNESSES.astype(np.float32), (places, samples.size)),
+            np.tile(STIFFNESSES.astype(np.float32), (positions, samples.size)),
             self._step_s,
         )
         force = -np.repeat(side, kinds, axis=1) * pressing
         predicted = np.zeros(
-            (places, samples.size, kinds, motion.noise.size, window.end - window.first),
+            (positions, samples.size, kinds, motion.noise.size, window.end - window.first),
             dtype=np.float32,
         )
         for channel in range(motion.noise.size):
             effect = force @ self._channels[channel][:, :steps, :length]
-            effect = effect.reshape(places, samples.size, kinds, length)
+            effect = effect.reshape(positions, samples.size, kinds, length)
             for i, sample in enumerate(samples):
                 count = window.end - sample
                 predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
         residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
         chi2: Real = np.einsum("kn,kn->k", residual, residual)
-        return chi2.reshape(places, samples.size, kinds)
+        return chi2.reshape(positions, samples.size, kinds)
 
 
 _INSTANTS = 16
@@ -459,7 +459,7 @@ STIFFNESSES = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
 """Stiffnesses of the starts, in N/m."""
 
 
-def chi2_of(predict: Prediction, window: Window, candidates: Real) -> Real:
+def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
     """Sum of squared residuals of candidates, shape (k,).
 
     Parameters

@@ -114,14 +114,14 @@ def sampled(
     rng = np.random.default_rng(0)  # the same record gives the same answer
     width = centres.shape[1]
     low, high = bounds
-    share = np.full(len(centres), 1 / len(centres))
+    mixture = np.full(len(centres), 1 / len(centres))
     samples = np.empty((0, width))
     chi2 = np.empty(0)
     density = np.empty(0)
     proposals: list[tuple[Real, Real, Real]] = []
     posterior = None
     for _ in range(rounds):
-        chosen = rng.choice(len(centres), count, p=share)
+        chosen = rng.choice(len(centres), count, p=mixture)
         factors = np.linalg.cholesky(covariances)
         normal = rng.standard_normal((count, width))
         spread = np.sqrt(_FREEDOM / rng.chisquare(_FREEDOM, count))
@@ -130,7 +130,7 @@ def sampled(
         found = np.full(count, np.inf)
         if inside.any():
             found[inside] = chi2_of(drawn[inside])
-        proposals.append((centres, covariances, share))
+        proposals.append((centres, covariances, mixture))
         density = density + _density(samples, *proposals[-1]) if samples.size else density
         own = sum(_density(drawn, *each) for each in proposals)
         samples = np.concatenate([samples, drawn])
@@ -146,7 +146,7 @@ def sampled(
         tempered = weights**0.5
         tempered /= tempered.sum()
         best = np.argsort(-tempered)[:_CENTRES]
-        centres, share = samples[best], tempered[best] / tempered[best].sum()
+        centres, mixture = samples[best], tempered[best] / tempered[best].sum()
         mean = tempered @ samples
         deviation = samples - mean
         local = np.minimum(
@@ -161,11 +161,11 @@ def sampled(
     return posterior
 
 
-def _density(samples: Real, centres: Real, covariances: Real, share: Real) -> Real:
+def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> Real:
     """Density of a mixture of Student distributions, but for a constant factor."""
     width = samples.shape[1]
     total = np.zeros(samples.shape[0])
-    for centre, covariance, weight in zip(centres, covariances, share, strict=True):
+    for centre, covariance, weight in zip(centres, covariances, mixture, strict=True):
         factor = np.linalg.cholesky(covariance)
         scaled = np.linalg.solve(factor, (samples - centre).T)
         distance = np.sum(scaled**2, axis=0)

@@ -70,11 +70,11 @@ class SensorFilter:
         """
         points = np.asarray(s, dtype=np.complex128)
         ages = self.spacing_s * np.arange(len(self.weights))[::-1]
-        told: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
+        values: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
         if self.corner_hz > 0:
             u = points / (2 * pi * self.corner_hz)
-            told /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
-        return told
+            values /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
+        return values
 
 
 NO_FILTER: Final = SensorFilter()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # a loop that watches does not read models
 
 Real = NDArray[np.float64]
 
-_PLACES = np.linspace(0.04, 1.0, 33)
+_POSITIONS = np.linspace(0.04, 1.0, 33)
 """As shares of the length."""
 _STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
 _AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
@@ -68,8 +68,8 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBe
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,
     )
-    looks = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
-    return WatchedBeam(observed, looks)
+    vectors = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
+    return WatchedBeam(observed, vectors)
 
 
 def signatures(
@@ -100,14 +100,14 @@ def signatures(
     ages = np.maximum(1, np.round(_AGES_S * rate_hz)).astype(int)
     ticks = int(ages.max())
     step_s = 1 / (_FINER * rate_hz)
-    places = beam.length_m * _PLACES
-    kernels = contact_kernels(beam, damping, places, step_s, _FINER * ticks + 1, sensor_filter)
-    approach = places[:, None] * step_s * np.arange(kernels.steps)
+    positions = beam.length_m * _POSITIONS
+    kernels = contact_kernels(beam, damping, positions, step_s, _FINER * ticks + 1, sensor_filter)
+    approach = positions[:, None] * step_s * np.arange(kernels.steps)
     per_tick = _impulse_responses(model, ticks)
 
     found = []
     for stiffness in _STIFFNESSES_N_PER_M:
-        force = march(kernels.displacement, approach, np.full(places.size, stiffness), step_s)
+        force = march(kernels.displacement, approach, np.full(positions.size, stiffness), step_s)
         readings = responses(
             (kernels.torque, kernels.shear), force, _FINER // _PHASES, _PHASES * ticks + 1
         )

@@ -6,7 +6,7 @@ import numpy as np
 
 from rigd.touch._blind import Blind
 from rigd.touch._free_motion import FreeBeam
-from rigd.touch._kernels import contact_kernels, cross_kernels, places
+from rigd.touch._kernels import contact_kernels, cross_kernels, positions
 from rigd.touch._model import TouchModel
 from rigd.touch._physical import Starts
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
@@ -23,7 +23,7 @@ class Tables:
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
-        self.x_m = places(model.beam.length_m, _SPACING_M)
+        self.x_m = positions(model.beam.length_m, _SPACING_M)
         finer = 4 * max(1, round(4000 / rate_hz))
         steps = round((FINAL_S + NOTICED_S[-1] + 0.01) * rate_hz * finer)
         self.finest = contact_kernels(

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from rigd.touch._free_motion import BEFORE, FINER, TouchRecord
 from rigd.touch._kernels import contact_kernels
-from rigd.touch._physical import Touching, Window
+from rigd.touch._physical import Touching, WhitenedWindow
 from rigd.touch._tables import Tables
 
 Real = NDArray[np.float64]
 
 
-def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -> Real:
+def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedWindow) -> Real:
     """Effects on the innovations of what is uncertain, one standard deviation each, (c, n, r).
 
     Parameters
@@ -57,7 +57,7 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -
     return np.stack(columns, axis=-1)
 
 
-def _ringing(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
+def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
     """Effects of what is unknown of the free motion, also by where it lets the beam touch."""
     motion = whole.motion
     spread = motion.spread
@@ -71,12 +71,12 @@ def _ringing(tables: Tables, touching: Touching, best: Real, whole: Window) -> R
     return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
 
 
-def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
+def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
     """Effects of the encoder's steps, by where they let the beam touch."""
     motion = whole.motion
     samples = np.arange(whole.first, whole.end)
-    place = int(np.argmin(np.abs(tables.x_m - best[0])))
-    one = tables.free.per_sample(place, samples.size + 8)
+    index = int(np.argmin(np.abs(tables.x_m - best[0])))
+    one = tables.free.per_sample(index, samples.size + 8)
     # Columns begin four samples before the window.
     late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
     index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]
