@@ -1,8 +1,8 @@
 """Any force at one point: the likelihood of the point whatever the obstacle does.
 
 The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
-covariance that depends on the point; what decides is how both fit together. Works for obstacles
-that move, yield or come from outside as well as for springs, and tells less of each.
+covariance that depends on the point; the agreement of the two decides. This works for obstacles
+that move, yield or come from outside as well as for springs, with a larger uncertainty.
 """
 
 from dataclasses import dataclass
@@ -16,28 +16,28 @@ from rigd.touch._physical import WhitenedWindow
 Real = NDArray[np.float64]
 
 _SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
-"""Standard deviations of the force, one of which is likely."""
+"""Candidate standard deviations of the force."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlindScan:
-    """Likelihood over the places."""
+    """Likelihood over the positions."""
 
     x_m: Real
-    """Places, shape (m,)."""
+    """Positions, shape (m,)."""
     log_likelihood: Real
-    """Value at each, the force's size being the likeliest, shape (m,)."""
+    """Log-likelihood at each, for the likeliest size of the force, shape (m,)."""
     chi2: float
-    """Sum of squared residuals at the best place in units of what its model expects."""
+    """Sum of squared residuals at the best position in units of its model's expectation."""
     degrees: int
-    """What that would be on average."""
+    """Its expectation."""
     force_n: Real
-    """Force on the beam at the best place, shape (2 · samples,)."""
+    """Force on the beam at the best position, shape (2 · samples,)."""
     force_std_n: float
-    """Size of the force assumed there."""
+    """Size of the force at that position."""
 
     def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
-        """Best place, its standard deviation and the ends of the places not much less likely.
+        """Return the best position, its standard deviation and the ends of the likely positions.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class Blind:
     kernels
         Contact kernels with two steps a sample.
     every
-        Every so many of their places is scanned.
+        One in so many of their positions is scanned.
     samples
         Most samples.
     """
@@ -82,10 +82,10 @@ class Blind:
         self._effects = [
             np.where(lag >= 0, table[::every][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
             for table in (kernels.torque, kernels.shear)
-        ]  # (places, samples, forces)
+        ]  # (positions, samples, forces)
 
     def scan(self, window: WhitenedWindow) -> BlindScan:
-        """Likelihood over the places.
+        """Return the likelihood over the positions.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
-"""Two obstacles at rest, the second met with or after the first.
+"""Two obstacles at rest, the second touched with or after the first.
 
-Each force bends the beam also at the other place, so both contacts are marched together. Two soft
-obstacles that are met at about the same time are much like one between them: what the second adds
-to one that explains the record is asked of every such touch.
+Each force bends the beam also at the other position, so both contacts are integrated together. Two
+soft obstacles that are touched at about the same time are similar to one between them: every touch
+that one obstacle explains is therefore tested for a second one.
 """
 
 import numpy as np
@@ -15,30 +15,30 @@ from rigd.touch._physical import SOFTEST, Space, Touching, WhitenedWindow
 Real = NDArray[np.float64]
 
 _AFTER_S = np.array([0.0, 0.008, 0.025, 0.06])
-"""The second would be met so long after the first by a free beam, in starts."""
+"""Times in starts after which a free beam would touch the second obstacle."""
 _POSITIONS = 12
 _TRIED_N_PER_M = 100.0
-"""Stiffness whose effect tells that of others in starts: of soft ones it grows in proportion."""
+"""Stiffness from whose effect others follow in starts: that of soft ones is proportional to it."""
 _SHARED = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
-"""Two that are like one: their places by that of the one, each with half of the moment."""
+"""Two obstacles equivalent to one: their positions relative to it, each with half of the moment."""
 _FARTHEST_M = 0.3
 
 
 class Pairing:
-    """March two obstacles.
+    """Integrates the contact with two obstacles.
 
-    Candidates have six columns: place, instant and logarithm of the stiffness of the first, then
-    the place of the second, how far the free beam still is from it at that instant in m, and the
+    Candidates have six columns: position, instant and logarithm of the stiffness of the first, then
+    the position of the second, the free beam's distance from it at that instant in m, and the
     logarithm of its stiffness.
 
     Parameters
     ----------
     touching
-        Knows the record's steps.
+        Integration on the record's steps.
     kernels
         Contact kernels of those steps.
     crossing
-        Kernels between the places, likewise.
+        Kernels between the positions, likewise.
     """
 
     __slots__ = ("_crossing", "_kernels", "_touching")
@@ -47,14 +47,14 @@ class Pairing:
         self._touching, self._kernels, self._crossing = touching, kernels, crossing
 
     def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
-        """Effect on the channels in the window, and the force of the first obstacle.
+        """Return the effect on the channels in the window, and the force of the first obstacle.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
         window
-            Which samples.
+            The samples.
 
         Returns
         -------
@@ -85,22 +85,22 @@ class Pairing:
         return first + second, forces[0]
 
     def channels(self, parameters: Real, window: WhitenedWindow) -> Real:
-        """Effect on the channels alone; the arguments are those of `predicted`."""
+        """Return the effect on the channels alone; the arguments are those of `predicted`."""
         return self.predicted(parameters, window)[0]
 
     def starts(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Candidates that are like one obstacle, or have another beside it, shape (k, 6).
+        """Return candidates that are like one obstacle, or have a second one, shape (k, 6).
 
         Parameters
         ----------
         one
-            Place, instant and logarithm of the stiffness of the one that explains the record.
+            Position, instant and logarithm of the stiffness of the one that explains the record.
         window
             The samples.
         space
             Ranges of the candidates.
         count
-            How many places of another, the likeliest by its effect to first order.
+            Number of positions of a second one, the likeliest by its first-order effect.
         """
         shared = np.tile(np.concatenate([one, one]), (len(_SHARED), 1))
         shared[:, [0, 3]] *= _SHARED
@@ -109,7 +109,7 @@ class Pairing:
         return np.vstack([shared, self._with_another(one, window, space, count)])
 
     def _with_another(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
-        """Return the likeliest of another obstacle beside the one, by its effect to first order."""
+        """Return the likeliest second obstacles by their first-order effect."""
         x_m = np.linspace(space.low[3], space.high[3], _POSITIONS)
         instants = np.full(_POSITIONS, one[1])
         steps = self._touching.steps(instants, window)
@@ -124,7 +124,7 @@ class Pairing:
         rows = np.vstack([alone, changed, second])
         residual = window.residuals(self.channels(rows, window))
         now, effect = residual[0], residual[4:] - residual[0]
-        # What changes of the first could do is left out of both, and follows from the second.
+        # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(((residual[1:4] - now) / space.difference[:3, None]).T)
         own = effect - (effect @ q) @ q.T
         power = np.einsum("kn,kn->k", own, own) + 1e-300
@@ -141,7 +141,7 @@ class Pairing:
 
     @staticmethod
     def exchanged(parameters: Real) -> Real:
-        """Return candidates in which the second is met first and the first at once after it.
+        """Return candidates in which the second is touched first and the first right after it.
 
         Parameters
         ----------
@@ -154,12 +154,12 @@ class Pairing:
 
     @staticmethod
     def space(one: Space) -> Space:
-        """Ranges of the candidates.
+        """Return the ranges of the candidates.
 
         Parameters
         ----------
         one
-            Those of one obstacle at rest.
+            Ranges of one obstacle at rest.
         """
         return Space(
             low=np.concatenate([one.low, [one.low[0], 0.0, one.low[2]]]),
