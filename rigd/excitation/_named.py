@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rigd.excitation._from_file import from_csv
-from rigd.excitation._narrow_sweeps import LoopPreview, modes
+from rigd.excitation._narrow_sweeps import SweepRig, modes
 from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
@@ -15,7 +15,7 @@ from rigd.excitation._until import ScanRig, until
 Value = float | int | str | Path
 
 
-class RigPreview(LoopPreview, MoveRig, ScanRig, Protocol):
+class RigPreview(SweepRig, MoveRig, ScanRig, Protocol):
     """Interface to a rig for which an excitation is made."""
 
 

@@ -228,7 +228,7 @@ _REGULARISATION: Final = 1e-12
 """Relative regularisation: few bands leave some combinations of parameters undetermined."""
 
 
-class LoopPreview(Protocol):
+class SweepRig(Protocol):
     """Interface to a rig's predicted behaviour before it moves."""
 
     @property
@@ -269,9 +269,7 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def time_fractions(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview
-) -> Real:
+def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
     """Return the time fractions of the bands that determine the damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
@@ -323,7 +321,7 @@ def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 
 def _information_rates(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview, damping: Damping
+    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
     """Return the information per second of each band, (bands, k, k), damping parameters first.
 
@@ -375,7 +373,7 @@ def modes(
     ring_down_s: float = 15.0,
     taper_s: float = 1.0,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
-    rig: LoopPreview | None = None,
+    rig: SweepRig | None = None,
 ) -> Excitation:
     """Linear sweeps through narrow bands round modes, one after the other.
 
@@ -470,7 +468,7 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
 
 
 def _within_limits(
-    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: LoopPreview
+    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
     """Return the amplitude of each sweep, reduced where the rig's limits require it.
 
