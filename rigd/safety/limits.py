@@ -1,7 +1,7 @@
 """Limits of the rig, and the table of interlocks.
 
-For every interlock the table states the monitored quantity, the limit, the process that checks it and
-the action; the checks, the messages and docs/safety.md agree on it. The profile has the levels.
+For every interlock the table states the monitored quantity, the limit, the process that checks it,
+and the action; the checks, the messages and docs/safety.md agree on it. The profile has the levels.
 """
 
 from dataclasses import dataclass, field

@@ -277,7 +277,7 @@ class TopicBuffer:
                 "into the memory that reading a session may take. Give a shorter session."
             )
         if end > len(self._array):
-            # Resized without a copy, by a small fraction: two such arrays would take too much memory.
+            # Resized without a copy, by a small fraction: two arrays would take too much memory.
             grown = max(end, len(self._array) + max(_GROWTH, len(self._array) // 8))
             self._array.resize(min(grown, self._most), refcheck=False)
         if self._on_messages is not None:

@@ -75,8 +75,8 @@ def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: Whitened
     """Return the effects of the encoder's steps on the instant of touch."""
     motion = whole.motion
     samples = np.arange(whole.first, whole.end)
-    index = int(np.argmin(np.abs(tables.x_m - best[0])))
-    one = tables.free.per_sample(index, samples.size + 8)
+    nearest = int(np.argmin(np.abs(tables.x_m - best[0])))
+    one = tables.free.per_sample(nearest, samples.size + 8)
     # Columns begin four samples before the window.
     late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
     index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]
