@@ -67,7 +67,7 @@ class ForceRealisation:
 def realise_force(
     beam: Beam, damping: Damping, force_at_m: float, output_at_m: Real, highest_rad_s: float
 ) -> ForceRealisation:
-    """Realise the response to a force on the beam.
+    """Return a state-space realisation of the response to a force on the beam.
 
     Parameters
     ----------

@@ -357,7 +357,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
 
 
 def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
-    """Roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
+    """Return the roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
     half = -0.5 * rate
     first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
     second = first.conj()
@@ -369,7 +369,7 @@ def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
 
 
 def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps: int) -> Complex:
-    """Poles in the upper half plane, followed from the undamped ones while damping grows.
+    """Follow poles in the upper half plane from the undamped ones while damping grows.
 
     NaN where the path was lost or has left the principal sheet.
     """

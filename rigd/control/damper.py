@@ -57,7 +57,7 @@ class VibrationDamper:
     --------
     >>> from rigd.control.damper import DamperSettings, VibrationDamper
     >>> damper = VibrationDamper(DamperSettings(10.0, 0.025, 4.0, 320.0), rate_hz=1000)
-    >>> damper.step(0.01) < 0  # what pushes the beam forward gives way backward
+    >>> damper.step(0.01) < 0  # a positive torque of the beam moves the reference backward
     True
     """
 

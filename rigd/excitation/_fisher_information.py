@@ -407,7 +407,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
 
 
 def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Whitened decays from the first sample on, offset and drift, shape (m, samples)."""
+    """Return whitened decays from the first sample, offset and drift, shape (m, samples)."""
     time_s = np.arange(samples) / sample_hz
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))

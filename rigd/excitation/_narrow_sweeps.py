@@ -375,7 +375,7 @@ def modes(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     rig: SweepRig | None = None,
 ) -> Excitation:
-    """Linear sweeps through narrow bands round modes, one after the other.
+    """Return linear sweeps through narrow bands around modes, one after the other.
 
     Parameters
     ----------

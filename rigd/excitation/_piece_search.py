@@ -598,7 +598,7 @@ def best_mixture(
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
-    """Information of steady sines per second of each, shape (m, k, k)."""
+    """Return the information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
     rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
     return rates

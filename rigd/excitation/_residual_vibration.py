@@ -41,7 +41,7 @@ class DisturbedRig(Protocol):
 
     @property
     def settling_s(self) -> float:
-        """Time in which the loop follows up what the reference has done."""
+        """Time in which the loop catches up with the reference."""
 
     @property
     def torque_noise_nm(self) -> float:

@@ -231,10 +231,10 @@ def chirp(
     taper_s: float = 0.0,
     there_and_back: int = 0,
 ) -> Excitation:
-    """Linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from the sweep's first tick.
+    """Return a linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from its first tick.
 
-    The defaults are the paper's experiment (Section 5). There and back, the frequency returns to f0
-    in as long again, and angle and speed are continuous where it turns.
+    The defaults are the paper's experiment (Section 5). With ``there_and_back`` the frequency
+    returns to f0 in the same time, with continuous angle and speed at the turn.
 
     Parameters
     ----------
@@ -251,8 +251,8 @@ def chirp(
     taper_s
         Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
     there_and_back
-        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change in
-        time shows as such; 0: one.
+        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change
+        over time is visible; 0: one.
 
     Raises
     ------
@@ -392,11 +392,11 @@ def multisine(
     taper_s: float = 0.0,
     seed: int = 0,
 ) -> Excitation:
-    """Random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
+    """Return a random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
 
-    The period is turned so that it begins at its smallest magnitude (a shift in time: the
-    spectrum's magnitude stays flat), and scaled to the peak ``amplitude_rad``. The crest factor
-    reached, peak over rms, is reported in ``parameters["crest_factor"]``.
+    The period is shifted so that it begins at its smallest magnitude (the spectrum's magnitude
+    stays flat), and scaled to the peak ``amplitude_rad``. ``parameters["crest_factor"]`` is its
+    crest factor, peak over rms.
 
     Parameters
     ----------
@@ -469,7 +469,7 @@ def multisine(
 def _random_phase_period(
     ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
-    """One period of every harmonic in the band, shape (ticks,), of peak 1, from near zero on."""
+    """Return one period of all harmonics, shape (ticks,), with peak 1 and a start near zero."""
     frequency_hz = np.arange(1, ticks // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
     inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (

@@ -111,7 +111,7 @@ def touch(
     ExcitationError
         If an option is not finite or out of range, or the rig cannot brake from that speed.
     IdentifiedBeamError
-        If the file is not what it should be, or has what a search for touches does not take into
+        If the file is invalid, or has an effect that a search for touches does not take into
         account.
     """
     if rig is None:

@@ -56,7 +56,7 @@ class DesignRig(Protocol):
         Parameters
         ----------
         beam
-            The beam as estimated, with what is at its ends.
+            The estimated beam, with tip mass and root compliance.
         """
 
 

@@ -4,7 +4,7 @@ A reference is made of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a
 is linear, so that a mode with the pole s is left at rest where the accelerations' transform
 ``Σ a[j] exp(-s j dt)`` is zero: the angle that follows the reference has the same zero. A zero of
 second order (its derivative by s is zero as well) leaves little where the pole is not well known.
-The poles are those of the closed loop with the motor held, for its modes are what rings on.
+The poles are those of the closed loop with the motor held, since its modes continue to ring.
 """
 
 from collections.abc import Sequence

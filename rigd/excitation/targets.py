@@ -226,6 +226,6 @@ def _linearised(
     coefficient = _OF_COEFFICIENT.get(name, name)
     if estimate.values[coefficient] == 0.0 or name not in estimate.names:
         free = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_KIND[name]} damping {free} in what was found so far"
+        return value, gradient, f"{_KIND[name]} damping {free} in the estimate so far"
     gradient[estimate.names.index(name)] = value if name in LOGARITHMIC else 1.0
     return value, gradient, ""

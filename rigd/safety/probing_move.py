@@ -432,6 +432,6 @@ class ProbingMove:
 
 
 def _rise(x: float) -> float:
-    """Rise smoothly from 0 to 1 over x in [0, 1]."""
+    """Return a smooth rise from 0 to 1 over x in [0, 1]."""
     x = min(max(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)

@@ -166,7 +166,7 @@ def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) 
 
 
 def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Undo `protected_metadata`: return ``session`` and ``segments``; empty without them."""
+    """Return ``session`` and ``segments`` from `protected_metadata`; empty without them."""
     found: dict[str, dict[str, str]] = {}
     for key, value in channel.items():
         record, dot, name = key.partition(".")

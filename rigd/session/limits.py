@@ -26,7 +26,7 @@ MAX_ENTRIES: Final = 100_000
 MAX_MESSAGE_BYTES: Final = 16 << 20
 """Longest message that is read."""
 MAX_STEPS: Final = 6_000_000
-"""Most work on a file, in what a run of messages costs: about a microsecond."""
+"""Most work on a file, in units of a run of messages: about a microsecond."""
 
 MAX_SCHEMA_BYTES: Final = 1 << 17
 """Longest schema that is interpreted; those of this package take some hundred bytes."""

@@ -1,4 +1,4 @@
-"""Any force at one point: the likelihood of the point whatever the obstacle does.
+"""Any force at one point: the likelihood of the point for any behaviour of the obstacle.
 
 The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
 covariance that depends on the point; the agreement of the two decides. This works for obstacles

@@ -442,7 +442,7 @@ class Explainer:
         return found
 
     def pairing(self) -> Pairing:
-        """Pairs of obstacles on this record."""
+        """Return the integration of two obstacles on this record."""
         tables = self.tables
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
@@ -468,7 +468,7 @@ class Explainer:
         return self._sampled("two", pairing.channels, window, found, space, doubt)
 
     def side(self) -> float:
-        """Direction in which the beam presses: against the force, from any cause."""
+        """Return the direction in which the beam presses: opposite to the force."""
         return -1.0 if self.blind.force_n.sum() > 0 else 1.0
 
     def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
