@@ -1,11 +1,11 @@
-"""Drag of still air on a thin beam: where it acts, and how the modes feel it.
+"""Drag of still air on a thin beam: the force along the beam, and its effect on the modes.
 
 Each length of a round beam of diameter d that moves across the air at the speed v is held back by
 the quasi-steady force per metre ``-rho_air/2 C_D d |v| v`` (Morison's drag term). The
 beam enters by the product `C_D d` (in m) only; for a constant coefficient it is one number.
 
-The force is evaluated at the points of a Gauss-Legendre rule along the beam, whose weights turn it
-into what each mode and the root feel of it.
+The force is evaluated at the points of a Gauss-Legendre rule along the beam, whose weights convert
+it into the forces on each mode and the root.
 
 References
 ----------
@@ -24,18 +24,18 @@ from rigd.beam._modes import clamped_free_eigenvalues, mode_shape
 Real = NDArray[np.float64]
 
 AIR_DENSITY_KG_PER_M3 = 1.2
-"""Dry air at 20 °C and 1013 hPa has 1.204. A laboratory at another temperature or height differs by
-a few per cent, by which C_D d would be off."""
+"""Dry air at 20 °C and 1013 hPa has 1.204. In a laboratory at another temperature or height it
+differs by a few per cent, with the same relative error of C_D d."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DragGrid:
-    """Points along the beam, and the modes that carry the force from there to the root."""
+    """Points along the beam, and the modes that transmit the force to the root."""
 
     x_m: Real
     """Distance from the motor's axis, shape (g,)."""
     weight_m: Real
-    """Length of beam that each point stands for, shape (g,)."""
+    """Length of beam per point, shape (g,)."""
     shapes: Real
     """Modes at the points, shape (n, g), each of mean square 1 over the beam."""
     leverage_m: Real
@@ -49,10 +49,10 @@ class DragGrid:
         ----------
         beam
         modes
-            Number of modes that are followed.
+            Number of modes.
         points
-            Number of points of the Gauss-Legendre rule. The force is smooth but for kinks where the
-            speed changes its sign along the beam.
+            Number of points of the Gauss-Legendre rule. The force is smooth except for kinks where
+            the speed changes its sign along the beam.
         """
         node, weight = np.polynomial.legendre.leggauss(points)
         x = 0.5 * (node + 1)
@@ -67,13 +67,13 @@ class DragGrid:
 
     @property
     def to_modes(self) -> Real:
-        """From force per metre at the points to that of each mode, shape (n, g), dimensionless."""
+        """Matrix from force per metre at the points to modal forces, (n, g), dimensionless."""
         length_m = self.weight_m.sum()
-        shares: Real = self.shapes * self.weight_m / length_m
-        return shares
+        projection: Real = self.shapes * self.weight_m / length_m
+        return projection
 
     @property
     def to_moment(self) -> Real:
-        """From force per metre at the points to its moment about the axis, shape (g,), in m²."""
+        """Row from force per metre at the points to its moment about the axis, (g,), in m²."""
         moment: Real = self.x_m * self.weight_m
         return moment

@@ -1,20 +1,19 @@
 """Deflection of the beam from the measured motor angle, computed while it moves.
 
-What turns with the motor sees the beam bend by ``w(x) = y(x) - x theta``, clamped at the axis. The
-modes of the undamped clamped–free beam, which fractional damping does not couple, give it exactly::
+In a frame that turns with the motor the beam bends by ``w(x) = y(x) - x theta``, clamped at the
+axis. The modes of the undamped clamped–free beam, which fractional damping does not couple, give::
 
     w(x) = -sum_i b_i phi_i(x) H_i theta,   H_i = P / (Q k_i⁴ + P),   b_i = ∫ x phi_i dx / L
 
-with P, Q and k_i of `rigd.beam._modes`. H_i passes high frequencies and blocks a standing angle, so
-samples of the angle are all it needs: nothing is differentiated, and the encoder's noise comes out
-no greater than it went in, but for what it shakes a mode.
+with P, Q and k_i of `rigd.beam._modes`. H_i passes high frequencies and blocks a constant angle, so
+samples of the angle suffice: nothing is differentiated, and the encoder's noise is not amplified,
+except at the modes.
 
-Each H_i is a sum over poles. The two of its mode, with their exact residues, are all of it for
-damping of first order; the branch cut that fractional orders add is stood for by a fixed ladder of
-real poles, fitted. Every pole is discretised by impulse invariance, with a direct term that puts
-the zero at standstill where it belongs: for a sinusoid of frequency omega that is right to
-``(omega / rate)⁴ / 720``, where straight lines from sample to sample would cost
-``(omega / rate)² / 12``.
+Each H_i is a sum over poles. For damping of first order it consists of the two poles of its mode,
+with their exact residues; a fitted ladder of fixed real poles approximates the branch cut of
+fractional orders. Every pole is discretised by impulse invariance, with a direct term that gives a
+zero at standstill: for a sinusoid of frequency omega the error is ``(omega / rate)⁴ / 720``,
+compared with ``(omega / rate)² / 12`` for linear interpolation between samples.
 """
 
 import numpy as np
@@ -27,25 +26,25 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _CHUNK = 256
-"""Samples taken in at once: a table of this many powers of each pole is kept."""
+"""Samples processed at once: a table of this many powers of each pole is stored."""
 
 _HIGHEST = 0.5
-"""Fastest mode that is followed, as a share of the sampling rate: a faster one would be
-mistaken for a slower one."""
+"""Fastest mode in use, as a fraction of the sampling rate: a faster one would be aliased to a
+slower one."""
 
 _LADDER = 10
 """Real poles for the branch cut, from `_SLOWEST_RAD_S` to the sampling rate: two a decade."""
 _SLOWEST_RAD_S = 0.03
 _FIT_FROM_HZ = 0.05
 _FIT_TO = 0.1
-"""End of the ladder's fit, as a share of the sampling rate."""
+"""End of the ladder's fit, as a fraction of the sampling rate."""
 _SMALL = 0.01
-"""Size of H below which the fit's absolute error counts and not the relative one: deflections of a
-hundredth of the rigid motion."""
+"""Size of H below which the fit's absolute, not relative, error counts: deflections of a hundredth
+of the rigid motion."""
 
 
 class DeflectionFilter:
-    """Deflection of the beam, relative to the line that its root points along.
+    """Deflection of the beam, relative to the tangent at its root.
 
     Parameters
     ----------
@@ -54,15 +53,15 @@ class DeflectionFilter:
     rate_hz
         Samples of the angle a second.
     modes
-        How many are followed one by one; those too fast for the sampling rate are not. One more
-        stands for all the others, as far as they follow without inertia of their own.
+        Number of separate modes, without those too fast for the sampling rate. One more
+        represents all others, approximated without inertia of their own.
     points
-        Along the beam.
+        Number of points along the beam.
 
     Attributes
     ----------
     x_m
-        Where the deflection is told, shape (points,), in m from the motor's axis: 0 … length.
+        Positions of the deflection, shape (points,), in m from the motor's axis: 0 … length.
 
     Notes
     -----
@@ -87,14 +86,14 @@ class DeflectionFilter:
 
         ladder = _ladder(damping, rate_hz)
         step: Complex = np.exp(np.concatenate([pairs.ravel(), ladder]) / rate_hz)
-        # Row per mode, column per pole: share of the pole in the mode.
+        # Row per mode, column per pole: weight of the pole in the mode.
         weights = np.zeros((z.size, step.size), dtype=np.complex128)
         for i, residues in enumerate(_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
         if ladder.size:
             weights[:, pairs.size :] = _cut(z, beam, damping, rate_hz, step, weights)
 
-        # Powers of the poles, the highest first: what each sample of a chunk leaves at its end.
+        # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
         self._powers: Complex = step[:, None] ** np.arange(_CHUNK, -1, -1)
         self._shapes: Complex = -_shapes(beam, self.x_m / beam.length_m, z) @ weights
         self._direct: Real = -(self._shapes @ _standing(step)).real
@@ -102,9 +101,9 @@ class DeflectionFilter:
         self._rest_rad: float | None = None
 
     def feed(self, angle_rad: Real) -> Real:
-        """Take samples of the motor's angle, at the sampling rate and without gaps.
+        """Process samples of the motor's angle, at the sampling rate and without gaps.
 
-        Before the first one, the beam is taken to have been at rest there.
+        The beam is assumed to be at rest before the first one.
 
         Parameters
         ----------
@@ -130,12 +129,12 @@ class DeflectionFilter:
 def _followed(pairs: Complex, rate_hz: float) -> int:
     """Return the number of modes, from the first on, with poles slow enough for the rate."""
     slow = np.abs(pairs[:, 0].imag) < 2 * np.pi * _HIGHEST * rate_hz
-    told = slow & ~np.isnan(pairs[:, 0])
-    return told.size if told.all() else int(np.argmin(told))
+    usable = slow & ~np.isnan(pairs[:, 0])
+    return usable.size if usable.all() else int(np.argmin(usable))
 
 
 def _ladder(damping: Damping, rate_hz: float) -> Real:
-    """Real poles in rad/s that stand for the branch cut; none if there is no cut."""
+    """Return real poles in rad/s for the branch cut; none if there is no cut."""
     internal_integer = damping.zeta == 0 or damping.alpha in (0, 1)
     external_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
     if internal_integer and external_integer:
@@ -145,13 +144,13 @@ def _ladder(damping: Damping, rate_hz: float) -> Real:
 
 
 def _standing(step: Complex) -> Complex:
-    """State that a standing angle of 1 leaves in the discrete poles."""
+    """Return the state of the discrete poles for a constant angle of 1."""
     state: Complex = 1 / (1 - step)
     return state
 
 
 def _loads(s: Complex, z: Real, beam: Beam, damping: Damping) -> tuple[Complex, Complex, Complex]:
-    """P and ``Q k⁴`` of the modes, both over EI, and ``s d/ds`` of their sum."""
+    """Return P and ``Q k⁴`` of the modes, both over EI, and ``s d/ds`` of their sum."""
     inertial = beam.density_over_stiffness * s * s
     external = damping.gamma * s**damping.lambda_
     internal = damping.zeta * s**damping.alpha
@@ -161,7 +160,7 @@ def _loads(s: Complex, z: Real, beam: Beam, damping: Damping) -> tuple[Complex, 
 
 
 def _residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
-    """Residues of H_i at its mode's poles, shape (modes, 2), in rad/s."""
+    """Return residues of H_i at its mode's poles, shape (modes, 2), in rad/s."""
     load, _, slope = _loads(pairs, z[:, None], beam, damping)
     residues: Complex = load * pairs / slope
     return residues
@@ -170,7 +169,7 @@ def _residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
 def _cut(
     z: Real, beam: Beam, damping: Damping, rate_hz: float, step: Complex, weights: Complex
 ) -> Real:
-    """Weights of the ladder (the last of the poles) in each mode: what the pairs leave of H_i."""
+    """Fit the weights of the ladder (the last poles) in each mode to the residual of the pairs."""
     frequency_hz = np.geomspace(_FIT_FROM_HZ, max(_FIT_TO * rate_hz, 2 * _FIT_FROM_HZ), 200)
     s = 2j * np.pi * frequency_hz[:, None]
     load, spring, _ = _loads(s, z, beam, damping)
@@ -189,16 +188,16 @@ def _cut(
 
 
 def _shapes(beam: Beam, x: Real, z: Real) -> Real:
-    """``b_i phi_i`` at x = 0…1 for the modes that are followed, shape (x.size, z.size), in m.
+    """Return ``b_i phi_i`` at x = 0…1 for the used modes, shape (x.size, z.size), in m.
 
-    The last one stands for all that come after it too, by what they add to it at low frequency:
-    the ``b_i phi_i / k_i⁴`` of all modes add up to the bend under a load that grows like x.
+    The last one includes all later modes by their low-frequency sum: the ``b_i phi_i / k_i⁴`` of
+    all modes add up to the bend under a load that grows like x.
     """
     numbers = np.arange(1, z.size + 1)
-    shares = 2 * (-1.0) ** (numbers - 1) / z**2
+    factors = 2 * (-1.0) ** (numbers - 1) / z**2
     shapes = np.zeros((x.size, z.size))
-    for i, share in enumerate(shares):
-        shapes[:, i] = share * mode_shape(i + 1, x)
+    for i, factor in enumerate(factors):
+        shapes[:, i] = factor * mode_shape(i + 1, x)
     if z.size:
         under_load = x**2 * (x**3 - 10 * x + 20) / 120
         shapes[:, -1] = z[-1] ** 4 * (under_load - shapes[:, :-1] @ z[:-1] ** -4.0)

@@ -1,9 +1,9 @@
 """State-space realisation of the beam under forces at points, its root held.
 
-The response to a force is that of the modes, whose pairs of poles and residues are exact. What they
-leave is smooth: the static share of the modes that are left out, the branch cut of the fractional
-orders, and modes so heavily damped that they do not oscillate. A ladder of real poles and a direct
-term stand for it, fitted to the exact response (`PointForceGrid`) by linear least squares.
+The response to a force is that of the modes, whose pairs of poles and residues are exact. The
+remainder is smooth: the static part of the omitted modes, the branch cut of the fractional orders,
+and overdamped modes. A ladder of real poles and a direct term, fitted to the exact response
+(`PointForceGrid`) by linear least squares, approximates it.
 """
 
 from dataclasses import dataclass
@@ -22,64 +22,64 @@ Complex = NDArray[np.complexfloating]
 
 _MOST_MODES = 80
 _HEAVY_DAMPING = 0.9
-"""Damping ratio from which a mode is left to the ladder: its poles lie on the cut, or near it."""
+"""Damping ratio from which the ladder represents a mode: its poles lie on the cut, or near it."""
 _LIGHT_DAMPING = 0.3
 _SLOWEST_RAD_S = 0.03
 _PER_DECADE = 5
 _MODES_BEYOND = 2.0
-"""Modes up to this multiple of the highest frequency that matters are followed, so that those left
-out are static below it."""
+"""Modes up to this multiple of the highest frequency of interest are included, so that the omitted
+ones are static below it."""
 _LADDER_BEYOND = 10.0
 _TAIL_BEYOND = 30.0
 _TAIL_WEIGHT = 1e-2
-"""Weight of the fit beyond the highest frequency, on a line halfway between the axes, where no mode
-that is left out resonates: it keeps the response small where nothing else does."""
+"""Weight of the fit beyond the highest frequency, on a line halfway between the axes, where no
+omitted mode resonates: it bounds the response there."""
 _POINTS_PER_DECADE = 40
 _SMALL = 0.01
-"""Torque per force over the lever arm, and shear per force, below which the absolute error of the
-fit counts and not the relative one."""
+"""Torque per force over the lever arm, and shear per force, below which the absolute, not relative,
+error of the fit counts."""
 _RCOND = 1e-11
 _HIGHEST_ORDER = 1.5
-"""Up to it the displacements of 580 random beams were right to 0.6 %, beyond it not always."""
+"""For orders up to it the displacements of 580 random beams were right to 0.6 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceRealisation:
-    """State space ``x' = a x + b F`` of a force at a point, and what follows from it.
+    """State space ``x' = a x + b F`` of a force at a point, and its outputs.
 
-    A force at another point has the same `a` and `b`, and rows of its own.
+    A force at another point has the same `a` and `b`, but other rows.
     """
 
     a: Real
     """(n, n) in 1/s: 2 × 2 blocks of the modes, then the real poles. Of two realisations of a beam
-    the one that goes to a higher frequency has the poles of the other, and more of both."""
+    the one up to a higher frequency has the poles of the other, and more of both."""
     modes: int
     """Number of modes."""
     b: Real
     """(n,)."""
     rows: Real
-    """(outputs, n): displacement at each point told (m), torque (N·m) and shear (N) of the motor on
-    the beam."""
+    """(outputs, n): displacement at each output point (m), torque (N·m) and shear (N) of the motor
+    on the beam."""
     direct: Real
-    """(outputs,), per N of the force: what follows it at once."""
+    """(outputs,), per N of the force: direct term."""
 
 
 def realise_force(
-    beam: Beam, damping: Damping, force_at_m: float, told_at_m: Real, highest_rad_s: float
+    beam: Beam, damping: Damping, force_at_m: float, output_at_m: Real, highest_rad_s: float
 ) -> ForceRealisation:
-    """Realise the response to a force on the beam.
+    """Return a state-space realisation of the response to a force on the beam.
 
     Parameters
     ----------
     beam, damping
         Parameters of the exact model.
     force_at_m
-        Where the force acts, as a distance from the motor's axis.
-    told_at_m
-        Where the displacement is told, shape (points,).
+        Position of the force, as a distance from the motor's axis.
+    output_at_m
+        Positions of the displacements, shape (points,).
     highest_rad_s
-        Angular frequency up to which the response has to be right, but for beams with more than
-        80 modes below twice that.
+        Angular frequency up to which the response is accurate, except for beams with more than 80
+        modes below twice that.
 
     Raises
     ------
@@ -97,10 +97,10 @@ def realise_force(
     [ 0.797 -0.6   -1.   ]
     """
     check_order(damping)
-    x = np.append(told_at_m, force_at_m) / beam.length_m
+    x = np.append(output_at_m, force_at_m) / beam.length_m
     poles, residues = _modal(beam, damping, x, highest_rad_s)
     if poles.size == _MOST_MODES and -poles[-1].real < _LIGHT_DAMPING * np.abs(poles[-1]):
-        # The next modes resonate and are not followed.
+        # The next modes resonate and are not included.
         highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_BEYOND)
 
     low, high = _SLOWEST_RAD_S / 300, highest_rad_s
@@ -112,15 +112,15 @@ def realise_force(
     grid = PointForceGrid(s, beam, damping)
     exact = np.column_stack(
         [
-            grid.per_force(told_at_m, np.full_like(told_at_m, force_at_m)),
+            grid.per_force(output_at_m, np.full_like(output_at_m, force_at_m)),
             grid.torque_per_force(force_at_m),
             grid.shear_per_force(force_at_m),
         ]
     )
-    # The same poles for each highest frequency, as far as they go.
+    # The same poles for each highest frequency, up to it.
     rungs = ceil(_PER_DECADE * np.log10(_LADDER_BEYOND * high / _SLOWEST_RAD_S)) + 1
     ladder = -_SLOWEST_RAD_S * 10 ** (np.arange(rungs) / _PER_DECADE)
-    # A ladder's response to a held force is 1, so that no pole is lost to the cut-off.
+    # A ladder's response to a held force is 1, so that the cut-off loses no pole.
     columns = np.column_stack([-ladder / (s[:, None] - ladder), np.ones_like(s)])
     modal = _of_pairs(s, poles, residues)
     weights = emphasis[:, None] / np.column_stack(
@@ -152,14 +152,14 @@ def realise_force(
     a[real, real] = ladder
     b[real] = -ladder
     rows = np.empty((exact.shape[1], n))
-    # The first of a pair's states is the real part of z, the second less its imaginary part.
+    # The first of a pair's states is the real part of z, the second minus its imaginary part.
     rows[:, even], rows[:, even + 1] = 2 * residues.real, 2 * residues.imag
     rows[:, pairs:] = fitted[:, :-1]
     return ForceRealisation(a, poles.size, b, rows, fitted[:, -1])
 
 
 def check_order(damping: Damping) -> None:
-    """Refuse damping with which no force at a point can be realised.
+    """Raise if no force at a point can be realised with the damping.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def check_order(damping: Damping) -> None:
 
 
 def _modal(beam: Beam, damping: Damping, x: Real, highest_rad_s: float) -> tuple[Complex, Complex]:
-    """Poles of the modes that oscillate, and the residues of all outputs, shape (outputs, modes).
+    """Return the poles of the oscillating modes, and the residues of all outputs (outputs, modes).
 
     `x` are the points over the length, that of the force last.
     """
@@ -211,14 +211,14 @@ def _modal(beam: Beam, damping: Damping, x: Real, highest_rad_s: float) -> tuple
 
 
 def _of_pairs(s: Complex, poles: Complex, residues: Complex) -> Complex:
-    """Response of the pairs, shape (s, outputs)."""
+    """Return the response of the pairs, shape (s, outputs)."""
     upper, lower = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
     response: Complex = upper @ residues.T + lower @ residues.conj().T
     return response
 
 
 def _unbounded(s: Complex, beam: Beam, damping: Damping) -> Real:
-    """Size of the response of a beam without ends at the force, in m/N."""
+    """Return the size of the response of a beam without ends at the force, in m/N."""
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     load = beam.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
     load = load * beam.bending_stiffness_n_m2

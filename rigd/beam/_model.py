@@ -14,8 +14,8 @@ cancels at low frequency and overflows at high frequency; two other forms are us
 
 Derivatives with respect to the parameters are computed along with G.
 
-The in-line formula of the paper for ``beta^4`` reads as if ``rho/EI`` multiplied the external
-damping too; the equation printed before it, the definition of gamma and Table 4 say otherwise.
+The in-line formula of the paper for ``beta^4`` seems to multiply the external damping by ``rho/EI``
+too; the equation printed before it, the definition of gamma and Table 4 contradict that.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class Beam:
 
     @property
     def density_over_stiffness(self) -> float:
-        """``rho / (E I)`` in s²/m⁴: what the natural frequencies depend on."""
+        """``rho / (E I)`` in s²/m⁴, which determines the natural frequencies."""
         return self.density_kg_per_m / self.bending_stiffness_n_m2
 
     @property
@@ -71,8 +71,8 @@ class Damping:
 
     Notes
     -----
-    Orders lie in (0, 2). Zero is let through because the paper's Table 2 writes it, with a zero
-    coefficient, for a damping that is absent.
+    Orders lie in (0, 2). Zero is allowed because the paper's Table 2 uses it, with a zero
+    coefficient, for an absent damping.
     """
 
     zeta: Annotated[float, Ge(0), Le(1)] = 0.0
@@ -88,11 +88,11 @@ class Damping:
 # Transfer function
 
 PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
-"""What G may be differentiated with respect to; each derivative holds the other five constant."""
+"""Parameters of the derivatives of G; each derivative holds the other five constant."""
 
 _BLOCK = 2048
-"""Points evaluated at once: temporaries that stay in cache and below malloc's trimming threshold
-make 8000 points twice as fast."""
+"""Points evaluated at once: temporaries that fit into the cache and below malloc's trimming
+threshold make 8000 points twice as fast."""
 
 _SERIES_LIMIT = 40.0
 _N = np.array([4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)])
@@ -102,7 +102,7 @@ _DD = _D[1:] * np.arange(1.0, 10.0)
 
 
 class TransferGrid:
-    """Eq. 25 on one grid of s; what does not depend on the parameters is computed once.
+    """Eq. 25 on one grid of s; parts that do not depend on the parameters are computed once.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class TransferGrid:
         self._parts = [slice(i, i + _BLOCK) for i in range(0, points.size, _BLOCK)]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
-        """Coupling torque per motor angle, G(s) in N·m/rad, of the grid's shape.
+        """Return the coupling torque per motor angle, G(s) in N·m/rad, in the grid's shape.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class TransferGrid:
     def evaluate_with_gradient(
         self, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
     ) -> tuple[Complex, Complex]:
-        """G and its derivatives with respect to the parameters named in `wrt`.
+        """Return G and its derivatives with respect to the parameters in `wrt`.
 
         Parameters
         ----------
@@ -220,7 +220,7 @@ class TransferGrid:
 
 
 def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
-    """Coupling torque per motor angle (Eq. 25 of the paper).
+    """Return the coupling torque per motor angle (Eq. 25 of the paper).
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
 ) -> tuple[Complex, Complex]:
-    """G(s) and its derivatives with respect to parameters.
+    """Return G(s) and its derivatives with respect to parameters.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def transfer_and_gradient(
 
 
 def _polynomial(coefficients: Real, x: Complex) -> Complex:
-    """Horner's rule, lowest power first."""
+    """Evaluate a polynomial by Horner's rule, lowest power first."""
     total = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total *= x
@@ -300,7 +300,7 @@ def _polynomial(coefficients: Real, x: Complex) -> Complex:
 
 
 def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
-    """F and ``2 z² S``, S = sin z sinh z / (1 + cos z cosh z), from decaying exponentials only."""
+    """Return F and ``2 z² sin z sinh z / (1 + cos z cosh z)`` from decaying exponentials."""
     below = np.flatnonzero(q.imag < 0)
     z_squared = _root_in_first_quadrant(q.real, np.abs(q.imag))
     z = _root_in_first_quadrant(z_squared.real, z_squared.imag)
@@ -318,14 +318,14 @@ def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
     s = (even - sum_) * 2j
     s *= z_squared
     s *= reciprocal
-    # F and S are real functions of q: what was computed for Im q >= 0 serves the other half.
+    # F and S are real functions of q: the values for Im q >= 0 give the other half.
     f[below] = f[below].conj()
     s[below] = s[below].conj()
     return f, s
 
 
 def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
-    """Square root for ``imag >= 0``; as accurate as numpy's and three times as fast."""
+    """Return the square root for ``imag >= 0``; as accurate as numpy's and three times as fast."""
     root = np.empty(real.shape, dtype=np.complex128)
     root.real, root.imag = real, imag
     larger = np.sqrt(0.5 * (np.abs(root) + np.abs(real)))
@@ -337,7 +337,7 @@ def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
 
 
 def _f(q: Complex) -> Complex:
-    """F(q)."""
+    """Return F(q)."""
     f = np.empty_like(q)
     series = np.abs(q) < _SERIES_LIMIT
     if series.any():
@@ -349,7 +349,7 @@ def _f(q: Complex) -> Complex:
 
 
 def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
-    """F, dF/dq and ``F - q dF/dq`` (which the series gives without the cancellation)."""
+    """Return F, dF/dq and ``F - q dF/dq`` (which the series gives without cancellation)."""
     f, slope, remainder = np.empty((3, q.size), dtype=np.complex128)
     series = np.abs(q) < _SERIES_LIMIT
     if series.any():

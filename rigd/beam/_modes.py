@@ -22,13 +22,13 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _HOMOTOPY_STEPS = (8, 64)
-"""Steps in which damping grows: few, and more for the beams where that loses a path."""
+"""Steps in which damping grows: few at first, more for beams where that loses a path."""
 
 CLOSE_BY = 0.05
-"""Relative distance up to which a root is the one that was expected: modes lie far more apart."""
+"""Relative distance up to which a root is the expected one: modes lie far more apart."""
 
 _ON_THE_CUT = 1e-9
-"""How far beyond pi an argument may be, by rounding, of a pole that is all but real."""
+"""Excess of an argument over pi, by rounding, for an almost real pole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Mode:
 
 
 def clamped_free_eigenvalues(n: int) -> Real:
-    """First `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,), to full precision.
+    """Return the first `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,).
 
     References
     ----------
@@ -79,7 +79,7 @@ def _eigenvalues(n: int) -> Real:
 
 
 def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
-    """First `n` natural frequencies of the beam without damping, shape (n,), in rad/s.
+    """Return the first `n` natural frequencies of the undamped beam, shape (n,), in rad/s.
 
     Parameters
     ----------
@@ -102,16 +102,16 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
 
 
 def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
-    """Shape of a mode (1, 2, …) at ``x / L`` in 0…1, with mean square 1 and 2 at the tip.
+    """Return the shape of a mode (1, 2, …) at ``x / L``, with mean square 1 and 2 at the tip.
 
-    Written without growing exponentials, so high modes are as accurate as low ones.
+    Computed without growing exponentials: high modes are as accurate as low ones.
 
     Parameters
     ----------
     number
-        From 1 on.
+        Number of the mode, from 1.
     x_over_length
-        Places along the beam, 0 (axis) to 1 (tip), of any shape.
+        Positions along the beam, 0 (axis) to 1 (tip), of any shape.
 
     References
     ----------
@@ -135,7 +135,7 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
 
 
 def mode_mean(n: int) -> Real:
-    """Mean of each of the first `n` mode shapes over the beam, shape (n,).
+    """Return the mean of each of the first `n` mode shapes over the beam, shape (n,).
 
     Parameters
     ----------
@@ -153,9 +153,9 @@ def mode_mean(n: int) -> Real:
 
 
 def root_shear_ratio(n: int) -> Real:
-    """Third over second derivative of each mode shape at the axis, over -k; shape (n,).
+    """Return third over second derivative of each mode shape at the axis, over -k; shape (n,).
 
-    There a mode of mean square 1 and wave number k has the curvature ``2 k² (-1)^(i - 1)``.
+    A mode of mean square 1 and wave number k has the curvature ``2 k² (-1)^(i - 1)`` there.
 
     Parameters
     ----------
@@ -176,10 +176,10 @@ def root_shear_ratio(n: int) -> Real:
 
 
 def participation(beam: Beam, n: int) -> Real:
-    """First `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
+    """Return the first `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
 
-    Times rho, a factor is the mode's share of the rigid beam's moment of inertia: all of them add
-    up to L³/3.
+    Times rho, a factor is the mode's part of the rigid beam's moment of inertia: the sum of all
+    factors is L³/3.
 
     Parameters
     ----------
@@ -192,8 +192,8 @@ def participation(beam: Beam, n: int) -> Real:
     --------
     >>> from rigd.beam import Beam, participation
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> share = participation(beam, 3) / (beam.length_m**3 / 3)
-    >>> print(share.round(4))
+    >>> fraction = participation(beam, 3) / (beam.length_m**3 / 3)
+    >>> print(fraction.round(4))
     [0.9707 0.0247 0.0032]
     """
     factors: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
@@ -201,10 +201,10 @@ def participation(beam: Beam, n: int) -> Real:
 
 
 def poles(beam: Beam, damping: Damping, n: int) -> Complex:
-    """Poles of the first `n` modes, shape (n, 2), in rad/s.
+    """Return the poles of the first `n` modes, shape (n, 2), in rad/s.
 
-    A row holds a conjugate pair (positive frequency first), or two real poles (slow one first)
-    where integer-order damping exceeds the critical one.
+    A row has a conjugate pair (positive frequency first), or two real poles (slow one first) where
+    integer-order damping exceeds the critical one.
 
     Parameters
     ----------
@@ -216,8 +216,8 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     Raises
     ------
     ArithmeticError
-        If a mode has no pole: damping so strong, with one order above 1 and the other below, that
-        it leaves the principal sheet.
+        If a mode has no pole on the principal sheet: damping is very strong, with one order above 1
+        and the other below.
 
     Examples
     --------
@@ -239,10 +239,10 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
 def poles_for_eigenvalues(
     z: Real, beam: Beam, damping: Damping, near_rad_s: Complex | None = None
 ) -> Complex:
-    """Both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as `poles` has them.
+    """Return both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as in `poles`.
 
-    With the roots of ``tan z = tanh z`` in place of the clamped–free eigenvalues these are the
-    zeros of G. A row is NaN if there is no root on the principal sheet.
+    With the roots of ``tan z = tanh z`` instead of the clamped–free eigenvalues these are the zeros
+    of G. A row is NaN if there is no root on the principal sheet.
 
     Parameters
     ----------
@@ -251,8 +251,8 @@ def poles_for_eigenvalues(
     beam, damping
         Parameters of the exact model.
     near_rad_s
-        Where the roots in the upper half plane are expected, shape (m,). If all lie as close as
-        `CLOSE_BY`, they are not followed from those of the undamped beam, at a tenth of the price.
+        Expected roots in the upper half plane, shape (m,). If all are within `CLOSE_BY`, the roots
+        are found from them, ten times faster than from those of the undamped beam.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
     damper = damping.gamma / beam.density_over_stiffness
@@ -292,7 +292,7 @@ def pole_gradient(
     beam, damping
         Parameters of the exact model.
     wrt
-        Names of `rigd.beam.PARAMETERS`; what does not move a pole gives 0.
+        Names of `rigd.beam.PARAMETERS`; those without effect on a pole give 0.
 
     Examples
     --------
@@ -323,7 +323,7 @@ def pole_gradient(
 
 
 def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
-    """First `n` modes of the beam; raises as `poles` does.
+    """Return the first `n` modes of the beam; raises as `poles` does.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
 
 
 def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
-    """Roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
+    """Return the roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
     half = -0.5 * rate
     first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
     second = first.conj()
@@ -369,7 +369,7 @@ def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
 
 
 def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps: int) -> Complex:
-    """Poles in the upper half plane, followed from the undamped ones while damping grows.
+    """Follow poles in the upper half plane from the undamped ones while damping grows.
 
     NaN where the path was lost or has left the principal sheet.
     """
@@ -381,9 +381,9 @@ def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps
 
 
 def _searched_poles(omega_squared: Real, damper: float, damping: Damping) -> Complex:
-    """Poles in the upper half plane from many starts, most of them near the cut.
+    """Search for poles in the upper half plane from many starts, most of them near the cut.
 
-    Near critical damping of a nearly first order, a pole turns along the cut so sharply that no
+    Near critical damping of almost first order a pole turns along the cut so sharply that no
     reasonable step follows it. NaN where no start leads to a pole on the principal sheet.
     """
     angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
@@ -403,12 +403,12 @@ def _newton(
     zeta: float,
     damping: Damping,
 ) -> Complex:
-    """Roots of the characteristic equation by Newton's method in ln s.
+    """Find roots of the characteristic equation by Newton's method in ln s.
 
-    There a pole moves almost linearly, and one that leaves the principal sheet shows as an argument
-    beyond pi. NaN where nothing was found, or not in the upper half of the principal sheet.
+    In ln s a pole moves almost linearly, and one off the principal sheet has an argument beyond pi.
+    NaN where no root is found in the upper half of the principal sheet.
     """
-    with np.errstate(all="ignore"):  # a start that leads nowhere overflows
+    with np.errstate(all="ignore"):  # a diverging start overflows
         for _ in range(40):
             inertial = np.exp(2 * log_s)
             external = damper * np.exp(damping.lambda_ * log_s)

@@ -1,4 +1,4 @@
-"""Beam that is turned at its root and pushed at a point: what a touch does to it.
+"""Response of the beam to an angle of its root and to a force at a point, as in a touch.
 
 The displacement ``y(x)`` from the line of angle zero obeys, in the Laplace domain::
 
@@ -7,7 +7,7 @@ The displacement ``y(x)`` from the line of angle zero obeys, in the Laplace doma
 with ``P = rho s² + c_v s^lambda`` and ``Q = EI (1 + zeta s^alpha)``. The motor holds the root by
 the torque ``-Q y''(0)`` and the base shear ``Q y'''(0)``, both as it exerts them on the beam.
 
-As for Eq. 25, one form would cancel at low and overflow at high frequency, and there are two, which
+As for Eq. 25, a single form would cancel at low and overflow at high frequency. Two are used, which
 meet at ``|q| = 40`` for ``q = -L⁴ P / Q``:
 
 * below, power series: with ``K_n(x) = sum_k (-P/Q)^k x^(4k+n) / (4k+n)!`` the solution is
@@ -36,7 +36,7 @@ Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
 _TERMS = 9
-"""Terms of the series: the first that is left out is below 40^9 / 36! = 7e-28."""
+"""Terms of the series: the first omitted one is below 40^9 / 36! = 7e-28."""
 
 
 class PointForceGrid:
@@ -75,7 +75,7 @@ class PointForceGrid:
         self._waves = _Waves(self._b4[self._high], beam.length_m)
 
     def per_angle(self, x_m: ArrayLike, order: int = 0) -> Complex:
-        """Displacement along the beam per angle of the root, or a derivative of it.
+        """Return the displacement along the beam per angle of the root, or its derivative.
 
         Parameters
         ----------
@@ -102,16 +102,16 @@ class PointForceGrid:
         return out.reshape((*self._shape, *x.shape))
 
     def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
-        """Displacement along the beam per force on it, the root held, or a derivative of it.
+        """Return the displacement along the beam per force on it, the root held, or its derivative.
 
         Parameters
         ----------
         x_m, force_at_m
-            Where it is told and where the force acts, as distances from the motor's axis; both are
-            broadcast against each other.
+            Positions of displacement and force, as distances from the motor's axis; broadcast
+            against each other.
         order
-            Order of the derivative with respect to `x_m`, 0 to 3; the third jumps at the force, and
-            is given on the root's side there.
+            Order of the derivative with respect to `x_m`, 0 to 3; the third jumps at the force,
+            where its value on the root's side is returned.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class PointForceGrid:
         Parameters
         ----------
         force_at_m
-            Where it acts.
+            Position of the force.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
         return -self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
@@ -157,7 +157,7 @@ class PointForceGrid:
         Parameters
         ----------
         force_at_m
-            Where it acts.
+            Position of the force.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
         return self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
@@ -166,13 +166,13 @@ class PointForceGrid:
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
     def _k(self, n: int) -> Complex:
-        """``K_n`` at the tip at the low points, shape (low, 1)."""
+        """Return ``K_n`` at the tip at the low points, shape (low, 1)."""
         return _series(self._b4[self._low, None], np.array([self._length_m]), n)
 
     def _root_curves(
         self, b4: Complex, tip_moment: Complex, tip_shear: Complex
     ) -> tuple[Complex, Complex]:
-        """y''(0) and y'''(0) that cancel second and third derivatives of the rest at the tip."""
+        """Return y''(0) and y'''(0) that cancel the other terms' derivatives at the tip."""
         k0, k1, k3 = self._k(0), self._k(1), self._k(3)
         determinant = k0 * k0 - b4 * k1 * k3
         moment: Complex = (k1 * tip_shear - k0 * tip_moment) / determinant
@@ -181,7 +181,7 @@ class PointForceGrid:
 
 
 def _series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
-    """``K_n`` or a derivative of it at the points x (m,) for b4 (s, 1); shape (s, m)."""
+    """Return ``K_n`` or its derivative at the points x (m,) for b4 (s, 1); shape (s, m)."""
     n -= order
     if n < 0:
         return b4 * _series(b4, x, n + 4)
@@ -220,11 +220,11 @@ class _Waves:
         self._inverse = np.linalg.inv(np.moveaxis(np.array(rows), -1, 0)).astype(np.complex128)
 
     def turned(self, x: Real, order: int) -> Complex:
-        """Per angle at x (m,), shape (s, m)."""
+        """Return the response per angle at x (m,), shape (s, m)."""
         return self._combined(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
 
     def pushed(self, x: Real, at: Real, order: int) -> Complex:
-        """Per force over Q at x (m,) for forces at `at` (m,), shape (s, m)."""
+        """Return the response per force over Q at x (m,) for forces at `at` (m,), shape (s, m)."""
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
         near = -1 / (4 * b**3)  # A, of the decaying wave
         far = -near / kappa  # B, of the other

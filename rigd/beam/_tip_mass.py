@@ -1,21 +1,21 @@
-"""Transfer function of the beam with a tip mass, an elastic clamp, or modes of their own stiffness.
+"""Transfer function of the beam with a tip mass, an elastic clamp, or modal stiffness offsets.
 
 With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``q = z⁴ = -L⁴ p / c`` and the
-share ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`` turns Eq. 25 into::
+mass ratio ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`` turns Eq. 25 into::
 
     G = -(EI/L) c (F + mu U) / (1 - mu F),    U = 2 z² sin z sinh z / (1 + cos z cosh z)
 
-F as in `rigd.beam._model`. A clamp that turns by kappa for a torque on the beam's root
-makes ``G / (1 + kappa G)`` of it.
+F as in `rigd.beam._model`. A clamp that turns by kappa per torque on the beam's root turns it into
+``G / (1 + kappa G)``.
 
 F and U are functions of q alone; ``q d/dq`` of them needs one more, ``B = z (cos z sinh z +
 sin z cosh z) / (1 + cos z cosh z)``::
 
     q F' = (F + U + F²) / 4,    q U' = U/2 + z² B/2 + U F/4
 
-A link that is not quite uniform has modes whose stiffness k⁴ differs from the uniform beam's by the
-share d. Mode i of the sum that G is (`rigd.beam._modes`) is then replaced by adding, with a² its
-participation::
+In a beam that is not quite uniform the stiffness k⁴ of a mode differs from the uniform beam's by
+the relative offset d. The following term then replaces mode i of the sum G (`rigd.beam._modes`),
+with its participation a²::
 
     G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
 """
@@ -51,26 +51,26 @@ _SERIES[0, 0] += 1.0
 """Power series in q of ``1 + cos z cosh z`` and of the numerators of F, U and z² B over q."""
 
 _HOMOTOPY_STEPS = 12
-_SHARE_A_STEP = 0.02
+_CHANGE_PER_STEP = 0.02
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-10
 """Relative length of Newton's last step: the error is of the order of its square."""
 _CLOSELY = 1e-6
-"""The same from close by, where convergence is quadratic from the first step on."""
+"""The same for close starts, where convergence is quadratic from the first step on."""
 _NEARLY = 1e-4
-"""The same on the way to the whole mass."""
+"""The same during the increase to the whole mass."""
 _FARTHEST = 10.0
-"""By how much a pole may move in one step of the way to the whole mass."""
+"""Largest movement of a pole in one step of the increase to the whole mass."""
 _ASIDE = 1e-7
 _NEXT_TO_POLE = 1e-8
-"""Relative distance from a pole: the root of what rounding leaves of G's size there."""
+"""Relative distance from a pole: the square root of the rounding error relative to G there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedResponse:
-    """G of the beam with a tip mass, and what it changes by.
+    """G of the beam with a tip mass, and its derivatives.
 
-    All of the shape of s; c, p and the mass are varied one at a time, EI and the length held.
+    All of the shape of s; c, p and the mass vary one at a time, with fixed EI and length.
     """
 
     response: Complex
@@ -101,17 +101,17 @@ def loaded_response(
     stiffness, length = beam.bending_stiffness_n_m2, beam.length_m
     f, u, f_slope, u_slope = _functions(-(length**4) * inertial / elastic)
     per_mass = s_squared / (length * stiffness * inertial)
-    share = tip_mass_kg * per_mass
-    inverse = 1 / (1 - share * f)
-    loaded = (f + share * u) * inverse
-    by_share = (u + loaded * f) * inverse
-    slope = (f_slope + share * u_slope + share * loaded * f_slope) * inverse
+    mass_ratio = tip_mass_kg * per_mass
+    inverse = 1 / (1 - mass_ratio * f)
+    loaded = (f + mass_ratio * u) * inverse
+    by_ratio = (u + loaded * f) * inverse
+    slope = (f_slope + mass_ratio * u_slope + mass_ratio * loaded * f_slope) * inverse
     per_length = -stiffness / length
     return LoadedResponse(
         response=per_length * elastic * loaded,
         by_elastic=per_length * (loaded - slope),
-        by_inertial=per_length * elastic / inertial * (slope - share * by_share),
-        by_mass=per_length * elastic * per_mass * by_share,
+        by_inertial=per_length * elastic / inertial * (slope - mass_ratio * by_ratio),
+        by_mass=per_length * elastic * per_mass * by_ratio,
     )
 
 
@@ -122,7 +122,7 @@ def _with_offsets(
     beam: Beam,
     stiffness_offsets: tuple[float, ...],
 ) -> LoadedResponse:
-    """Give modes 2, 3, … of a beam on a rigid clamp a stiffness of their own."""
+    """Give modes 2, 3, … of a beam on a rigid clamp their stiffness offsets."""
     length, stiffness = beam.length_m, beam.bending_stiffness_n_m2
     total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic)), dtype=np.complex128)
     z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
@@ -143,7 +143,7 @@ def _with_offsets(
 
 
 Slopes = dict[str, Callable[[], Complex]]
-"""Derivatives of a response by the names of parameters, each computed when it is asked for."""
+"""Derivatives of a response by the names of parameters, each computed on demand."""
 
 
 def differentiated_response(
@@ -154,7 +154,7 @@ def differentiated_response(
     tip_mass_kg: float,
     stiffness_offsets: tuple[float, ...] = (),
 ) -> tuple[LoadedResponse, Slopes]:
-    """Evaluate G with a tip mass on a rigid clamp, to be differentiated by any parameter.
+    """Return G with a tip mass on a rigid clamp, and its derivatives by any parameter.
 
     Parameters
     ----------
@@ -165,13 +165,13 @@ def differentiated_response(
     tip_mass_kg
         Point mass at the tip.
     stiffness_offsets
-        As `LoadedBeam` has them, held.
+        As in `LoadedBeam`, fixed.
 
     Returns
     -------
     response : LoadedResponse
     slopes : dict of str to callable
-        By `rigd.beam.PARAMETERS` but for the length, and by ``tip_mass_kg``.
+        By `rigd.beam.PARAMETERS` except the length, and by ``tip_mass_kg``.
     """
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
@@ -193,7 +193,7 @@ def differentiated_response(
 
 @dataclass(frozen=True, slots=True)
 class LoadedBeam:
-    """Beam with a tip mass on an elastic clamp, uniform or with modes of their own stiffness.
+    """Beam with a tip mass on an elastic clamp, uniform or with modal stiffness offsets.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ class LoadedBeam:
         )
 
     def with_frequencies(self, frequency_hz: Sequence[float]) -> "LoadedBeam":
-        """Give the bare beam the frequencies of some modes, each by a stiffness of its own.
+        """Return the beam with given frequencies of some modes, by a stiffness offset for each.
 
         Parameters
         ----------
@@ -255,12 +255,12 @@ class LoadedBeam:
         return found
 
     def transfer(self, s: Complex) -> Complex:
-        """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
+        """Return the coupling torque per motor angle in N·m/rad, in the shape of `s` (not 0)."""
         response = self.at(s).response
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
     def transfer_and_gradient(self, s: Complex, wrt: Sequence[str]) -> tuple[Complex, Complex]:
-        """Differentiate the same with respect to parameters.
+        """Return the transfer function and its derivatives with respect to parameters.
 
         Parameters
         ----------
@@ -275,22 +275,22 @@ class LoadedBeam:
         gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
         """
         at, by = self._differentiated(s)
-        share = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
+        factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
         gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
-        return at.response * share, gradient * share * share
+        return at.response * factor, gradient * factor * factor
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
         """Differentiate poles with respect to parameters; shape (n, len(wrt)).
 
-        As those of roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is infinite,
-        but next to it the ratios of its derivatives are already as they should be.
+        Computed as for roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is
+        infinite, but close to it the ratios of its derivatives are accurate.
 
         Parameters
         ----------
         poles_rad_s : ndarray of complex, shape (n,)
             Poles, as of `poles`.
         wrt
-            Names as of `transfer_and_gradient`; what does not move a pole gives 0.
+            Names as of `transfer_and_gradient`; those without effect on a pole give 0.
         """
         aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
         s = poles_rad_s * (1 - aside)
@@ -303,12 +303,12 @@ class LoadedBeam:
         return moved
 
     def _uniform(self) -> None:
-        """Refuse what only a uniform beam defines."""
+        """Raise if the beam is not uniform."""
         if any(self.stiffness_offsets):
             raise ValueError("Of modes of their own stiffness the shear is not known.")
 
     def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
-        """Give `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
+        """Return `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
         at, by = differentiated_response(
             np.log(s),
             s * s,
@@ -320,11 +320,11 @@ class LoadedBeam:
         return at, by | {"root_compliance_rad_per_nm": lambda: -at.response * at.response}
 
     def tip_slope(self, s: Complex) -> Complex:
-        """Slope of the tip against the root per motor angle, of the shape of `s`."""
+        """Return the slope of the tip against the root per motor angle, in the shape of `s`."""
         return self.tip_response(s)[1]
 
     def tip_response(self, s: Complex) -> tuple[Complex, Complex]:
-        """Displacement (m/rad) and slope of the tip per motor angle, against the root's line.
+        """Return displacement (m/rad) and slope of the tip per motor angle, relative to the root.
 
         Parameters
         ----------
@@ -336,13 +336,13 @@ class LoadedBeam:
         elastic, inertial = self.factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
-        for place, offset in enumerate(self.stiffness_offsets, start=1):
-            # Mode i takes part by -p b / (c k⁴ (1 + d) + p); of a rigid turn b is its share.
-            k4, turn = (z[place] / tip) ** 4, 2 * (-1) ** place * tip / z[place] ** 2
+        for index, offset in enumerate(self.stiffness_offsets, start=1):
+            # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
+            k4, turn = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
             more = inertial * turn * elastic * k4 * offset
             more = more / ((elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial))
             displacement = displacement + 2 * more
-            slope = slope + tip_slopes[place] * more
+            slope = slope + tip_slopes[index] * more
         if self.tip_mass_kg:
             push = self._push(s, grid)
             displacement = displacement + grid.per_force(tip, tip) * push
@@ -351,13 +351,13 @@ class LoadedBeam:
         return displacement * root, slope * root
 
     def _push(self, s: Complex, grid: PointForceGrid) -> Complex:
-        """Force on the tip, per angle of the root, of what accelerates the mass there."""
+        """Return the force on the tip, per angle of the root, that accelerates the tip mass."""
         tip, load = self.beam.length_m, self.tip_mass_kg * s * s
         push: Complex = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
         return push
 
     def shear(self, s: Complex) -> Complex:
-        """Force of the motor on the beam per motor angle in N/rad, of the shape of `s`."""
+        """Return the motor's force on the beam per motor angle in N/rad, in the shape of `s`."""
         self._uniform()
         grid = PointForceGrid(s, self.beam, self.damping)
         shear = grid.shear_per_angle()
@@ -368,7 +368,7 @@ class LoadedBeam:
         return shear
 
     def at(self, s: Complex) -> LoadedResponse:
-        """Give what the clamp, were it rigid, would have to exert, with its derivatives."""
+        """Return the torque for a rigid clamp, with its derivatives."""
         elastic, inertial = self.factors(s)
         found = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
         if not any(self.stiffness_offsets):
@@ -376,7 +376,7 @@ class LoadedBeam:
         return _with_offsets(found, elastic, inertial, self.beam, self.stiffness_offsets)
 
     def residues(self, poles_rad_s: Complex) -> Complex:
-        """Residues of the coupling torque per angular acceleration, ``G(s) / s²``, at poles of it.
+        """Return residues of the coupling torque per angular acceleration, ``G(s) / s²``, at poles.
 
         A mode whose pair of poles is p and its conjugate adds ``2 Re(r exp(p t))`` to the response
         to a unit change of the angular velocity.
@@ -391,7 +391,7 @@ class LoadedBeam:
         ndarray of complex, shape (n,)
             In N·m s.
         """
-        # On a rigid clamp G is infinite at a pole, but next to it the ratio is as it should be.
+        # On a rigid clamp G is infinite at a pole, but close to it the ratio is accurate.
         aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
         s = poles_rad_s * (1 - aside)
         at = self.at(s)
@@ -399,7 +399,7 @@ class LoadedBeam:
         return residues
 
     def factors(self, s: Complex) -> tuple[Complex, Complex]:
-        """Elastic factor c and inertial factor p."""
+        """Return elastic factor c and inertial factor p."""
         log_s, damping = np.log(s), self.damping
         elastic = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
         external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
@@ -425,9 +425,9 @@ class LoadedBeam:
         return by_log_s / s
 
     def poles(self, z: Real, near_rad_s: Complex | None = None) -> Complex:
-        """Both poles of each mode with the rig's shaft held, shape (len(z), 2), in rad/s.
+        """Return both poles of each mode with locked hub, shape (len(z), 2), in rad/s.
 
-        Followed from those of the bare beam on a rigid clamp while mass and compliance grow.
+        They are followed from those of the beam on a rigid clamp while mass and compliance grow.
 
         Parameters
         ----------
@@ -439,7 +439,7 @@ class LoadedBeam:
         Returns
         -------
         ndarray of complex
-            As `rigd.beam._modes.poles_for_eigenvalues` has them; NaN where a path was lost.
+            As of `rigd.beam._modes.poles_for_eigenvalues`; NaN where a path was lost.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
             found = self._newton(near_rad_s, _CLOSELY, zeros=False)
@@ -448,20 +448,20 @@ class LoadedBeam:
         return self._followed(z, zeros=False)
 
     def zeros(self, z: Real) -> Complex:
-        """Zeros of the response, in pairs as `poles` has them.
+        """Return the zeros of the response, in pairs as in `poles`.
 
         Parameters
         ----------
         z : ndarray
-            Roots of ``tan z = tanh z``: those of the bare beam.
+            Roots of ``tan z = tanh z``: those of the uniform beam.
         """
         return self._followed(z, zeros=True)
 
     def _followed(self, z: Real, *, zeros: bool) -> Complex:
-        """Follow poles or zeros from those of the bare beam."""
+        """Follow poles or zeros from those of the uniform beam."""
         offsets = np.array(self.stiffness_offsets)
         if not zeros and offsets.size:
-            # On a rigid clamp they are those of the stiffness k⁴ (1 + d), exactly.
+            # On a rigid clamp they are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
         found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
@@ -469,18 +469,18 @@ class LoadedBeam:
         if rigid and not (zeros and offsets.any()):
             return found
         known = ~np.isnan(found[:, 0])
-        # One of a conjugate pair will do; where the decay does not oscillate both have to be found.
+        # One of a conjugate pair suffices; without oscillation both have to be found.
         turning = found[known][:, 0].imag != 0
         others = found[known][~turning][:, 1]
         here = np.concatenate([found[known][:, 0], others])
         here *= 1 - _ASIDE  # G is infinite at an undamped pole
-        # As shares of the beam's own: what moves the poles by a few percent needs no small steps.
-        share = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
+        # Relative to the beam's own values: a change that moves the poles little needs few steps.
+        change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         turned = self.beam.bending_stiffness_n_m2 / self.beam.length_m
-        share = max(share, self.root_compliance_rad_per_nm * turned)
+        change = max(change, self.root_compliance_rad_per_nm * turned)
         if zeros:
-            share = max(share, float(np.abs(offsets).max(initial=0.0)))
-        steps = min(max(math.ceil(share / _SHARE_A_STEP), 2), _HOMOTOPY_STEPS)
+            change = max(change, float(np.abs(offsets).max(initial=0.0)))
+        steps = min(max(math.ceil(change / _CHANGE_PER_STEP), 2), _HOMOTOPY_STEPS)
         before = here
         for step in range(1, steps + 1):
             fraction = step / steps
@@ -501,16 +501,16 @@ class LoadedBeam:
         return found
 
     def _newton(self, s: Complex, converged: float, *, zeros: bool) -> Complex:
-        """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found.
+        """Find roots of ``1/G + kappa``, or of G, from close starts; NaN where none is found.
 
         Parameters
         ----------
         s
             Starts.
         converged
-            Relative length of a step that is the last one.
+            Relative length of the last step.
         zeros
-            Whether roots of G are looked for.
+            Whether roots of G are searched for.
         """
         start = s
         with np.errstate(all="ignore"):
@@ -529,7 +529,7 @@ class LoadedBeam:
 
 
 def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """F, U, q F' and q U'."""
+    """Return F, U, q F' and q U'."""
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
     series = np.abs(q) < _SERIES_LIMIT
@@ -545,8 +545,8 @@ def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
 
 
 def _scaled(q: Complex) -> tuple[Complex, Complex, Complex]:
-    """F, U and z² B from decaying exponentials only."""
-    # Real functions of q: what holds above the real axis, mirrored, holds below.
+    """Return F, U and z² B from decaying exponentials only."""
+    # Real functions of q: their values above the real axis, mirrored, are those below.
     below = q.imag < 0
     z = np.sqrt(np.sqrt(np.where(below, q.conj(), q)))
     decay, turn = np.exp(-z), np.exp(1j * z)

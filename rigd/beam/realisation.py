@@ -1,16 +1,16 @@
 """State-space realisations of the exact model: beam alone, and beam on a motor.
 
-A realisation is the finite-dimensional stand-in for Eq. 25 that can run in real time. The coupling
-torque per angular acceleration, ``G(s) / s²``, is approximated by poles and direct terms::
+A realisation is a finite-dimensional approximation of Eq. 25 that runs in real time. Poles and
+direct terms approximate the coupling torque per angular acceleration, ``G(s) / s²``::
 
     G(s) ≈ s² [ sum_i r_i / (s - p_i) + D ] + V s + K
 
-The poles are one complex pair per clamped–free mode, where the exact poles are, and a fixed ladder
+The poles are one complex pair per clamped–free mode, equal to the exact poles, and a fixed ladder
 of real poles for the branch cut of the fractional orders. Only the residues and the direct terms
-are fitted: one linear least-squares problem with relative errors as residuals. V and K are needed:
-the branch point at s = 0 makes G fall slower than s² there. D, V and K are kept from going negative
-and the fit has a faint tail beyond its band, because an approximation can be accurate in the band
-and still not be passive, and then motor and beam together are unstable.
+are fitted: one linear least-squares problem with relative errors as residuals. V and K are needed
+because the branch point at s = 0 makes G fall slower than s² there. D, V and K are constrained to
+be non-negative, and the fit has a small weight beyond its band: an approximation can be accurate in
+the band without being passive, and motor and beam together are then unstable.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ ERROR_BAND_HZ = (0.05, 100.0)
 """Band in which a realisation states its error: the paper's chirp and an octave above."""
 
 MAX_GROWTH_PER_S = 1e-2
-"""A frictionless motor with the beam attached may not grow faster than this. Zero would refuse the
-undamped beam, whose poles lie on the imaginary axis but for rounding and the fit's error."""
+"""Limit of the growth of a frictionless motor with the beam attached. Zero would exclude the
+undamped beam, whose poles lie on the imaginary axis except for rounding and the fit's error."""
 
 _MODES_UP_TO_HZ = 1200.0
 _MOST_MODES = 300
 _HEAVY_DAMPING = 0.8
 """Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
-would only offer huge residues that cancel in the band."""
+would only allow huge residues that cancel in the band."""
 _CUT_POLES = -(10.0 ** (np.arange(-6, 14) / 3.0))
 _FIT_BAND_HZ = (0.02, 500.0)
 _TAIL_HZ = (1e-4, 1080.0)
@@ -46,7 +46,7 @@ _TAIL_WEIGHT = 1e-3
 _CLOSEST = 3e-7
 _MAX_OUTPUT_ERROR = 3e-3
 _RCOND = 1e-10
-"""Cuts off the combinations of columns that would buy the last digit in the band with huge residues
+"""Excludes combinations of columns that would gain the last digit in the band with huge residues
 that cancel there and nowhere else."""
 
 
@@ -55,7 +55,7 @@ Complex = NDArray[np.complexfloating]
 
 
 class RealisationError(UserError, ValueError):
-    """The damping cannot be realised to the error asked for, or not stably."""
+    """The damping cannot be realised with the requested error, or not stably."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,12 +80,12 @@ class Realisation:
     relative_error: float
     """Largest ``|realised - exact| / |exact|`` between 0.05 and 100 Hz."""
     poles_rad_s: Complex
-    """(m,): of a conjugate pair the one in the upper half plane, then the real ones."""
+    """(m,): the pole in the upper half plane of each conjugate pair, then the real ones."""
     modes: NDArray[np.intp]
     """(m,): mode of each pole, the first is 0; -1: a pole of the branch cut."""
 
     def transfer(self, s: ArrayLike) -> Complex:
-        """G(s) as realised, in N·m/rad, of the shape of `s` (rad/s)."""
+        """Return G(s) of the realisation, in N·m/rad, in the shape of `s` (rad/s)."""
         points = np.asarray(s, dtype=np.complex128)
         columns = _basis(points.ravel(), self.poles_rad_s)
         direct = (
@@ -128,12 +128,12 @@ def state_output(
     realisation
         The beam's.
     response
-        Response to the angle of the root, from s (rad/s) to an array of its shape. Its poles have
-        to be those of the torque.
+        Response to the angle of the root, from s (rad/s) to an array of its shape. It must have the
+        poles of the torque.
     inertial
-        Whether it may have a part that follows the angular acceleration at once (D).
+        Whether it may have a part proportional to the angular acceleration (D).
     small
-        Size of the response below which its error counts as a share of this size.
+        Size of the response below which its error is relative to this size.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def state_output(
     target = np.concatenate([weighted.real, weighted.imag])
     coefficients = np.zeros(columns.shape[1])
     coefficients[used] = np.linalg.lstsq(rows / scale, target, rcond=_RCOND)[0] / scale
-    # The mean and not the largest, for a response has zeros of its own.
+    # The mean, not the largest error, since a response has zeros of its own.
     in_band = weight == 1
     left = ((columns @ coefficients - exact) / size)[in_band]
     error = float(np.sqrt(np.mean(np.abs(left) ** 2)))
@@ -172,7 +172,7 @@ def state_output(
 
 
 def _basis(s: Complex, poles: Complex) -> Complex:
-    """Columns whose combination with ``c, D, V, K`` is G: shape (len(s), n + 3)."""
+    """Return the columns whose combination with ``c, D, V, K`` is G: shape (len(s), n + 3)."""
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
     s2 = (s * s)[:, None]
     columns = np.empty((s.size, 2 * upper.size + real.size + 3), dtype=np.complex128)
@@ -204,19 +204,19 @@ def realise(
     beam, damping
         Parameters of the exact model.
     tip_mass_kg, root_compliance_rad_per_nm
-        Point mass at its tip, and by how much its clamp turns for a torque.
+        Point mass at its tip, and rotation of its clamp per torque.
     stiffness_offsets
         Relative differences of the stiffness of modes 2, 3, … from the uniform beam's.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
     modes_of
-        A beam that is a little stiffer or softer: of this one the same modes are realised as of
-        that one, so that both have as many states. None: no such beam.
+        A slightly stiffer or softer beam whose modes determine the realised ones, so that both
+        realisations have the same number of states. None: the beam itself.
 
     Raises
     ------
     RealisationError
-        If the error is larger, naming the error achieved; if the realisation would make a
+        If the error is larger (the message states it); if the realisation would make a
         frictionless motor unstable; if the exact beam itself is not passive: negative
         coefficients, orders outside 0…2; if the beam has more than 300 modes to realise; or if it
         does not have the modes of `modes_of`.
@@ -251,7 +251,8 @@ def realise(
     if not error <= max_relative_error:
         raise RealisationError(
             f"{damping} on {beam} is realised with a relative error of {error:.1e} between "
-            f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was asked."
+            f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was "
+            "requested."
         )
     realisation = _state_space(poles, modes, coefficients, error)
     growth = _growth_on_frictionless_motor(realisation, beam)
@@ -273,16 +274,16 @@ def _check_passive(damping: Damping) -> None:
 
 
 def _exact(loaded: LoadedBeam, s: Complex) -> Complex:
-    """Transfer function of the beam as it is, of the shape of s."""
+    """Return the transfer function of the exact beam, in the shape of s."""
     if loaded.plain:
         return TransferGrid(s).evaluate(loaded.beam, loaded.damping)
     return loaded.transfer(np.asarray(s, dtype=np.complex128))
 
 
 def _poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
-    """Modes up to 1.2 kHz, upper half plane first, then every real pole; and which modes."""
+    """Return poles up to 1.2 kHz, upper half plane first, then real ones; and their modes."""
     reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * modes_of.density_over_stiffness
-    # Damping may shift the highest modes down, so a few more are looked at than the undamped count.
+    # Damping may lower the highest modes, so a few more are computed than the undamped count.
     count = int(1.25 * reach**0.25 * modes_of.length_m / np.pi) + 3
     if count > _MOST_MODES:
         raise RealisationError(
@@ -312,7 +313,7 @@ def _poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp
 
 
 def _realised(pairs: Complex) -> NDArray[np.bool_]:
-    """Choose what is realised of the poles of the modes; of the shape of `pairs`."""
+    """Return which poles of the modes are realised, in the shape of `pairs`."""
     oscillating = pairs[:, 0].imag > 0
     numbers = np.flatnonzero(oscillating)
     upper = pairs[numbers, 0]
@@ -327,7 +328,7 @@ def _realised(pairs: Complex) -> NDArray[np.bool_]:
 
 
 def _zeros(loaded: LoadedBeam) -> Complex:
-    """Zeros of G up to the end of the fit's band: the modes of the pinned–free beam."""
+    """Return the zeros of G up to the end of the fit's band: the pinned–free beam's modes."""
     beam = loaded.beam
     reach = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
     count = int(reach**0.25 * beam.length_m / np.pi) + 1
@@ -338,7 +339,7 @@ def _zeros(loaded: LoadedBeam) -> Complex:
 
 
 def _fit_grid(landmarks: Complex) -> tuple[Real, Real]:
-    """Angular frequencies and weights: the band, crowded at poles and zeros, and the tails."""
+    """Return angular frequencies and weights: the band, dense at poles and zeros, and the tails."""
     low, high = _FIT_BAND_HZ
     band = np.concatenate([np.geomspace(low, high, 200), _clusters(landmarks, 10)])
     band = band[(band >= low) & (band <= high)]
@@ -351,7 +352,7 @@ def _fit_grid(landmarks: Complex) -> tuple[Real, Real]:
 
 
 def _clusters(landmarks: Complex, points: int) -> Real:
-    """Frequencies (Hz) spread over three half-widths on either side of each pole or zero."""
+    """Return frequencies (Hz) over three half-widths on either side of each pole or zero."""
     half_width = np.maximum(-landmarks.real, 1e-4 * landmarks.imag)
     offsets = np.linspace(-3, 3, points)
     frequency: Real = (landmarks.imag[:, None] + half_width[:, None] * offsets).ravel() / (
@@ -361,26 +362,26 @@ def _clusters(landmarks: Complex, points: int) -> Real:
 
 
 def _fit(columns: Complex, target: Complex) -> Real:
-    """Real least squares with the last three unknowns (D, V, K) not negative."""
+    """Solve real least squares with non-negative last three unknowns (D, V, K)."""
     matrix = np.concatenate([columns.real, columns.imag])
     scale = np.linalg.norm(matrix, axis=0)
     q, r = np.linalg.qr(matrix / scale)
     rotated = q.T @ np.concatenate([target.real, target.imag])
-    kept = np.arange(matrix.shape[1])
+    free = np.arange(matrix.shape[1])
     while True:
         solution = np.zeros(matrix.shape[1])
-        solution[kept] = np.linalg.lstsq(r[:, kept], rotated, rcond=_RCOND)[0]
+        solution[free] = np.linalg.lstsq(r[:, free], rotated, rcond=_RCOND)[0]
         direct = solution[-3:]
         if (direct >= 0).all():
             scaled: Real = solution / scale
             return scaled
-        kept = kept[kept != matrix.shape[1] - 3 + np.argmin(direct)]
+        free = free[free != matrix.shape[1] - 3 + np.argmin(direct)]
 
 
 def _relative_error(
     loaded: LoadedBeam, poles: Complex, zeros: Complex, coefficients: Real
 ) -> float:
-    """Largest relative error over a grid several times as dense as the fit's."""
+    """Return the largest relative error over a grid several times as dense as the fit's."""
     low, high = ERROR_BAND_HZ
     landmarks = np.concatenate([poles[poles.imag > 0], zeros])
     frequency = np.concatenate([np.geomspace(low, high, 1200), _clusters(landmarks, 34)])
@@ -391,7 +392,7 @@ def _relative_error(
 
 
 def _apart(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
-    """Where ω is not so near a pole or zero that a relative error means nothing there."""
+    """Return where ω is not too close to a pole or zero for a relative error to have a meaning."""
     landmarks = np.concatenate([poles, zeros])
     distance = np.abs(1j * omega[:, None] - landmarks).min(axis=1)
     apart: NDArray[np.bool_] = distance > _CLOSEST * omega
@@ -417,10 +418,10 @@ def _state_space(
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
-    """Largest real part of the poles of a motor, as heavy as the beam, that turns the realisation.
+    """Return the growth rate of the realisation on a frictionless motor as heavy as the beam.
 
-    Without friction and with little inertia of its own it gives the beam every chance to be
-    unstable.
+    Without friction and with little inertia of its own such a motor is the most critical case for
+    stability.
     """
     motor_and_beam = couple(realisation, motor_inertia_kg_m2=beam.inertia_kg_m2)
     return float(np.linalg.eigvals(motor_and_beam.a).real.max())
@@ -434,7 +435,7 @@ class CoupledModel:
     """``x' = a x + b τ`` of a motor that rigidly turns a beam; τ is the torque on the shaft in N·m.
 
     The state is angle (rad), angular velocity (rad/s), then the states of the beam. τ is the
-    motor's torque less whatever friction is not in the model.
+    motor's torque minus any friction that the model does not contain.
     """
 
     a: Real
@@ -450,25 +451,25 @@ class CoupledModel:
     acceleration_per_torque: float
     """In rad/(s² N·m)."""
     beam_torque: Real
-    """(n,) row: Γ, what the beam takes, in N·m; τ adds `beam_torque_per_torque`."""
+    """(n,) row: Γ, the torque on the beam, in N·m; τ adds `beam_torque_per_torque`."""
     beam_torque_per_torque: float
-    """Share of τ that reaches the beam at once."""
+    """Fraction of τ that reaches the beam at once."""
     sensor_torque: Real
-    """(n,) row: what a sensor between motor and clamp measures, ``Γ + J_tool θ''``, in N·m."""
+    """(n,) row: torque of a sensor between motor and clamp, ``Γ + J_tool θ''``, in N·m."""
     sensor_torque_per_torque: float
-    """Share of τ that passes the sensor at once."""
+    """Fraction of τ that passes the sensor at once."""
     sensed_torque: Real | None = None
-    """(n,) row: what the sensor's filter lets through, in N·m; None: it has none."""
+    """(n,) row: torque after the sensor's filter, in N·m; None: it has none."""
     shear: Real = field(default_factory=lambda: np.zeros(0))
     """(n,) row: force of the motor on the beam, in N; τ adds `shear_per_torque`."""
     shear_per_torque: float = 0.0
     """In 1/m."""
     sensed_shear: Real | None = None
-    """(n,) row: what the sensor's filter lets through of it, in N; None: it has none."""
+    """(n,) row: shear after the sensor's filter, in N; None: it has none."""
 
 
 def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledModel:
-    """Let the sensor's torque and shear through low-pass filters, of order 1 or 2 (Butterworth).
+    """Return the model with low-pass filters of the sensor's torque and shear.
 
     The filters' states come last.
 
@@ -582,14 +583,14 @@ def couple(
 
 
 def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
-    """``x(t + duration) = phi x(t) + gamma τ``, exact for a τ held over the duration.
+    """Return phi and gamma of ``x(t + duration) = phi x(t) + gamma τ``, exact for a held τ.
 
     Parameters
     ----------
     model
         Motor and beam.
     duration_s
-        Time over which τ is held.
+        Time for which τ is held.
 
     Returns
     -------
@@ -620,7 +621,7 @@ def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
     ----------
     model
     inputs
-        What each adds to the state's derivative, shape (n, inputs).
+        Effect of each on the state's derivative, shape (n, inputs).
     duration_s
     """
     n, m = inputs.shape
@@ -631,7 +632,7 @@ def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
 
 
 def _expm(matrix: Real) -> Real:
-    """Matrix exponential by scaling and squaring with the [13/13] Padé approximant.
+    """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
     cases. scipy has the same, but importing it takes longer than all else a fast session starts.

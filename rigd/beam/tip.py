@@ -1,7 +1,7 @@
 """Motion of the beam's free end, predicted from the motor's angle.
 
 The boundary value problem of the beam, clamped on the shaft and free at its tip, gives the tip's
-displacement and slope over the angle as, with ``z = beta L`` as in `rigd.beam._model`::
+displacement and slope over the angle, with ``z = beta L`` as in `rigd.beam._model`::
 
     Y(L)  = L (sin z + sinh z) / (z (1 + cos z cosh z))
     Y'(L) = (cos z + cosh z) / (1 + cos z cosh z)
@@ -22,15 +22,15 @@ SMALL_SLOPE_RAD = 0.14
 """Slope of the tip against the root up to which the linear model holds.
 
 No part of a clamped beam slopes more than its tip. In the first mode this is a deflection of 10 %
-of the length, in the second of 3 %. What the model leaves out grows with the square: the tip comes
-nearer to the axis by up to a third of it in lengths, here 0.6 %, and curvature and inertia differ
-from the linear ones by shares of that size, which is what a careful session measures.
+of the length, in the second of 3 %. The error of the linear model grows with the square: the tip
+approaches the axis by up to a third of it in lengths, here 0.6 %, and curvature and inertia differ
+from the linear ones by fractions of that size, the accuracy of a careful session.
 """
 
 _PADDED = 1.125
 _DECAY = 7.0
 _BLOCK = 1 << 15
-"""Frequencies that are evaluated at once, lest an hour at 1 kHz take a gigabyte."""
+"""Frequencies evaluated at once: an hour at 1 kHz would take a gigabyte."""
 
 
 def linear_model_error(slope_rad: float) -> float:
@@ -44,7 +44,7 @@ def linear_model_error(slope_rad: float) -> float:
     Returns
     -------
     float
-        A third of the slope squared: see `SMALL_SLOPE_RAD`. From 1 on the model says nothing.
+        A third of the slope squared: see `SMALL_SLOPE_RAD`. From 1 on the model is useless.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def linear_model_error(slope_rad: float) -> float:
     >>> print(f"{100 * linear_model_error(0.6):.0f} %")
     12 %
     """
-    return slope_rad * slope_rad / 3.0  # infinite, not an error, of what no tip does
+    return slope_rad * slope_rad / 3.0  # infinite, not an error, for an absurd slope
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +60,11 @@ class TipMotion:
     """Largest motion of the free end."""
 
     deflection_m: float
-    """Relative to the line that the root points along."""
+    """Relative to the tangent at the root."""
     slope_rad: float
-    """Against that line."""
+    """Relative to the same line."""
     speed_m_s: float
-    """Through still air: with what the root's turning adds."""
+    """Through still air, including the rotation of the root."""
 
 
 def tip_motion(
@@ -87,7 +87,7 @@ def tip_motion(
     rate_hz
         Samples a second.
     tip_mass_kg, root_compliance_rad_per_nm
-        Point mass at the tip, and by how much the clamp turns for a torque.
+        Point mass at the tip, and rotation of the clamp per torque.
 
     Examples
     --------
@@ -102,11 +102,11 @@ def tip_motion(
     """
     n = angle_rad.size
     padded = _quick_length(int(np.ceil(_PADDED * n)))
-    # On s = sigma + j omega what wraps round has decayed.
+    # On s = sigma + j omega the wrap-around has decayed.
     sigma = _DECAY * rate_hz / padded
     s = np.asarray(2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
     s += sigma
-    # The angle stays where it ends: a jump back would ring at the last samples.
+    # The angle stays at its final value: a jump back would ring at the last samples.
     angle = np.full(padded, angle_rad[-1] - angle_rad[0])
     np.subtract(angle_rad, angle_rad[0], out=angle[:n])
     for start in range(0, padded, _BLOCK):
@@ -116,11 +116,11 @@ def tip_motion(
     del angle
     sloped, speeding = np.empty((2, s.size), dtype=np.complex128)
     loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
-    # Block by block and in place: these are all of the record's length.
+    # Block by block and without copies: these arrays have the record's length.
     for start in range(0, s.size, _BLOCK):
         some = slice(start, start + _BLOCK)
         turned = deflected[some].copy()
-        root: Complex = turned  # turns as the motor does, but for a clamp
+        root: Complex = turned  # turns like the motor, except for a compliant clamp
         if loaded.plain:
             displaced, slope = tip_response(beam, damping, s[some])
             displaced -= beam.length_m
@@ -140,7 +140,7 @@ def tip_motion(
             block = motion[start : start + _BLOCK]
             growth = np.exp(sigma * np.arange(start, start + block.size) / rate_hz)
             peaks.append(float(np.max(np.abs(block * growth))))
-        return float(np.max(peaks))  # not a number stays one
+        return float(np.max(peaks))  # NaN stays NaN
 
     return TipMotion(
         deflection_m=largest(deflected), slope_rad=largest(sloped), speed_m_s=largest(speeding)
@@ -181,6 +181,6 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
 
 
 def _quick_length(least: int) -> int:
-    """Length of which a transform is quick: at most an eighth more than the least one."""
+    """Return a length with a fast transform, at most an eighth above the least one."""
     unit = 1 << max(0, least.bit_length() - 4)
     return -(-least // unit) * unit

@@ -2,7 +2,7 @@
 
 Offers the design by pole placement (`design_pid`), the discrete controller of the loop
 (`PidController`, one step per tick), the linear closed loop of rig and controller (`close_loop`,
-`check_stability`) and its margins (`loop_margins`). It talks to no device and checks no limit:
+`check_stability`) and its margins (`loop_margins`). It accesses no device and checks no limit:
 limits are in `rigd.safety`.
 """
 

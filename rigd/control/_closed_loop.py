@@ -1,9 +1,9 @@
 """The discrete closed loop of motor, beam, delays, feed-forward and PID: linear, exact at ticks.
 
-The plant is propagated exactly under the held torque, with the moment inside a period at which
-the actuation delay lets a command through; delayed readings are the exact values of that earlier
-moment. Friction, quantisation and the torque limit are left out, noise too. A sensor that is read
-at the very moment a new torque takes effect sees the old one.
+The plant is propagated exactly under the held torque, with the instant inside a period at which the
+actuation delay passes a command; delayed readings are the exact values of that earlier instant.
+Friction, quantisation, the torque limit and noise are left out. A sensor that is read at the
+instant a new torque takes effect sees the old one.
 """
 
 from dataclasses import dataclass, replace
@@ -27,27 +27,27 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 MAX_GROWTH_PER_S = 0.02
-"""Fastest growth of the loop that is let through, with a warning.
+"""Fastest accepted growth of the loop, with a warning.
 
-A beam with almost no damping leaves the loop slightly unstable whatever the controller does (below
-0.02 % at a pole of 80 rad/s, at up to 0.003 /s). At the rate allowed here an oscillation grows by
-35 % over the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session of 136 s.
+A beam with almost no damping leaves the loop slightly unstable with any controller (below 0.02 % at
+a pole of 80 rad/s, at up to 0.003 /s). At the rate allowed here an oscillation grows by 35 % over
+the 15 s of a ring-down, and from the noise floor by a factor of 15 in a session of 136 s.
 """
 
 MAX_DAMPING_TAKEN = 0.004
 """Largest damping ratio that the controller may take from a mode of the beam.
 
-Checked on a beam of the same dimensions that has next to no damping of its own: a loop that is
-stable only by the damping it is to measure is not safe, and its record shows little of the beam
-near that mode. With the coupling torque fed forward a mode loses 0.0001 to 0.0015 (poles from 40 to
+Checked on a beam of the same dimensions with almost no damping of its own: a loop that is stable
+only through the damping to be measured is not safe, and its record shows little of the beam near
+that mode. With feed-forward of the coupling torque a mode loses 0.0001 to 0.0015 (poles from 40 to
 120 rad/s, gains from 0.8 to 1.2, torque readings up to 10 ms old); without, 0.0045 to 0.013.
 """
 
 _LIGHT_DAMPING_RATIO = 1e-4
-"""Damping of the beam in that check: undamped, rounding may make its realisation unstable."""
+"""Damping of the beam in that check: rounding may make an undamped realisation unstable."""
 
 MAX_DELAY_PERIODS = 50
-"""Longest delay that is modelled: every period of delay is one more state."""
+"""Longest delay in the model: every period of delay is one more state."""
 
 _DEAD = 1e-9
 _BLOCK = 64  # ticks: fewer make the sequential part longer, more the products
@@ -72,7 +72,7 @@ class LoopModel:
     tool_inertia_kg_m2: float
     """Inertia between torque sensor and beam."""
     actuation_delay_s: float
-    """From a tick to the moment its command takes effect; any fraction of a period."""
+    """Delay from a tick to the instant its command takes effect; any fraction of a period."""
     angle_delay_s: float
     """Age of the angle at the tick that uses it."""
     torque_delay_s: float
@@ -82,13 +82,13 @@ class LoopModel:
     tip_mass_kg: float = 0.0
     """Point mass at the beam's tip."""
     root_compliance_rad_per_nm: float = 0.0
-    """By how much the clamp turns for a torque on the beam's root."""
+    """Rotation of the clamp per torque on the beam's root."""
     stiffness_offsets: tuple[float, ...] = ()
     """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with what is at its ends; a loop without a beam has none."""
+        """The beam with tip mass and root compliance; a loop without a beam has none."""
         assert self.beam is not None
         return LoadedBeam(
             self.beam,
@@ -110,19 +110,19 @@ class LoopResponse:
     torque_nm: Real
     """The command, friction compensation included, not limited."""
     coupling_torque_nm: Real
-    """What the sensor measures (beam and tool inertia), without its delay."""
+    """Measured torque (beam and tool inertia), without the sensor's delay."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
     """A signal at which the loop can be opened: it is read from the state and acts on the next.
 
-    ``outer(action, reading)`` is the part of the closed loop's matrix that passes through the cut.
+    ``outer(action, reading)`` is the part of the closed loop's matrix through the cut.
     """
 
     name: str
     action: Real
-    """(n,): what one unit of the signal adds to the next state."""
+    """(n,): effect of one unit of the signal on the next state."""
     reading: Real
     """(n,): the signal is ``reading · x``."""
 
@@ -132,7 +132,7 @@ class ClosedLoop:
     """``x[k+1] = a x[k] + b r[k]``, ``y[k] = c x[k] + d r[k]`` from the reference.
 
     The rows of y are angle (rad), velocity (rad/s), torque without friction compensation (N·m),
-    the speed by which that compensation goes (rad/s), and the sensor's torque (N·m).
+    the speed used by that compensation (rad/s), and the sensor's torque (N·m).
     """
 
     a: Real
@@ -144,13 +144,13 @@ class ClosedLoop:
     d: Real
     """(5,)."""
     model: LoopModel
-    """Model it was computed from."""
+    """Model from which it was computed."""
     cuts: tuple[Cut, ...]
     """The torque command, the angle and the coupling torque as the controller reads them."""
     poles_rad_s: Complex
-    """Its modes as poles in continuous time, the fastest growing (or slowest decaying) first."""
+    """Its modes as continuous-time poles, the fastest growing (or slowest decaying) first."""
     shaft_torque: Real
-    """(n,): what a torque of 1 N·m on the shaft, held for a period, adds to the next state."""
+    """(n,): effect on the next state of 1 N·m on the shaft, held for a period."""
     realisation: Realisation | None
     """The beam, whose states follow angle and velocity in x; None: the motor alone."""
 
@@ -161,7 +161,7 @@ class ClosedLoop:
 
     @property
     def growth_per_s(self) -> float:
-        """Rate at which the dominating mode grows (negative: decays), in 1/s."""
+        """Growth rate of the dominating mode (negative: decays), in 1/s."""
         return float(self.poles_rad_s[0].real)
 
     def least_damped(self) -> complex:
@@ -171,9 +171,9 @@ class ClosedLoop:
     def simulate(self, reference_rad: Real) -> LoopResponse:
         """Return the response to a reference from rest, exact at the ticks.
 
-        The record is cut into blocks. Within a block the response is a product of matrices (the
-        block's impulse response on the reference, and its free response on the state at its
-        start); only these states have to be followed one after the other.
+        The record is divided into blocks. Within a block the response is a product of matrices (the
+        block's impulse response with the reference, and its free response with the state at its
+        start); only these states are computed one after the other.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class ClosedLoop:
         Raises
         ------
         ControlDesignError
-            If the loop is unstable and the response grows beyond all numbers.
+            If the loop is unstable and the response overflows.
         """
         n = reference_rad.size
         blocks = -(-n // _BLOCK)
@@ -212,7 +212,7 @@ class ClosedLoop:
         del padded
         angle, velocity, torque, speed, coupling = rows[:, :n]
         settings = self.model.settings
-        # In place: an hour of record takes 30 MB a channel.
+        # Without a copy: an hour of record takes 30 MB a channel.
         speed /= settings.friction_velocity_rad_s
         np.tanh(speed, out=speed)
         speed *= settings.friction_compensation_nm
@@ -220,7 +220,7 @@ class ClosedLoop:
         return LoopResponse(angle, velocity, torque, coupling)
 
     def response(self, frequency_hz: Real) -> Complex:
-        """Return angle over reference at some frequencies, complex, of the shape given."""
+        """Return angle over reference, complex, in the shape of the frequencies."""
         z = np.exp(2j * pi * np.atleast_1d(frequency_hz) / self.model.rate_hz)
         identity = np.eye(self.b.size)
         values = [
@@ -230,7 +230,7 @@ class ClosedLoop:
         return np.array(values).reshape(np.shape(frequency_hz))
 
     def _block_matrices(self) -> tuple[Real, Real, Real, Real]:
-        """Free (5, n, L) and forced (5, L, L) response, state step (n, n) and drive (L, n)."""
+        """Return free (5, n, L) and forced (5, L, L) response, step (n, n) and drive (L, n)."""
         n = self.b.size
         free = np.empty((_BLOCK, _ROWS, n))  # c aⁱ
         drive = np.empty((_BLOCK, n))  # aⁱ b, turned round at the end
@@ -375,23 +375,23 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
         Ticks a second.
     """
     eigenvalues = np.linalg.eigvals(a).astype(complex)
-    # Delays leave eigenvalues at zero: they have died out after a few ticks.
+    # Delays have eigenvalues at zero, which decay within a few ticks.
     poles: Complex = np.log(eigenvalues[np.abs(eigenvalues) > _DEAD]) * rate_hz
     return poles
 
 
 def check_stability(loop: ClosedLoop) -> str | None:
-    """Judge a closed loop before anything moves.
+    """Check the stability of a closed loop before anything moves.
 
     Returns
     -------
     str or None
-        A warning if the loop is unstable, but so slowly that a session can be run.
+        A warning if the loop is unstable, but so slowly that a session is possible.
 
     Raises
     ------
     ControlDesignError
-        If the loop grows faster than `MAX_GROWTH_PER_S`, or would do so but for the beam's own
+        If the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without the beam's own
         damping (`MAX_DAMPING_TAKEN`).
     """
     remedy = _remedy(loop.model.settings)
@@ -420,10 +420,10 @@ def check_stability(loop: ClosedLoop) -> str | None:
 
 
 def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Close the loop of a rig, and refuse an unstable one.
+    """Close the loop of a rig, and raise if it is unstable.
 
-    The result for the last few models is stored: what checks a rig and what plans a session need
-    the same one.
+    The results for the last few models are cached: the check of a rig and the planning of a session
+    need the same one.
 
     Parameters
     ----------
@@ -435,7 +435,7 @@ def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
     loop : ClosedLoop
         The loop.
     warning : str or None
-        As `check_stability` returns it.
+        From `check_stability`.
 
     Raises
     ------
@@ -467,7 +467,7 @@ def _remedy(settings: ControlSettings) -> str:
 
 
 def light_beam(model: LoopModel, beam: Beam) -> LoopModel:
-    """Give a loop a beam with next to no damping of its own.
+    """Return a loop's model with a beam that has almost no damping.
 
     Parameters
     ----------
@@ -514,29 +514,29 @@ class _Plant:
         lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
         size = n + commands + sum(lengths)
 
-        # Columns of what stands in force before and after the switch within a period. With no
-        # whole period of delay the command after it is the tick's own: the input column, last.
+        # Columns of the torque before and after the switch within a period. Without a whole period
+        # of delay the command after it is the tick's own: the input column, last.
         before = n + whole
         after = before - 1 if whole else size
         switch_s = part * period_s
         extended = np.zeros((size, size + 1))
 
         def advance(duration_s: float) -> tuple[Real, int]:
-            """State (n, size + 1) a time after a tick, and the column of the torque then."""
+            """Return the state (n, size + 1) a time after a tick, and the torque's column then."""
             state, column = np.eye(n, size + 1), before
-            for stretch_s, acting in (
+            for interval_s, acting in (
                 (min(duration_s, switch_s), before),
                 (duration_s - switch_s, after),
             ):
-                if stretch_s > 0.0:
-                    phi, gamma = propagator(coupled, stretch_s)
+                if interval_s > 0.0:
+                    phi, gamma = propagator(coupled, interval_s)
                     state = phi @ state
                     state[:, acting] += gamma
                     column = acting
             return state, column
 
         def read(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
-            """Row (size + 1,) of what a sensor reads a time after a tick."""
+            """Return the row (size + 1,) of a sensor's reading a time after a tick."""
             state, column = advance(since_tick_s)
             reading: Real = row @ state
             reading[column] += per_torque
@@ -576,7 +576,7 @@ class _Plant:
 
 
 def _split(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
-    """Whole periods and the rest, as a part of a period, of a delay."""
+    """Return the whole periods of a delay, and the remainder as a fraction of a period."""
     periods = delay_s / period_s
     if periods > MAX_DELAY_PERIODS:
         raise ControlDesignError(

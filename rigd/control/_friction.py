@@ -1,7 +1,7 @@
-"""Motion of the closed loop with what is not linear: Coulomb friction, encoder steps, sensor noise.
+"""Motion of the closed loop with its nonlinear effects: friction, encoder steps, sensor noise.
 
-The friction is constant over a period and implicit: the torque, of at most the Coulomb friction,
-that takes the shaft's speed at the end of the period nearest to zero. A shaft at rest is so held at
+The Coulomb friction is constant over a period and implicit: the torque, up to its limit, that
+brings the shaft's speed at the end of the period closest to zero. It therefore holds a shaft at
 rest. The motor's torque is not limited.
 """
 
@@ -17,7 +17,7 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Disturbances:
-    """What the linear closed loop leaves out."""
+    """Effects that the linear closed loop does not contain."""
 
     coulomb_nm: float
     """Coulomb friction of the motor, at the output shaft."""
@@ -59,7 +59,7 @@ def simulate_disturbed(
     modes
         Number of modes, from the first on, whose amplitudes are computed.
     draws
-        Number of realisations of the noise, and of where in a step of the encoder the motor stands.
+        Number of realisations of the noise, and of the angle within an encoder step.
     seed
         Seed of the draws.
     """
@@ -68,7 +68,7 @@ def simulate_disturbed(
     command, angle_cut, torque_cut = loop.cuts
     n, step_rad = reference_rad.size, disturbances.encoder_step_rad
     random = np.random.default_rng(seed)
-    place_rad = step_rad * random.uniform(-0.5, 0.5, draws)
+    offset_rad = step_rad * random.uniform(-0.5, 0.5, draws)
     noise = random.normal(0.0, disturbances.torque_noise_nm, (n, draws))
     actions = np.stack([loop.b, command.action, torque_cut.action, angle_cut.action], axis=1)
     rows = np.stack([loop.c[0], angle_cut.reading, loop.c[3]])
@@ -88,7 +88,7 @@ def simulate_disturbed(
         inputs[1] = settings.friction_compensation_nm * np.tanh(speed)
         inputs[2] = noise[tick]
         if step_rad:
-            inputs[3] = step_rad * np.rint((reading + place_rad) / step_rad) - place_rad - reading
+            inputs[3] = step_rad * np.rint((reading + offset_rad) / step_rad) - offset_rad - reading
         x = loop.a @ x + actions @ inputs
         friction = (velocity @ x) / per_torque
         x -= pushed * friction.clip(-disturbances.coulomb_nm, disturbances.coulomb_nm)

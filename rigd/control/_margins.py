@@ -1,23 +1,23 @@
-"""Gain, phase, delay and modulus margin of the discrete closed loop, at each place it can be cut.
+"""Gain, phase, delay and modulus margin of the discrete closed loop at each of its cuts.
 
-A margin says how wrong one signal may be before the loop loses its stability. There are three such
-places, and they answer different questions:
+A margin states how wrong one signal may be before the loop becomes unstable. There are three such
+signals, and they answer different questions:
 
 torque command
-    Motor and drive: torque constant, gear, delay of the command. Everything goes through here, the
+    Motor and drive: torque constant, gear, delay of the command. It contains the whole loop, the
     angle's PID and the coupling torque's feed-forward.
 angle reading
-    The loop the controller was designed for: the PID around the motor, with the beam cancelled by
-    the feed-forward.
+    The loop for which the controller was designed: the PID around the motor, with the beam
+    cancelled by the feed-forward.
 torque reading
     The feed-forward alone: calibration, lever arm and delay of the sensor.
 
-The feed-forward is positive feedback that cancels the beam. Where the clamped beam resonates its
-loop gain is -1 by design, so that the curve passes close to the critical point at the first and at
-the third place whatever the controller: a command that is `k` times too strong leaves ``1 - k``
-times the beam in the loop. A gain margin of 2 cannot be had there; it would mean a motor that feels
-the beam turned inside out. What counts there is that the tolerances of drive and sensor fit into
-it. Only at the angle the rules of thumb for a feedback loop apply.
+The feed-forward is positive feedback that cancels the beam. Where the clamped beam resonates, its
+loop gain is -1 by design. The curve therefore passes close to the critical point at the first and
+the third signal with any controller: a command that is `k` times too strong leaves ``1 - k`` times
+the beam in the loop. A gain margin of 2 is impossible there; it would mean a motor that feels the
+inverted beam. There the tolerances of drive and sensor have to fit into the margin. The rules of
+thumb for a feedback loop apply to the angle only.
 """
 
 from collections.abc import Callable
@@ -33,12 +33,12 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _LOWEST = 1e-6
-"""Lowest frequency that is looked at, as a part of the sampling rate."""
+"""Lowest examined frequency, as a fraction of the sampling rate."""
 _PER_DECADE = 60
-_BESIDE = np.geomspace(0.03, 100.0, 16)
-"""Where frequencies are set on both sides of a resonance, in its half-widths."""
+_OFFSETS = np.geomspace(0.03, 100.0, 16)
+"""Offsets of frequencies on both sides of a resonance, in its half-widths."""
 _SHARPEST = 1e-6
-"""Half-width that is given to a resonance without damping, as a part of its frequency."""
+"""Half-width assumed for a resonance without damping, as a fraction of its frequency."""
 _DEAD = 1e-3
 """Magnitude of an eigenvalue below which it belongs to a delay, not to a resonance."""
 _ALMOST_REAL = 1e-3
@@ -51,7 +51,7 @@ _ZOOMS = 3
 class Margins:
     """Stability margins at one signal of a stable loop, each with its frequency.
 
-    A frequency is NaN where there is no limit.
+    A frequency is NaN if there is no limit.
     """
 
     cut: str
@@ -65,7 +65,7 @@ class Margins:
     gain_down_hz: float
     """Frequency of that limit."""
     phase_rad: float
-    """Smallest phase that the signal may be turned by, either way, up to π."""
+    """Smallest phase shift in either direction that makes it unstable, up to π."""
     phase_hz: float
     """Frequency of that limit."""
     delay_s: float
@@ -81,13 +81,13 @@ class Margins:
 def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     """Return the margins at each of the loop's cuts.
 
-    An additional delay counts as a turn of the phase. That is exact for whole periods, and
-    otherwise to 0.1 % at the frequencies of the beam.
+    An additional delay counts as a phase shift. That is exact for whole periods, and otherwise to
+    0.1 % at the frequencies of the beam.
 
     Parameters
     ----------
     loop
-        Stable: the margins of an unstable one mean nothing.
+        A stable loop: the margins of an unstable one are meaningless.
 
     References
     ----------
@@ -107,7 +107,7 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
 
 
 def open_loop_gain(loop: ClosedLoop, cut: Cut, phase_rad: Real) -> Complex:
-    """Return the loop's gain L where it is cut; the loop closes as ``1/(1 + L)``.
+    """Return the loop's gain L at a cut; the loop closes as ``1/(1 + L)``.
 
     Parameters
     ----------
@@ -137,20 +137,20 @@ def _margins(loop: ClosedLoop, cut: Cut) -> Margins:
         return open_loop_gain(loop, cut, phase_rad)
 
     rate_hz = loop.model.rate_hz
-    places = _places(loop, cut)
-    gain = curve(places)
+    frequencies = _frequencies(loop, cut)
+    gain = curve(frequencies)
 
-    real_at, real_gain = _where_real(curve, places, gain)
+    real_at, real_gain = _where_real(curve, frequencies, gain)
     factor = -1.0 / real_gain
     up_at, up = _smallest(real_at, np.where(factor > 1.0, factor, inf))
     down_at, down = _smallest(real_at, np.where(factor <= 1.0, -factor, inf))
 
-    unity_at = _zeros(lambda value: np.abs(value) - 1.0, curve, places, gain)
+    unity_at = _zeros(lambda value: np.abs(value) - 1.0, curve, frequencies, gain)
     lag_rad = (np.angle(curve(unity_at)) + pi) % (2.0 * pi)
     phase_at, phase_rad = _smallest(unity_at, np.minimum(lag_rad, 2.0 * pi - lag_rad))
     delay_at, delay_s = _smallest(unity_at, lag_rad / unity_at / rate_hz)
 
-    modulus_at, modulus = _smallest_distance(curve, places, gain)
+    modulus_at, modulus = _smallest_distance(curve, frequencies, gain)
     to_hz = rate_hz / (2.0 * pi)
     return Margins(
         cut=cut.name,
@@ -171,35 +171,37 @@ Curve = Callable[[Real], Complex]
 """The loop's gain over frequency times period."""
 
 
-def _places(loop: ClosedLoop, cut: Cut) -> Real:
-    """Frequencies times period, dense round each resonance of the open and of the closed loop."""
+def _frequencies(loop: ClosedLoop, cut: Cut) -> Real:
+    """Return frequencies times period, dense around the resonances of open and closed loop."""
     opened = loop.a - np.outer(cut.action, cut.reading)
     poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (opened, loop.a)])
     poles = np.log(poles[np.abs(poles) > _DEAD].astype(complex))
     poles = poles[(poles.imag > 0.0) & (poles.imag < pi)]
     half_width = np.maximum(np.abs(poles.real), _SHARPEST * poles.imag)
-    beside = half_width[:, np.newaxis] * np.concatenate([-_BESIDE, [0.0], _BESIDE])
+    offsets = half_width[:, np.newaxis] * np.concatenate([-_OFFSETS, [0.0], _OFFSETS])
     lowest = 2.0 * pi * _LOWEST
     spread = np.geomspace(lowest, pi, round(_PER_DECADE * np.log10(pi / lowest)))
-    places = np.concatenate([spread, (poles.imag[:, np.newaxis] + beside).ravel()])
-    return np.unique(places[(places >= lowest) & (places <= pi)])
+    frequencies = np.concatenate([spread, (poles.imag[:, np.newaxis] + offsets).ravel()])
+    return np.unique(frequencies[(frequencies >= lowest) & (frequencies <= pi)])
 
 
-def _where_real(curve: Curve, places: Real, gain: Complex) -> tuple[Real, Real]:
-    """Where the gain is real and negative, and what it is there."""
-    inner = _zeros(np.imag, curve, places, gain)
-    # Standstill and half the sampling rate end the curve: the gain is real there by nature.
+def _where_real(curve: Curve, frequencies: Real, gain: Complex) -> tuple[Real, Real]:
+    """Return frequencies at which the gain is real and negative, and its values there."""
+    inner = _zeros(np.imag, curve, frequencies, gain)
+    # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
     ends = [end for end in (0, -1) if abs(gain[end].imag) < _ALMOST_REAL * abs(gain[end].real)]
-    at = np.concatenate([inner, places[ends]])
+    at = np.concatenate([inner, frequencies[ends]])
     real = np.concatenate([curve(inner).real, gain[ends].real])
     return at[real < 0.0], real[real < 0.0]
 
 
-def _zeros(function: Callable[[Complex], Real], curve: Curve, places: Real, gain: Complex) -> Real:
+def _zeros(
+    function: Callable[[Complex], Real], curve: Curve, frequencies: Real, gain: Complex
+) -> Real:
     """Return where a real function of the gain changes its sign."""
     negative = np.signbit(function(gain))
     first = np.flatnonzero(negative[:-1] != negative[1:])
-    low, high = places[first], places[first + 1]
+    low, high = frequencies[first], frequencies[first + 1]
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         before = np.signbit(function(curve(middle))) == negative[first]
@@ -209,18 +211,21 @@ def _zeros(function: Callable[[Complex], Real], curve: Curve, places: Real, gain
 
 
 def _smallest(at: Real, values: Real) -> tuple[float, float]:
-    """Place and size of the smallest value; NaN and infinity if there is none."""
+    """Return position and size of the smallest value; NaN and infinity if there is none."""
     if values.size == 0 or values.min() == inf:
         return nan, inf
     index = int(values.argmin())
     return float(at[index]), float(values[index])
 
 
-def _smallest_distance(curve: Curve, places: Real, gain: Complex) -> tuple[float, float]:
-    """Where the gain is nearest to -1, and how near."""
+def _smallest_distance(curve: Curve, frequencies: Real, gain: Complex) -> tuple[float, float]:
+    """Return where the gain is closest to -1, and the distance."""
     for _ in range(_ZOOMS):
         nearest = int(np.abs(1.0 + gain).argmin())
-        low, high = places[max(nearest - 1, 0)], places[min(nearest + 1, places.size - 1)]
-        places = np.linspace(low, high, 21)
-        gain = curve(places)
-    return _smallest(places, np.abs(1.0 + gain))
+        low, high = (
+            frequencies[max(nearest - 1, 0)],
+            frequencies[min(nearest + 1, frequencies.size - 1)],
+        )
+        frequencies = np.linspace(low, high, 21)
+        gain = curve(frequencies)
+    return _smallest(frequencies, np.abs(1.0 + gain))

@@ -5,8 +5,8 @@ The beam does not appear in the design: its measured coupling torque is fed forw
 
 The discrete controller takes one step a tick, in plain floats. Everything is discretised by
 Tustin's rule. The two low-pass filters of the reference (for the friction compensation) are the
-nominal closed loop ``1/(1 + s/p)²``, so that the compensated speed is the one the motor is expected
-to have, not the one that is asked of it.
+nominal closed loop ``1/(1 + s/p)²``, so that the compensated speed is the expected speed of the
+motor, not the requested one.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from rigd.errors import UserError
 
 
 class ControlDesignError(UserError, ValueError):
-    """The controller asked for cannot be designed, or its closed loop is unstable."""
+    """The requested controller cannot be designed, or its closed loop is unstable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class ControlSettings:
     pole_rad_s: Annotated[float, Gt(0)]
     """All four poles of the nominal closed loop lie at minus this."""
     feedforward_gain: Annotated[float, Ge(0), Le(2)]
-    """Part of the measured coupling torque that is added to the command; 1 cancels the beam."""
+    """Fraction of the measured coupling torque that is added to the command; 1 cancels the beam."""
     friction_compensation_nm: Annotated[float, Ge(0)]
-    """Coulomb friction the controller assumes; 0 switches the compensation off."""
+    """Coulomb friction assumed by the controller; 0 switches the compensation off."""
     friction_velocity_rad_s: Annotated[float, Gt(0)]
     """Reference speed over which the compensation changes sign."""
 
@@ -62,28 +62,28 @@ class PidGains:
 def design_pid(
     motor_inertia_kg_m2: float, viscous_nm_s_per_rad: float, pole_rad_s: float
 ) -> PidGains:
-    """Place all four poles of motor and controller at ``-pole_rad_s``.
+    """Return the gains that put all four poles of motor and controller at ``-pole_rad_s``.
 
-    The feedback is ``(a2 s² + a1 s + a0)/(s (s + a3))`` and the reference path has the same
-    denominator and the numerator ``p² (s + p)²/K``, which leaves ``1/(1 + s/p)²`` from reference
-    to angle.
+    The feedback is ``(a2 s² + a1 s + a0)/(s (s + a3))``. The reference path has the same
+    denominator and the numerator ``p² (s + p)²/K``: the response from reference to angle is
+    ``1/(1 + s/p)²``.
 
     Parameters
     ----------
     motor_inertia_kg_m2, viscous_nm_s_per_rad
         The motor alone, at the output shaft.
     pole_rad_s
-        The distance p of the poles from the origin.
+        Distance p of the poles from the origin.
 
     Returns
     -------
     PidGains
-        The same controller written as a parallel PID with set-point weights b and c.
+        The same controller as a parallel PID with set-point weights b and c.
 
     Raises
     ------
     ControlDesignError
-        If p is too small beside the motor's own ``g = B/J``: the filter's time constant is
+        If p is too small compared with the motor's own ``g = B/J``: the filter's time constant is
         positive only for ``p > g/4`` and the proportional gain only for ``p > 4 g/15``.
 
     References
@@ -133,10 +133,10 @@ def design_pid(
 class PidController:
     """2DOF PID with feed-forward of the coupling torque and compensation of Coulomb friction.
 
-    After each step its terms stand in the attributes ``proportional_nm``, ``integral_nm``,
+    After each step its terms are in the attributes ``proportional_nm``, ``integral_nm``,
     ``derivative_nm``, ``feedforward_nm`` and ``friction_nm``, their sum in
-    ``unlimited_torque_nm``, and ``saturated`` says whether that was limited; the integral then
-    already holds the anti-windup's correction for the next step.
+    ``unlimited_torque_nm``, and ``saturated`` states whether the sum was limited; the integral then
+    already contains the anti-windup's correction for the next step.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class PidController:
     rate_hz
         Steps a second.
     torque_limit_nm
-        Magnitude the returned torque never exceeds; the integral term follows it by
+        Largest magnitude of the returned torque; the integral term follows it by
         back-calculation.
 
     Examples
@@ -210,10 +210,10 @@ class PidController:
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
-        """Take over without a bump from rest at an angle.
+        """Initialise the controller at rest at an angle, without a bump.
 
-        The next step returns no torque if reference and angle are still there and the coupling
-        torque is zero.
+        The next step returns no torque if reference and angle are still equal to it and the
+        coupling torque is zero.
         """
         self.proportional_nm = self._kp * (self._b_p - 1.0) * angle_rad
         self.integral_nm = -self.proportional_nm
@@ -236,7 +236,7 @@ class PidController:
         reference_rad, angle_rad
             Reference and measured angle.
         coupling_torque_nm
-            What the sensor measures; fed forward.
+            Measured torque, which is fed forward.
         """
         error = reference_rad - angle_rad
         weighted_error = self._b_d * reference_rad - angle_rad

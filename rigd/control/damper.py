@@ -1,9 +1,9 @@
 """Active damping of the beam: the motor that holds it yields to its torque like a dashpot.
 
-A motor that turns at a speed in proportion to the torque that the beam exerts on it takes energy
-out of every mode, whatever the beam is. The reference is moved so; the lag of the loop that follows
-it is made up for by a lead, and slow torques are left out, so that the motor stays where it is.
-Whether loop, delays and beam leave it stable is checked on the closed loop.
+A motor whose speed is proportional to the torque of the beam takes energy out of every mode of any
+beam. The damper moves the reference in this way; a lead compensates the lag of the loop, and slow
+torques are filtered out, so that the motor stays in position. The stability with loop, delays and
+beam is checked on the closed loop.
 """
 
 from dataclasses import dataclass, replace
@@ -20,13 +20,13 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _STRENGTH = 0.25
-"""Speed per torque, times the beam's inertia and the frequency of its first mode: its damping ratio
+"""Speed per torque, times the beam's inertia and the frequency of its first mode: the damping ratio
 becomes about half of that. Twice as much gains little, and is less stable at the third mode."""
 _HALVINGS = 5
 _STIFFNESSES = (0.8, 1.0, 1.25)
-"""Stiffness of the beam, over the profile's, for which the loop has to be stable."""
+"""Stiffnesses of the beam, over the profile's, for which the loop has to be stable."""
 _SLOW = 0.25
-"""Corner below which torques are left out, over the frequency of the first mode."""
+"""Corner below which torques are filtered out, over the frequency of the first mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +36,15 @@ class DamperSettings:
     yield_rad_per_nm_s: float
     """Speed of the reference per torque of the beam."""
     lead_s: float
-    """Lead that makes up for the lag of the loop."""
+    """Lead that compensates the lag of the loop."""
     slow_rad_s: float
-    """Corner below which torques are left out."""
+    """Corner below which torques are filtered out."""
     fast_rad_s: float
-    """Corner above which they are."""
+    """Corner above which torques are filtered out."""
 
 
 class VibrationDamper:
-    """Moves a reference so that the beam loses its vibration.
+    """Moves a reference so that the beam's vibration decays.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class VibrationDamper:
     --------
     >>> from rigd.control.damper import DamperSettings, VibrationDamper
     >>> damper = VibrationDamper(DamperSettings(10.0, 0.025, 4.0, 320.0), rate_hz=1000)
-    >>> damper.step(0.01) < 0  # what pushes the beam forward gives way backward
+    >>> damper.step(0.01) < 0  # a positive torque of the beam moves the reference backward
     True
     """
 
@@ -66,12 +66,12 @@ class VibrationDamper:
         self._state = 0.0, 0.0, 0.0
 
     def step(self, coupling_torque_nm: float) -> float:
-        """Return by how much the reference is moved in this tick, in rad.
+        """Return the movement of the reference in this tick, in rad.
 
         Parameters
         ----------
         coupling_torque_nm
-            What the sensor measures.
+            Measured torque.
         """
         self._state, moved_rad = self._law.advance(self._state, coupling_torque_nm)
         return moved_rad
@@ -81,7 +81,7 @@ _Signal = TypeVar("_Signal", float, Real)
 
 
 class _Law:
-    """The recursion, of numbers in the control loop and of rows over its states in the design."""
+    """Recursion over numbers in the control loop, or over rows of its states in the design."""
 
     def __init__(self, settings: DamperSettings, rate_hz: float) -> None:
         self._gain = settings.yield_rad_per_nm_s / rate_hz
@@ -92,7 +92,7 @@ class _Law:
     def advance(
         self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
     ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
-        """Return the next state, of both filters and the leaking integral, and the movement."""
+        """Return the next state (both filters, leaky integral) and the movement."""
         fast, slow, yielded = state
         fast = fast + self._take * (torque - fast)
         slow = slow + self._leak * (fast - slow)
@@ -112,15 +112,15 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     Returns
     -------
     DamperSettings or None
-        The strongest that leaves the loop stable on beams of several stiffnesses with next to no
-        damping of their own; None where none does, or there is no beam.
+        The strongest damping that leaves the loop stable on beams of several stiffnesses with
+        almost no damping of their own; None without one, or without a beam.
 
     Raises
     ------
     RealisationError
         If such a beam cannot be realised.
     """
-    # Late: the control process damps by what was designed before, and starts sooner without these.
+    # Imported here: the control process uses a finished design, and starts sooner without these.
     from rigd.beam import undamped_frequencies_rad_s
     from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, light_beam
 
@@ -139,7 +139,7 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     loops = [close_loop(light_beam(model, beam)) for beam in beams]
     for _ in range(_HALVINGS):
         growths = [damped_poles(each, settings).real.max() for each in loops]
-        # As much as a loop without it may grow, on beams with next to no damping of their own.
+        # The same growth as without it is allowed, on beams with almost no damping of their own.
         if max(growths) <= MAX_GROWTH_PER_S:
             return settings
         settings = replace(settings, yield_rad_per_nm_s=0.5 * settings.yield_rad_per_nm_s)

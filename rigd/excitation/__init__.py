@@ -1,10 +1,10 @@
 """Reference trajectories: chirp, hold, step, multisine, narrow sweeps, moves, from a file.
 
 A reference is relative to the angle at which the session starts. Every excitation has the same
-three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). Offers a
-function per kind (`chirp` … `from_csv`, `modes`, `move`) and `make_excitation` for one by its name;
-the module `moves` has the paths that moves consist of, `targets` the precisions to search for.
-Whether a rig can follow a reference is not known here: `rigd.runner` predicts it.
+three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). The package
+has a function per kind (`chirp` … `from_csv`, `modes`, `move`) and `make_excitation` for one by its
+name; the module `moves` has the paths of which moves consist, `targets` the precisions to search
+for. `rigd.runner` predicts whether a rig can follow a reference.
 """
 
 import lazy_loader as lazy

@@ -52,14 +52,14 @@ BY_PARAMETER: Final = {
 """Names by which the exact model is differentiated, where they differ."""
 
 _OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2", *_OF_ENDS)
-"""Parameters beside beam and damping; 0 where nothing is said of them."""
+"""Parameters in addition to beam and damping; 0 by default."""
 
 TOLERATED: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
-"""By what a mode of an antenna differs from that of the beam, with its standard deviation over the
-uniformity, as the analyser has it. The number of the mode follows the name."""
+"""Difference between a mode of the antenna and that of the beam: its standard deviation over the
+uniformity, as the analyser defines it. The mode's number follows the name."""
 
 MODAL: Final = (*TOLERATED, "ln_damping_ratio", "residue_phase_rad")
-"""What a mode of the modal model is free in."""
+"""Free constants of each mode of the modal model."""
 
 _BACKGROUND: Final = 5
 """Terms of the modal model's background."""
@@ -67,26 +67,26 @@ _BACKGROUND: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class BeamEstimate:
-    """The beam as a fit found it, with the noise that the torque had."""
+    """Estimated beam, with the noise of its torque."""
 
     beam: Beam
     """Length as given, density and stiffness as estimated."""
     damping: Damping
-    """Damping as estimated; a coefficient of 0 is a kind of damping that the structure has not."""
+    """Damping as estimated; a coefficient of 0 means that the structure has no such damping."""
     names: tuple[str, ...]
-    """Parameters that the fit leaves free, of `PARAMETERS`, and deviations of modes."""
+    """Free parameters of the fit, of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: Real
-    """Shape (m,), increasing: where the spectrum of the noise is given."""
+    """Shape (m,), increasing: frequencies of the noise spectrum."""
     noise_nm2_per_hz: Real
     """Shape (m,): one-sided power spectral density of the torque's noise."""
     delay_s: float = 0.0
-    """By how much the torque is older than the angle."""
+    """Delay of the torque relative to the angle."""
     tool_inertia_kg_m2: float = 0.0
     """Inertia between torque sensor and beam."""
     tip_mass_kg: float = 0.0
     """Point mass at the tip."""
     root_compliance_rad_per_nm: float = 0.0
-    """By how much the clamp turns for a torque."""
+    """Rotation of the clamp per torque."""
     stiffness_offsets: tuple[float, ...] = ()
     """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
     uniformity: float = 0.0
@@ -94,20 +94,20 @@ class BeamEstimate:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Take over an estimate from JSON.
+        """Return an estimate from JSON.
 
         Parameters
         ----------
         document
             ``beam`` with the keys of `Beam`; ``damping`` with zeta, alpha, gamma and lambda;
-            ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and perhaps
+            ``names``; ``noise`` with ``frequency_hz`` and ``nm2_per_hz``, one-sided; and optionally
             ``delay_s``, ``tool_inertia_kg_m2``, ``tip_mass_kg``, ``root_compliance_rad_per_nm``
             and ``stiffness_offsets``. Other keys are ignored.
 
         Raises
         ------
         ExcitationError
-            If a key is missing, or its value is of no use.
+            If a key is missing or its value is invalid.
         """
         try:
             damping, noise = document["damping"], document["noise"]
@@ -141,7 +141,7 @@ class BeamEstimate:
     def stated(
         cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
     ) -> "BeamEstimate":
-        """Return a beam that is known beforehand, all parameters of a uniform one free.
+        """Return the estimate of a beam that is known beforehand, with all its parameters free.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class BeamEstimate:
         noise_nm2_per_hz
             One-sided power spectral density of the torque's noise, white.
         tip_mass_kg
-            Point mass at the tip, held.
+            Point mass at the tip, fixed.
         """
         absent = {
             *(() if damping.zeta else ("zeta", "alpha")),
@@ -166,12 +166,12 @@ class BeamEstimate:
         )
 
     def check(self) -> None:
-        """Refuse what no record can be predicted from.
+        """Raise if the estimate cannot predict a record.
 
         Raises
         ------
         ExcitationError
-            If a value is not finite or has no meaning, or nothing is free.
+            If a value is not finite or out of range, or no parameter is free.
         """
         beam, damping = self.beam, self.damping
         for key, value, least, below in (
@@ -203,7 +203,9 @@ class BeamEstimate:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
 
     def with_tolerance(self, uniformity: float) -> "BeamEstimate":
-        """Leave the modes free within a tolerance of the geometry, and the orders of the damping.
+        """Return the estimate with modes free within a tolerance of the geometry.
+
+        The orders of the damping are free as well.
 
         Parameters
         ----------
@@ -220,7 +222,7 @@ class BeamEstimate:
         return replace(self, names=free, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Leave the constants of each mode free and a background, and nothing of the beam."""
+        """Return the estimate with free constants of each mode and a background only."""
         modes = [mode.number for mode in self.modes()]
         constants = [f"{name}_{number}" for number in modes for name in MODAL]
         background = [f"background_{power}" for power in range(_BACKGROUND)]
@@ -228,7 +230,7 @@ class BeamEstimate:
 
     @property
     def values(self) -> dict[str, float]:
-        """Values of all `PARAMETERS` by name."""
+        """Return the values of all `PARAMETERS` by name."""
         beam, damping = self.beam, self.damping
         return dict(
             zip(
@@ -244,7 +246,7 @@ class BeamEstimate:
 
     @property
     def loaded(self) -> LoadedBeam | None:
-        """The beam with what is at its ends; None if nothing is, and nothing of it is free."""
+        """The beam with tip mass and root compliance; None if it has none and none is free."""
         at_ends = self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         if not at_ends and set(_OF_ENDS).isdisjoint(self.names):
             return None
@@ -252,7 +254,7 @@ class BeamEstimate:
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with what is at its ends."""
+        """The beam with tip mass and root compliance."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -262,7 +264,7 @@ class BeamEstimate:
         )
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple["EstimatedMode", ...]:
-        """Modes that oscillate below a frequency, with what moves them.
+        """Return the modes that oscillate below a frequency, with their gradients.
 
         Parameters
         ----------
@@ -302,9 +304,9 @@ class BeamEstimate:
         for (number, pole), row in zip(shown.items(), moved, strict=True):
             gradient = np.zeros(len(self.names), dtype=np.complex128)
             gradient[: len(parameters)] = row * scales
-            for place, name in enumerate(self.names):
+            for index, name in enumerate(self.names):
                 if name.endswith(f"_{number}"):
-                    gradient[place] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
+                    gradient[index] = CHANGES[name.rpartition("_")[0]](pole, 0j)[0]
             found.append(EstimatedMode(number, pole, gradient))
         return tuple(found)
 
@@ -324,7 +326,7 @@ class EstimatedMode:
     """A mode of the estimated beam with locked hub."""
 
     number: int
-    """From 1 on."""
+    """From 1."""
     pole_rad_s: complex
     """Upper one of the pair."""
     gradient: Complex
@@ -337,7 +339,7 @@ class EstimatedMode:
 
     @property
     def damping_ratio(self) -> float:
-        """Share of the critical damping."""
+        """Fraction of critical damping."""
         return -self.pole_rad_s.real / abs(self.pole_rad_s)
 
     @property

@@ -1,14 +1,14 @@
 """Fisher information of a record on the parameters of the beam, before or after it is recorded.
 
-The torque that a motion of the motor causes is known but for the parameters; its derivatives,
-whitened with the spectrum of the noise, tell how precisely a whole-record fit will determine them:
-the inverse of their Gram matrix is the covariance that no unbiased estimate surpasses (Cramér and
-Rao), and which the fit of `analysis` attains. What that fit projects out is projected out here as
-well: free decay from before the record, offset and drift of the torque.
+The torque caused by a motion of the motor is known except for the parameters. Its derivatives,
+whitened with the spectrum of the noise, give the precision of a whole-record fit: the inverse of
+their Gram matrix is the lower bound of any unbiased estimate's covariance (Cramér and
+Rao), and the fit of `analysis` attains it. The nuisance terms of that fit are projected out here
+as well: free decay from before the record, offset and drift of the torque.
 
-All of it happens in time, at a reduced rate: the derivatives of a record and of a piece after it
-add up sample by sample, so that a piece costs no more than its own length, with the ringing of all
-earlier ones counted.
+The computation is in the time domain, at a reduced rate: the derivatives of a record and of a
+segment after it add up sample by sample. A segment costs no more than its own length, and the
+vibration after all earlier ones counts.
 
 References
 ----------
@@ -47,12 +47,12 @@ _PRIOR_STD: Final = {
     "bending_stiffness_n_m2": 0.5,
     "delay_s": 0.05,
 }
-"""What is known without any record: coefficients within a factor of 20, orders within (0, 2)."""
+"""Prior knowledge without a record: coefficients within a factor of 20, orders within (0, 2)."""
 
 _RATE_OVER_BAND: Final = 2.4
 _TAPER: Final = 1.1
 _DECAY: Final = 5.0
-"""What wraps round in a transform of twice the length has decayed by exp(-5)."""
+"""The wrap-around of a transform of twice the length has decayed by exp(-5)."""
 
 
 # Whitened derivatives of the torque
@@ -60,10 +60,10 @@ _DECAY: Final = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueModel:
-    """The exact model on the frequencies of records of one length, ready for any motion."""
+    """Exact model on the frequencies of records of one length, for any motion."""
 
     estimate: BeamEstimate
-    """What the torque is computed from."""
+    """Parameters of the model."""
     rate_hz: float
     """Rate of the angle."""
     ticks: int
@@ -99,7 +99,7 @@ class TorqueModel:
         sample_hz = rate_hz / factor
         sigma = _DECAY * sample_hz / samples
         frequency_hz = np.fft.rfftfreq(samples, 1.0 / sample_hz)
-        # What lies above is no part of the band, nor of any mode that is seen.
+        # Higher frequencies belong neither to the band nor to a visible mode.
         frequency_hz = frequency_hz[frequency_hz <= _TAPER * BAND_HZ]
         s = sigma + 2j * pi * frequency_hz
         kernels = whitened_kernels(estimate, s, sample_hz)
@@ -113,18 +113,18 @@ class TorqueModel:
         return self.rate_hz / self.factor
 
     def spectrum(self, angle_rad: Real) -> Complex:
-        """Transform of an angle from rest, (n,) with n at most `ticks`, in the band."""
+        """Return the transform of an angle from rest, (n,) with n at most `ticks`, in the band."""
         time_s = np.arange(angle_rad.size) / self.rate_hz
         faded = angle_rad * np.exp(-self.sigma_per_s * time_s)
         spectrum: Complex = np.fft.rfft(faded, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
     def rows(self, spectrum: Complex) -> Real:
-        """Whitened derivatives of the torque by the parameters, shape (k, ticks / factor)."""
+        """Return whitened derivatives of the torque, shape (k, ticks / factor)."""
         return self._in_time(self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1)
 
     def motion(self, spectrum: Complex) -> Real:
-        """Torque (N·m) and slope of the tip (rad) at every tick, shape (2, ticks)."""
+        """Return torque (N·m) and slope of the tip (rad) at every tick, shape (2, ticks)."""
         return self._in_time(self.channels * spectrum, self.ticks, self.factor)
 
     def _in_time(self, spectra: Complex, samples: int, finer: int) -> Real:
@@ -135,7 +135,7 @@ class TorqueModel:
 
 
 def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
-    """Responses from the angle to torques in N·m/rad, and to the slope of the tip.
+    """Return the responses from the angle to torques in N·m/rad and to the slope of the tip.
 
     Parameters
     ----------
@@ -147,8 +147,8 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     Returns
     -------
     of_beam, measured, slope
-        Torque on the beam; as it is measured, tool inertia and delay included; slope of the tip
-        against the root.
+        Torque on the beam; measured torque, with tool inertia and delay; slope of the tip against
+        the root.
     """
     loaded = estimate.loaded
     if loaded is None:
@@ -167,7 +167,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     Parameters
     ----------
     estimate
-        Beam, damping, noise, and what is free.
+        Beam, damping, noise, and the free parameters.
     s
         Laplace variable in rad/s, shape (K,).
     sample_hz
@@ -201,7 +201,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
 
 
 def _by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
-    """Differentiate the response by the constants of modes that are free and the background."""
+    """Differentiate the response by the constants of free modes and of the background."""
     poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
     rows = []
     for name in estimate.names:
@@ -229,7 +229,7 @@ def reduction(rate_hz: float) -> int:
 def _whitening(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Weight that gives the noise of a sample variance 1, fading at the end of the band."""
+    """Return the weight that gives a sample's noise variance 1, fading at the end of the band."""
     density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
@@ -240,7 +240,7 @@ def _whitening(
 
 
 def _quick(least: int) -> int:
-    """Length of which a transform is quick: at most an eighth more than the least one."""
+    """Return a length with a fast transform, at most an eighth above the least one."""
     unit = 1 << max(0, least.bit_length() - 4)
     return -(-least // unit) * unit
 
@@ -250,10 +250,10 @@ def _quick(least: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """A record that goes on: its information, and what of it still rings."""
+    """Information of a record up to now, and the vibration that continues after it."""
 
     estimate: BeamEstimate
-    """What it was computed with."""
+    """Estimate from which it was computed."""
     before: Real
     """(k + m, k + m): Gram matrix of the derivatives and of m nuisance terms up to now."""
     ahead: Real
@@ -276,7 +276,7 @@ class RecordSoFar:
         rate_hz
             Rate of the angle.
         ahead_s
-            How far ahead the ringing is wanted.
+            Time from now on for which the vibration is computed.
         """
         factor = reduction(rate_hz)
         # Rest before it, so that a sample lies at its end.
@@ -300,20 +300,20 @@ class RecordSoFar:
 
     @property
     def through(self) -> Real:
-        """Take what the nuisance terms explain out of the derivatives: (k, k + m)."""
+        """Projection of the nuisance terms out of the derivatives: (k, k + m)."""
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_explained(self.before, k)], axis=1)
 
     def after(self, more: Real | None, samples: int) -> Real:
-        """Information (k, k) when so many more samples are recorded.
+        """Return the information (k, k) after a number of further samples.
 
         Parameters
         ----------
         more
-            Shape (k, n): derivatives that a piece adds from now on, n at least `samples`; None: the
-            motor is held.
+            Shape (k, n): derivatives that a segment adds from now on, n at least `samples`; None:
+            the motor is held.
         samples
-            Samples from now on that count.
+            Number of further samples that count.
         """
         rows = self.ahead[:, :samples]
         if more is not None:
@@ -323,18 +323,18 @@ class RecordSoFar:
 
 
 def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real:
-    """Fisher information of a record on the free parameters of the beam, shape (k, k).
+    """Return a record's Fisher information on the free parameters of the beam, shape (k, k).
 
-    Free decay from before the record, and offset and drift of the torque, are unknown as well:
-    what they take away is taken away. In the order of ``estimate.names``, zeta, gamma, density over
-    stiffness and stiffness counted by their logarithms. Its inverse is the least covariance.
+    Free decay from before the record, and offset and drift of the torque, are unknown as well and
+    reduce the information. In the order of ``estimate.names``; zeta, gamma, density over stiffness
+    and stiffness count by their logarithms. Its inverse is the least covariance.
 
     Parameters
     ----------
     angle_rad
         Shape (n,): motor angle, measured or predicted; the beam rested at the first.
     estimate
-        Beam, damping, noise, and what is free.
+        Beam, damping, noise, and the free parameters.
     rate_hz
         Rate of the angle.
 
@@ -359,21 +359,21 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
 
 
 def projected(gram: Real, k: int) -> Real:
-    """Information on the first k parameters when all others are unknown, shape (k, k).
+    """Return the information on the first k parameters if all others are unknown, shape (k, k).
 
     Parameters
     ----------
     gram
         Shape (k + m, k + m): of the derivatives.
     k
-        Number of the parameters that are wanted.
+        Number of parameters of interest.
     """
     information: Real = gram[:k, :k] - _explained(gram, k) @ gram[k:, :k]
     return 0.5 * (information + information.T)
 
 
 def _explained(gram: Real, k: int) -> Real:
-    """Regression of the first k derivatives on the others, shape (k, m)."""
+    """Return the regression of the first k derivatives on the others, shape (k, m)."""
     size = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
     unit = gram[k:, k:] / np.outer(size, size) + 1e-12 * np.eye(size.size)
     factors: Real = np.linalg.solve(unit, gram[k:, :k] / size[:, None]).T / size
@@ -381,7 +381,7 @@ def _explained(gram: Real, k: int) -> Real:
 
 
 def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
-    """Covariance for an information, with the little that is known without any record."""
+    """Return the covariance for an information, with prior knowledge of each parameter."""
     prior = np.array([_prior_std(name, estimate) for name in estimate.names])
     # In units of the prior the matrix is well scaled wherever something is known.
     unit = information * np.outer(prior, prior) + np.eye(len(prior))
@@ -407,7 +407,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
 
 
 def _nuisance(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Whitened decays from the first sample on, offset and drift, shape (m, samples)."""
+    """Return whitened decays from the first sample, offset and drift, shape (m, samples)."""
     time_s = np.arange(samples) / sample_hz
     poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
     decays = np.exp(np.outer(poles, time_s))

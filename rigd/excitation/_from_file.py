@@ -30,8 +30,8 @@ def from_csv(
 ) -> Excitation:
     """Read a reference from a text file.
 
-    Separator, decimal sign, head and encoding are found as `rigd.text_table.read_table` does; a
-    line that does not fit is refused.
+    `rigd.text_table.read_table` detects separator, decimal sign, heading and encoding; an
+    invalid line is an error.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def from_csv(
     Raises
     ------
     ExcitationError
-        If the file cannot be read, or a line of it is not what it should be.
+        If the file cannot be read, or a line of it is invalid.
     """
     path = Path(path)
     times, angles = _read_columns(path)
@@ -76,14 +76,14 @@ def from_csv(
 def _read_columns(
     path: Path,
 ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
-    """Return times in s, None if there is one angle a tick, and angles in rad."""
+    """Return times in s (None for one angle a tick) and angles in rad."""
     try:
         with open_plain_file(path, MOST_BYTES) as file:
             table = _table(file.buffer)
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
     except TableError as error:
-        # Without its text: the daemon reads files that whoever commands it may not be allowed to.
+        # Without its text: the daemon may read files that the requesting user may not.
         raise ExcitationError(f"{path}: {error.unquoted()}") from error
     angles = next(column for name, column in table.columns.items() if name != TIME)
     times = table.columns.get(TIME)

@@ -1,4 +1,4 @@
-"""Excitations by name and parameters, as a request or a command line gives them."""
+"""Excitations by name and parameters, from a request or a command line."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rigd.excitation._from_file import from_csv
-from rigd.excitation._narrow_sweeps import LoopPreview, modes
+from rigd.excitation._narrow_sweeps import SweepRig, modes
 from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
@@ -15,8 +15,8 @@ from rigd.excitation._until import ScanRig, until
 Value = float | int | str | Path
 
 
-class RigPreview(LoopPreview, MoveRig, ScanRig, Protocol):
-    """What an excitation that is made for one rig may know of it."""
+class RigPreview(SweepRig, MoveRig, ScanRig, Protocol):
+    """Interface to a rig for which an excitation is made."""
 
 
 KINDS: Mapping[str, Callable[..., Excitation]] = {
@@ -39,18 +39,18 @@ FROM_THE_RIG = frozenset({"rate_hz", "rig", "tip_slope_rad"})
 def make_excitation(
     kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: RigPreview | None = None
 ) -> Excitation:
-    """Make one for a rig's rate.
+    """Return an excitation at a rig's rate.
 
     Parameters
     ----------
     kind
         A name of `KINDS`.
     parameters
-        Keyword arguments of its function; what is left out has its default.
+        Keyword arguments of its function; missing ones have their defaults.
     rate_hz
         Ticks a second.
     rig
-        For an excitation that is made for one rig.
+        Rig for which the excitation is made, if it depends on one.
 
     Raises
     ------

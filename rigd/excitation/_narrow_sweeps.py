@@ -1,7 +1,7 @@
 """Narrow sweeps over the modes of a beam: their bands, amplitudes and times.
 
-A table of modes says where the bands lie. The amplitude in each is what the rig's limits allow, and
-the time in each follows from what a sweep tells of the damping. That is measured by the Fisher
+A table of modes gives the bands. The rig's limits give the amplitude in each, and the information
+on the damping gives the time in each. That is measured by the Fisher
 information of the exact model (`rigd.beam`): information from the torque, with white noise of any
 size on it, on the damping's parameters, with density, stiffness, delay and tool inertia free as
 well. A band that is swept slowly gives information in proportion to the time spent there, so the
@@ -25,7 +25,7 @@ from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
-    SHARE_OF_LIMITS,
+    LIMIT_FRACTION,
     Excitation,
     ExcitationError,
     assemble,
@@ -41,8 +41,8 @@ Complex = NDArray[np.complex128]
 _EASINGS: Final = 8
 _CLOSE_ENOUGH: Final = 1.005
 
-LEAST_SHARE: Final = 0.5
-"""Least share of an equal part of the time for every band: a mode is never left out."""
+LEAST_TIME_FRACTION: Final = 0.5
+"""Least time of a band, as a fraction of an equal division: no mode is left out."""
 
 SAME_MODE: Final = 1.1
 """Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
@@ -56,7 +56,7 @@ _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class _Entry(BaseModel):
-    """A mode as one fit found it; null where the fit has none, 0 Hz where it does not oscillate."""
+    """Mode of one fit; null where the fit has none, 0 Hz where it does not oscillate."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -71,7 +71,7 @@ class _Entry(BaseModel):
 
 
 class _Number(BaseModel):
-    """A number of a headline."""
+    """Number of a headline."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -80,7 +80,7 @@ class _Number(BaseModel):
 
 
 class _HeadlineMode(BaseModel):
-    """A mode of a headline: of the modal model where the record shows it."""
+    """Mode of a headline: of the modal model where the record shows it."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -89,7 +89,7 @@ class _HeadlineMode(BaseModel):
 
     @property
     def entry(self) -> _Entry:
-        """The same as one fit has it."""
+        """Return it in the form of one fit's mode."""
         return _Entry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,
@@ -98,7 +98,7 @@ class _HeadlineMode(BaseModel):
 
 
 class _Headline(BaseModel):
-    """Results that an analysis reports first of one record, or of a campaign."""
+    """Main results that an analysis reports of one record or of a campaign."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -106,7 +106,7 @@ class _Headline(BaseModel):
 
 
 class _Document(BaseModel):
-    """What is needed of the analyser's document."""
+    """The part of the analyser's document that is used here."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -121,7 +121,7 @@ class FoundMode:
     frequency_hz: float
     damping_ratio: float
     uncertainty_hz: float
-    """Uncertainty of the frequency: two standard deviations, as stated or as the fits differ."""
+    """Uncertainty of the frequency: two standard deviations, stated or from the fits' scatter."""
 
 
 def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
@@ -131,15 +131,14 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
     ----------
     path
         JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
-        and ``damping_ratio``, and perhaps ``frequency_std_hz``. More keys are ignored. Where
-        several fits found a mode, their medians are taken; where some of them are of the
-        estimator ``record``, only these. Modes of ``headlines``, those of the modal model, take
-        their place.
+        and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. Where
+        several fits found a mode, their medians are used; fits of the estimator ``record`` have
+        priority over others. Modes of ``headlines``, those of the modal model, replace all these.
 
     Raises
     ------
     ExcitationError
-        If the file cannot be read, or is not what it should be.
+        If the file cannot be read or has an invalid value.
     """
     path = Path(path)
     try:
@@ -169,7 +168,7 @@ def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
 
 
 def _complaint(detail: ErrorDetails) -> str:
-    """Say what is wrong with one value, in one sentence with a remedy."""
+    """Describe one invalid value, in one sentence with a remedy."""
     where = ""
     for part in detail["loc"]:
         where += f"[{part}]" if isinstance(part, int) else f".{part}" if where else part
@@ -192,7 +191,7 @@ def _complaint(detail: ErrorDetails) -> str:
 
 
 def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
-    """Group the entries of several fits that are one mode."""
+    """Group the entries of several fits that describe one mode."""
     group: list[_Entry] = []
     for entry in sorted(entries, key=_frequency_hz):
         if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
@@ -206,7 +205,7 @@ def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
 def _merged(group: Sequence[_Entry]) -> FoundMode:
     middle_hz = median(_frequency_hz(entry) for entry in group)
     stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
-    # Fits of structures that do not suit lie far off: the median of the distances tolerates them.
+    # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
     between_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
     return FoundMode(
         frequency_hz=middle_hz,
@@ -225,25 +224,25 @@ _POINTS: Final = 64
 """Frequencies in a band at which the information is computed."""
 
 _ROUNDS: Final = 500
-_RIDGE: Final = 1e-12
-"""Relative ridge on the information: few bands leave some parameter combinations undetermined."""
+_REGULARISATION: Final = 1e-12
+"""Relative regularisation: few bands leave some combinations of parameters undetermined."""
 
 
-class LoopPreview(Protocol):
-    """Loop preview: what is known of the rig before it moves."""
+class SweepRig(Protocol):
+    """Interface to a rig's predicted behaviour before it moves."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen as the profile has it."""
+        """The specimen according to the profile."""
 
     def tracking(self, frequency_hz: Real) -> Complex:
-        """Angle over reference, of the shape given."""
+        """Return angle over reference, in the shape of the frequencies."""
 
     def share_of_limits(self, reference_rad: Real) -> float:
-        """Largest share of a limit that a reference (n,) is predicted to take."""
+        """Return the largest predicted fraction of a limit for a reference (n,)."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Largest slope of the free end that is predicted for a reference (n,)."""
+        """Return the largest predicted slope of the free end for a reference (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +255,7 @@ class Band:
 
     @classmethod
     def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Lay one around a mode, so many half-power widths to either side of where it may lie."""
+        """Return the band around a mode: so many half-power widths beyond its uncertainty."""
         half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
@@ -270,47 +269,45 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def shares_of_time(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview
-) -> Real:
-    """Split the time over bands so that the damping comes out most precisely.
+def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
+    """Return the time fractions of the bands that determine the damping most precisely.
 
-    The geometric mean of the standard deviations of the damping's parameters is minimised, with all
-    other parameters free, by multiplicative steps (D. M. Titterington, 1976; for other criteria
-    than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
+    They minimise the geometric mean of the standard deviations of the damping's parameters, with
+    all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
+    other than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
 
     Parameters
     ----------
     bands, amplitudes_rad
-        Bands and what the reference's amplitude is in each.
+        Bands, and the amplitude of the reference in each.
     rig
-        Tells how much of it becomes angle.
+        Gives the angle for a reference.
 
     Returns
     -------
     ndarray, shape (len(bands),)
-        Shares, together 1.
+        Fractions with the sum 1.
     """
     damping = damping_of([band.mode for band in bands], rig.beam)
     rates, wanted = _information_rates(bands, amplitudes_rad, rig, damping)
     scale = np.sqrt(np.einsum("bii->i", rates))
     rates = rates / np.outer(scale, scale)
-    shares = np.full(len(bands), 1.0 / len(bands))
+    fractions = np.full(len(bands), 1.0 / len(bands))
     for _ in range(_ROUNDS):
-        information = np.tensordot(shares, rates, axes=1)
-        covariance = np.linalg.inv(information + _RIDGE * np.eye(len(scale)))
+        information = np.tensordot(fractions, rates, axes=1)
+        covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(scale)))
         lines = covariance[:wanted]
         of_bands = np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:wanted]
-        shares = shares * np.sqrt(of_bands.sum(axis=1))
-        shares /= shares.sum()
-    return shares
+        fractions = fractions * np.sqrt(of_bands.sum(axis=1))
+        fractions /= fractions.sum()
+    return fractions
 
 
 def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
-    """Damping of first order, internal and external, that gives modes their damping ratios.
+    """Fit a first-order damping, internal and external, to the modes' damping ratios.
 
-    By relative least squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``, neither
-    coefficient negative.
+    Relative least squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``; no coefficient
+    is negative.
     """
     omega = np.array([2.0 * pi * mode.frequency_hz for mode in modes])
     ratio = np.array([mode.damping_ratio for mode in modes])
@@ -324,11 +321,11 @@ def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 
 def _information_rates(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview, damping: Damping
+    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
-    """Information in a second of each band, (bands, k, k); the damping's parameters come first.
+    """Return the information per second of each band, (bands, k, k), damping parameters first.
 
-    A coefficient counts relatively. The order of a damping that is absent cannot be told.
+    Coefficients are relative. The order of an absent damping cannot be estimated.
     """
     factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
     orders = {"alpha": damping.zeta, "lambda": damping.gamma}
@@ -347,9 +344,9 @@ def _information_rates(
 
 
 def _tuned(beam: Beam, frequency_hz: float) -> Beam:
-    """Change the density so that the nearest undamped mode lies at a frequency.
+    """Change the density so that the nearest undamped mode has the given frequency.
 
-    A profile's beam is off by more than the width of such a band.
+    The profile's beam is wrong by more than the width of such a band.
     """
     omega = 2.0 * pi * frequency_hz
     modes_rad_s = undamped_frequencies_rad_s(beam, 12)
@@ -376,9 +373,9 @@ def modes(
     ring_down_s: float = 15.0,
     taper_s: float = 1.0,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
-    rig: LoopPreview | None = None,
+    rig: SweepRig | None = None,
 ) -> Excitation:
-    """Linear sweeps through narrow bands round modes, one after the other.
+    """Return linear sweeps through narrow bands around modes, one after the other.
 
     Parameters
     ----------
@@ -389,9 +386,9 @@ def modes(
     amplitude_rad
         Amplitude in each band; lower where the rig's limits or the slope of the tip require it.
     stop_hz
-        Modes above are left out.
+        Modes above it are left out.
     widths
-        Half-power widths swept to either side of a mode, beside its frequency's uncertainty.
+        Half-power widths swept on either side of a mode, in addition to its uncertainty.
     duration_s
         Duration of all sweeps together.
     rest_s, ring_down_s
@@ -401,13 +398,13 @@ def modes(
     tip_slope_rad
         Largest slope of the beam's free end, of which the sweeps use 90 %.
     rig
-        Limits the amplitudes and splits the time by what each band tells of the damping. Without
-        it neither happens.
+        Limits the amplitudes, and divides the time by the information on the damping. None:
+        equal amplitudes and times.
 
     Raises
     ------
     ExcitationError
-        If an option or the file is not what it should be.
+        If an option is out of range or the file is invalid.
     """
     positive("amplitude_rad", amplitude_rad, "rad")
     within_a_turn("amplitude_rad", amplitude_rad)
@@ -419,18 +416,19 @@ def modes(
     first, end = segments["sweep"]
     bands = _bands(Path(path), stop_hz, widths, rate_hz)
     fades = 2 * round(taper_s * rate_hz)
-    if fades < 2 or LEAST_SHARE * (end - first) / len(bands) < fades:
+    if fades < 2 or LEAST_TIME_FRACTION * (end - first) / len(bands) < fades:
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
             f"both ends of {len(bands)} sweeps; choose at least "
-            f"{2.0 * taper_s * len(bands) / LEAST_SHARE:g} s, or a taper_s from {2 / rate_hz:g} s."
+            f"{2.0 * taper_s * len(bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from "
+            f"{2 / rate_hz:g} s."
         )
     lengths = _lengths(np.full(len(bands), 1.0 / len(bands)), end - first)
     amplitudes_rad = [amplitude_rad] * len(bands)
     sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
     if rig is not None:
         eased_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
-        lengths = _lengths(_at_least(shares_of_time(bands, eased_rad, rig)), end - first)
+        lengths = _lengths(_at_least(time_fractions(bands, eased_rad, rig)), end - first)
         sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
         amplitudes_rad = _within_limits(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
@@ -455,7 +453,7 @@ def modes(
 
 
 def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
-    """Bands in the order of their sweeps: what rings longest comes first and rings on."""
+    """Return the bands in the order of their sweeps: the slowest decay comes first."""
     found = read_modes(path)
     inside = [mode for mode in found if mode.frequency_hz <= stop_hz]
     if not inside:
@@ -470,11 +468,11 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
 
 
 def _within_limits(
-    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: LoopPreview
+    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
-    """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
+    """Return the amplitude of each sweep, reduced where the rig's limits require it.
 
-    One after the other, since a mode still rings while the next is swept.
+    One after the other, since a mode still rings during the next sweep.
     """
     amplitudes_rad = []
     before_rad = np.empty(0)
@@ -482,36 +480,36 @@ def _within_limits(
         eased_rad = amplitude_rad
         for _ in range(_EASINGS):
             so_far_rad = np.concatenate([before_rad, eased_rad * sweep])
-            share = max(
+            fraction = max(
                 rig.share_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
             )
-            if share <= SHARE_OF_LIMITS * _CLOSE_ENOUGH:
+            if fraction <= LIMIT_FRACTION * _CLOSE_ENOUGH:
                 break
-            eased_rad *= SHARE_OF_LIMITS / share
+            eased_rad *= LIMIT_FRACTION / fraction
         amplitudes_rad.append(eased_rad)
         before_rad = np.concatenate([before_rad, eased_rad * sweep])
     return amplitudes_rad
 
 
-def _lengths(shares: Real, ticks: int) -> list[int]:
-    """Split ticks by shares, without losing one to rounding."""
-    ends = np.round(np.cumsum(shares) * ticks).astype(int)
+def _lengths(fractions: Real, ticks: int) -> list[int]:
+    """Divide ticks by fractions, without losing one to rounding."""
+    ends = np.round(np.cumsum(fractions) * ticks).astype(int)
     return [int(length) for length in np.diff(ends, prepend=0)]
 
 
-def _at_least(shares: Real) -> Real:
-    """Raise shares to the least one, at the cost of the others in proportion."""
-    least = LEAST_SHARE / len(shares)
-    low = shares < least
-    for _ in shares:
-        rest = (1.0 - least * np.count_nonzero(low)) / shares[~low].sum()
-        raised = np.where(low, least, shares * rest)
+def _at_least(fractions: Real) -> Real:
+    """Raise fractions to the least one, at the cost of the others in proportion."""
+    least = LEAST_TIME_FRACTION / len(fractions)
+    low = fractions < least
+    for _ in fractions:
+        rest = (1.0 - least * np.count_nonzero(low)) / fractions[~low].sum()
+        raised = np.where(low, least, fractions * rest)
         low = raised <= least
     return raised
 
 
 def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> Real:
-    """Sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks each."""
+    """Return a sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks."""
     duration_s = ticks / rate_hz
     t = np.arange(ticks) / rate_hz
     phase = (

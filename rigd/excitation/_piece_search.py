@@ -1,6 +1,6 @@
-"""Search for the next piece of excitation: sweeps, what they tell, and the limits they keep.
+"""Search for the next segment of excitation: its sweeps, information and limits.
 
-See `rigd.excitation.experiment_design`, which it serves.
+Serves `rigd.excitation.experiment_design`.
 """
 
 from collections.abc import Collection
@@ -21,84 +21,84 @@ from rigd.excitation._fisher_information import (
     whitened_kernels,
 )
 from rigd.excitation._shortest_move import MovePlant
-from rigd.excitation._signals import SHARE_OF_LIMITS, ExcitationError
+from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Precision, Quantities
 
 Real = NDArray[np.float64]
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
-"""Durations of pieces."""
+"""Candidate durations of a segment."""
 SHORTEST_S: Final = DURATIONS_S[0]
-"""Duration of the shortest piece."""
+"""Duration of the shortest segment."""
 
 _FADE_S: Final = 0.25
 _SETTLING_S: Final = 0.25
 _TAIL_S: Final = 1.0
-"""Ringing after a piece by which modes that it is not for are brought to rest."""
-LOOK_AHEAD_S: Final = 8.0
-"""How far a plan looks ahead: a mode tells of its damping only after it has swung for a while."""
+"""Time after a segment in which the modes that it does not excite are brought to rest."""
+HORIZON_S: Final = 8.0
+"""Planning horizon: a mode gives information on its damping only after it has rung for a while."""
 _HALF_WIDTH_HZ: Final = 0.5
 _OVER: Final = 2.0
 """Half the width of a sweep over a whole resonance, in its half-power half-widths."""
-_BESIDE: Final = 0.06
-"""Distance of the sweeps beside a mode, relative to its frequency: they tell of stiffness and tool
-inertia, without which the height of a resonance does not tell its damping."""
+_SIDE_OFFSET: Final = 0.06
+"""Distance of the off-resonance sweeps from a mode, relative to its frequency. They determine
+stiffness and tool inertia; without these the height of a resonance does not give the damping."""
 _LINES: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
 """Steady sines of the forecast, in half-power half-widths from a mode."""
 _PHASES: Final = 8
-_SHARES: Final = (1.0, 0.8, 0.5)
-"""Shares of a piece that others are tried with in addition."""
+_FRACTIONS: Final = (1.0, 0.8, 0.5)
+"""Fractions of a segment with which further bands are combined."""
 _ROUNDS: Final = 60
 _EFFICIENCY: Final = 0.7
-"""Time of a mixture of steady sines over that of pieces, which have to ring up (measured)."""
+"""Time of a mixture of steady sines over that of segments, which have to ring up (measured)."""
 _NEVER_S: Final = 1e5
 _TIGHTENINGS: Final = 3
 _THINNED: Final = 4
-"""Limits are looked at in one tick of so many while pieces are compared."""
+"""While segments are compared, limits are checked in one tick of so many."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What the rest of a session is expected to take."""
+    """Expected time until the targets are reached."""
 
     seconds: float
-    """Time until everything asked is reached, if pieces go on to tell as much; infinite: never."""
+    """Time until all targets are reached at the rate of the best segments; infinite: never."""
     reason: str
-    """Why it will not be reached in the time that is left; empty if it will."""
+    """Why the targets are not reached in the remaining time; empty if they are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A piece of excitation; begins and ends at angle, speed and acceleration zero."""
+    """A segment of excitation; begins and ends at angle, speed and acceleration zero."""
 
     name: str
-    """Modes, frequencies, duration and amplitudes, for people."""
+    """Modes, frequencies, duration and amplitudes, as text for the operator."""
     reference_rad: Real
     """Shape (n,): one value per tick, relative to the start angle."""
     angle_rad: Real
-    """Shape (n,): the angle that is predicted for it."""
+    """Shape (n,): the predicted angle."""
     names: tuple[str, ...]
     """Free parameters, in the order of the covariance."""
     covariance: Real
-    """Shape (k, k): expected at the end of the piece; see `information`."""
+    """Shape (k, k): covariance expected at the end of the segment; see `information`."""
     now: tuple[Precision, ...]
-    """Everything asked, as precise as it is expected to be when the piece begins."""
+    """Precision of each target expected at the beginning of the segment."""
     expected: tuple[Precision, ...]
-    """The same at its end."""
+    """Precision of each target expected at its end."""
     forecast: Forecast
-    """When everything is expected to be reached, from the beginning of the piece on."""
+    """When all targets are expected to be reached, from the beginning of the segment."""
     share_of_limits: float
-    """Largest share of a limit, or of the range of small slopes, that is predicted; with what still
-    rings."""
+    """Largest predicted fraction of a limit, or of the range of small slopes, with the remaining
+    vibration included."""
 
 
-# Sweeps that pieces are made of
+# Sweeps of which segments consist
 
 
 @dataclass(frozen=True, slots=True)
 class _Band:
-    """What a sweep goes through, and which mode it is for."""
+    """A band of frequencies to sweep, and the mode that it excites."""
 
     number: int
     middle_hz: float
@@ -109,40 +109,40 @@ class _Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sweep:
-    """Response to a sweep of amplitude 1, of one phase."""
+    """Response to a sweep of amplitude 1 in one phase."""
 
     reference_rad: Real
     """(n,)."""
     angle_rad: Real
     """(n,)."""
     rows: Real
-    """(k, samples): whitened derivatives of the torque from the beginning of the piece on."""
+    """(k, samples): whitened derivatives of the torque from the beginning of the segment."""
     weighted: Real
-    """(q, samples): the combinations of them that count."""
+    """(q, samples): their weighted combinations."""
     channels: Real
-    """(6, ticks): what limits are for, as shares of them."""
+    """(6, ticks): limited quantities, as fractions of their limits."""
     slope: Real
-    """(samples,): slope of the tip as far as one looks ahead, as a share of its limit."""
+    """(samples,): slope of the tip up to the planning horizon, as a fraction of its limit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A piece that could be played, at its amplitude."""
+    """A possible segment at its amplitude."""
 
     duration_s: float
     parts: tuple[tuple[_Band, float], ...]
     """Bands and amplitudes in rad."""
     terms: tuple[tuple[float, _Sweep], ...]
-    """What it is the sum of."""
+    """Sweeps and their factors; the segment is their sum."""
     channels: Real
-    """(6, ticks): thinned out."""
+    """(6, ticks): at one tick in `_THINNED`."""
     weighted: Real
     """(q, samples)."""
     swing: Real
-    """(samples,): slope of the tip as a share of its limit."""
+    """(samples,): slope of the tip as a fraction of its limit."""
     value: float
-    """What it tells as far as one looks ahead, if its first band is driven on after it; in seconds
-    of the best mixture."""
+    """Information up to the planning horizon if the first band is driven on after the segment; in
+    seconds of the best mixture."""
 
     def total(self, name: str) -> Real:
         """Sum one of the arrays of `_Sweep` over the terms."""
@@ -152,16 +152,16 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _GoingOn:
-    """A mode that is driven on after a piece, in two phases."""
+    """Response of a mode that is driven on after a segment, in two phases."""
 
     weighted: Real
     """(2, q, samples): for amplitude 1."""
     per_amplitude: Real
-    """(2, 2): what keeps the mode at its amplitude, real and imaginary."""
+    """(2, 2): factors that hold the amplitude of the mode constant, real and imaginary."""
 
 
 class PieceSearch:
-    """Everything that the pieces of one decision have in common."""
+    """Search for the best segment, with the quantities common to all candidates of one decision."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class PieceSearch:
             )
         self.model = TorqueModel.of(estimate, plant.rate_hz, record.ringing.shape[1])
         self.samples = record.ahead.shape[1]
-        self.limits = SHARE_OF_LIMITS * np.array(
+        self.limits = LIMIT_FRACTION * np.array(
             [
                 max(plant.angle_rad - abs(start_rad), 1e-6),
                 plant.velocity_rad_s,
@@ -192,7 +192,7 @@ class PieceSearch:
                 tip_slope_rad,
             ]
         )
-        # The motor is held by the torque of what rings, and the sensor feels it.
+        # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
         torque_nm, slope_rad = record.ringing
         none = np.zeros_like(torque_nm)
         rings = np.stack([none, none, none, torque_nm, torque_nm, slope_rad])
@@ -201,7 +201,7 @@ class PieceSearch:
         known = record.after(None, 0)
         self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad)
         self.needed_s = self.with_ring_up() / _EFFICIENCY
-        # With too little time everything asked is missed by one factor, not the last mode alone.
+        # With too little time all targets are missed by one factor, not the last mode alone.
         missed, needed_s = 1.0, self.needed_s
         for _ in range(_TIGHTENINGS):
             if not time_left_s < needed_s < _NEVER_S:
@@ -214,7 +214,7 @@ class PieceSearch:
         self.swing = self.ringing[-1, :: self.model.factor][: self.samples]
 
     def bands(self) -> list[_Band]:
-        """Bands that are tried: through every mode, and beside it."""
+        """Return the candidate bands: through every mode, and on either side of it."""
         found = []
         for mode in self.modes:
             hz = mode.frequency_hz
@@ -223,20 +223,25 @@ class PieceSearch:
             over_hz = min(_OVER * mode.damping_ratio * hz, 0.2 * hz)
             widths_hz = [0.0, half_hz, *([over_hz] if over_hz > 1.5 * half_hz else [])]
             found += [_Band(mode.number, hz, each, _FADE_S) for each in widths_hz]
-            # Fades as long as the beat with the mode: a shorter one makes it swing as well.
+            # Fades as long as the beat with the mode: a shorter one excites the mode as well.
             found += [
                 _Band(
-                    mode.number, (1.0 + step) * hz, 0.0, max(_FADE_S, 1.0 / (_BESIDE * hz)), False
+                    mode.number,
+                    (1.0 + step) * hz,
+                    0.0,
+                    max(_FADE_S, 1.0 / (_SIDE_OFFSET * hz)),
+                    False,
                 )
-                for step in (-_BESIDE, _BESIDE)
+                for step in (-_SIDE_OFFSET, _SIDE_OFFSET)
                 if (1.0 + step) * hz < BAND_HZ
             ]
         return found
 
     def lines(self) -> tuple[Real, Real]:
-        """Steady sines: frequencies (m,) in Hz, and the amplitudes (m,) of the angle in rad."""
+        """Return frequencies (m,) in Hz and amplitudes (m,) of the angle in rad of steady sines."""
         steps = [
-            (*(mode.damping_ratio * np.array(_LINES)), -_BESIDE, _BESIDE) for mode in self.modes
+            (*(mode.damping_ratio * np.array(_LINES)), -_SIDE_OFFSET, _SIDE_OFFSET)
+            for mode in self.modes
         ]
         frequency_hz = np.array(
             [
@@ -248,7 +253,7 @@ class PieceSearch:
         frequency_hz = frequency_hz[(frequency_hz > 0.0) & (frequency_hz < BAND_HZ)]
         s = 2j * pi * frequency_hz
         _, response, slope = responses(self.estimate, s)
-        # A short pulse tells what the motor needs for its own inertia, and by how much it lags.
+        # The response to a short pulse gives the torque for the motor's own inertia, and its lag.
         pulse = np.zeros(round(self.plant.rate_hz))
         rise = quintic(0.01, self.plant.rate_hz)
         pulse[: 2 * rise.size] = 1e-3 * np.concatenate([rise, rise[::-1]])
@@ -257,21 +262,21 @@ class PieceSearch:
         angle = turn @ answer.angle_rad
         lag = turn @ (pulse - answer.angle_rad) / angle
         own = turn @ (answer.torque_nm - answer.coupling_torque_nm) / angle
-        shares = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
-        return frequency_hz, 1.0 / (shares / self.limits[:, None]).max(axis=0)
+        fractions = np.abs([np.ones_like(s), s, lag, own + response, response, slope])
+        return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
 
     def best(self, time_left_s: float, through: Collection[int] = ()) -> _Candidate:
-        """Return the best piece that fits into the time, of those that drive one of some modes."""
+        """Return the best segment that fits into the time and drives one of the given modes."""
         durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
             raise ExcitationError(
-                f"No piece of excitation fits into {time_left_s:g} s: the shortest takes "
+                f"No segment of excitation fits into {time_left_s:g} s: the shortest takes "
                 f"{DURATIONS_S[0]:g} s."
             )
         return max((self.best_of(d, through) for d in durations_s), key=lambda each: each.value)
 
     def best_of(self, duration_s: float, through: Collection[int]) -> _Candidate:
-        """Return the best piece of a duration: through one mode, then with others in addition."""
+        """Return the best segment of a duration: one mode first, then further ones in addition."""
         bases = [(band, self.basis(band, duration_s)) for band in self.bands()]
         nothing = _Candidate(
             duration_s,
@@ -283,7 +288,7 @@ class PieceSearch:
             0.0,
         )
         at_modes = {band.number: basis for band, basis in reversed(bases) if band.at_mode}
-        # To show a mode takes more than a line, of which any smooth response is capable.
+        # A single line does not show a mode: any smooth response could produce it.
         over = {band.number: band for band, _ in bases if band.at_mode and band.number in through}
         quiet = {number: self.quieted(nothing, number, at_modes) for number in at_modes}
         found = max(
@@ -299,10 +304,10 @@ class PieceSearch:
         for _ in range(2):
             driven = {band.number for band, _ in found.parts}
             more = [
-                self.added(found, share, band, basis, turn)
+                self.added(found, fraction, band, basis, turn)
                 for band, basis in bases
                 if band.number not in driven
-                for share in _SHARES
+                for fraction in _FRACTIONS
                 for turn in range(0, _PHASES, 2)
             ]
             better = max(more, key=lambda each: each.value, default=found)
@@ -320,41 +325,41 @@ class PieceSearch:
     def quieted(
         self, start: _Candidate, number: int, at_modes: dict[int, tuple[_Sweep, _Sweep]]
     ) -> _Candidate:
-        """Bring all modes but one to rest by the end of the piece, as far as the limits allow."""
+        """Bring all modes but one to rest by the end of the segment, within the limits."""
         sweeps = [sweep for other, basis in at_modes.items() if other != number for sweep in basis]
         if not sweeps:
             return start
         first = self.model_samples(start.duration_s)
         tail = slice(first, first + self.model_samples(_TAIL_S))
-        # The tip's slope a second long tells the modes apart.
+        # One second of the tip's slope suffices to separate the modes.
         swings = np.stack([sweep.slope[tail] for sweep in sweeps], axis=1)
         rings = self.swing[tail]
         factors = -np.linalg.lstsq(swings, rings)[0]
         unit = sum(
             f * sweep.channels[:, ::_THINNED] for f, sweep in zip(factors, sweeps, strict=True)
         )
-        share = min(1.0, largest_factor(start.channels, unit))
+        fraction = min(1.0, largest_factor(start.channels, unit))
         weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
         return _Candidate(
             start.duration_s,
             (),
-            tuple((share * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
-            start.channels + share * unit,
-            start.weighted + share * weighted,
+            tuple((fraction * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
+            start.channels + fraction * unit,
+            start.weighted + fraction * weighted,
             start.swing
-            + share * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
+            + fraction * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
             0.0,
         )
 
     def basis(self, band: _Band, duration_s: float) -> tuple[_Sweep, _Sweep]:
-        """Sweep through a band in two phases, a quarter of a period apart."""
+        """Return the sweeps through a band in two phases, a quarter of a period apart."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
         phase = 2 * pi * band.middle_hz * from_middle_s
         phase += 2 * pi * band.half_width_hz * from_middle_s**2 / duration_s
         fade = quintic(min(band.fade_s, 0.4 * duration_s), rate_hz)
-        # The motor comes to rest as well before the piece ends.
+        # The motor comes to rest as well before the segment ends.
         last = n - self.ticks(self.plant.settling_s)
         window = np.zeros(n)
         window[:last] = 1.0
@@ -363,7 +368,7 @@ class PieceSearch:
         return self.sweep(window * np.sin(phase)), self.sweep(window * np.cos(phase))
 
     def sweep(self, reference_rad: Real) -> _Sweep:
-        """Compute the response to a reference from rest."""
+        """Return the response to a reference from rest."""
         n = reference_rad.size
         longer = np.concatenate([reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))])
         response = self.plant.respond(longer)
@@ -391,31 +396,31 @@ class PieceSearch:
 
     def added(
         self,
-        beside: _Candidate,
-        share: float,
+        base: _Candidate,
+        fraction: float,
         band: _Band,
         basis: tuple[_Sweep, _Sweep],
         turn: int,
     ) -> _Candidate:
-        """Drive a band as far as the limits allow, beside a share of another piece."""
+        """Drive a band as far as the limits allow, in addition to a fraction of another segment."""
         angle = 2 * pi * turn / _PHASES
         sine, cosine = float(np.cos(angle)), float(np.sin(angle))
         first, second = basis
         rings = self.ringing[:, : first.channels.shape[1] : _THINNED]
         unit = sine * first.channels[:, ::_THINNED] + cosine * second.channels[:, ::_THINNED]
-        before = rings + share * (beside.channels - rings)
+        before = rings + fraction * (base.channels - rings)
         amplitude_rad = largest_factor(before, unit)
-        swing = self.swing + share * (beside.swing - self.swing)
+        swing = self.swing + fraction * (base.swing - self.swing)
         swing += amplitude_rad * (sine * first.slope + cosine * second.slope)
-        weighted = self.held + share * (beside.weighted - self.held)
+        weighted = self.held + fraction * (base.weighted - self.held)
         weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
-        leading = beside.parts[0][0] if beside.parts else band
-        value = self.value(leading, weighted, swing, beside.duration_s)
+        leading = base.parts[0][0] if base.parts else band
+        value = self.value(leading, weighted, swing, base.duration_s)
         return _Candidate(
-            beside.duration_s,
-            (*((other, share * size) for other, size in beside.parts), (band, amplitude_rad)),
+            base.duration_s,
+            (*((other, fraction * size) for other, size in base.parts), (band, amplitude_rad)),
             (
-                *((share * factor, sweep) for factor, sweep in beside.terms),
+                *((fraction * factor, sweep) for factor, sweep in base.terms),
                 (amplitude_rad * sine, first),
                 (amplitude_rad * cosine, second),
             ),
@@ -426,39 +431,39 @@ class PieceSearch:
         )
 
     def value(self, band: _Band, weighted: Real, swing: Real, duration_s: float) -> float:
-        """Compute what is told as far as one looks ahead if a mode is driven on after a piece.
+        """Compute the information up to the horizon if a mode is driven on after a segment.
 
-        It is driven so that it keeps the amplitude that it has at the end of the piece.
+        The drive holds the amplitude that the mode has at the end of the segment.
         """
         first = self.model_samples(duration_s)
         rest = self.samples - first
         going_on = self.going_on(band)
         amplitudes = self.decays @ swing[first : first + self.decays.shape[1]]
-        place = 2 * [mode.number for mode in self.modes].index(band.number)
-        factors = going_on.per_amplitude @ amplitudes[place : place + 2]
+        index = 2 * [mode.number for mode in self.modes].index(band.number)
+        factors = going_on.per_amplitude @ amplitudes[index : index + 2]
         before = weighted[:, :first]
         after = weighted[:, first:] + np.tensordot(factors, going_on.weighted[:, :, :rest], axes=1)
         return float(np.vdot(before, before) + np.vdot(after, after))
 
     @cached_property
     def decays(self) -> Real:
-        """Amplitudes of the modes, real and imaginary, of what swings for a second: (2 m, n)."""
+        """Matrix (2 m, n) from one second of slope to modal amplitudes, real and imaginary."""
         time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
         free = np.exp(np.outer([mode.pole_rad_s for mode in self.modes], time_s))
         columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
         return np.linalg.pinv(columns.T)
 
     def going_on(self, band: _Band) -> _GoingOn:
-        """Drive a mode as long as one looks ahead."""
+        """Return the response to driving a mode up to the planning horizon."""
         if band.middle_hz not in self._going_on:
-            duration_s = LOOK_AHEAD_S - DURATIONS_S[0]
+            duration_s = HORIZON_S - DURATIONS_S[0]
             sweeps = self.basis(replace(band, half_width_hz=0.0), duration_s)
             weighted = np.stack([sweep.weighted for sweep in sweeps])
             mode = next(each for each in self.modes if each.number == band.number)
             last = self.model_samples(duration_s - _FADE_S)
             here = slice(last - self.model_samples(_TAIL_S), last)
             time_s = np.arange(here.start, here.stop) / self.model.sample_hz
-            # What it has reached by then of its steady amplitude.
+            # Fraction of the steady amplitude that the mode has reached by then.
             rising = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
             turn = np.exp(1j * mode.pole_rad_s.imag * time_s)
             columns = np.stack([turn.real, -turn.imag], axis=1) * rising[:, None]
@@ -467,53 +472,55 @@ class PieceSearch:
             self._going_on[band.middle_hz] = _GoingOn(weighted, per_amplitude)
         return self._going_on[band.middle_hz]
 
-    def piece(self, chosen: _Candidate, time_left_s: float) -> Piece:
-        """Describe a piece, with what is expected of it."""
+    def segment(self, chosen: _Candidate, time_left_s: float) -> Piece:
+        """Return a candidate as a segment, with the precisions expected of it."""
         estimate, quantities = self.estimate, self.quantities
         samples = self.model_samples(chosen.duration_s)
         channels = chosen.total("channels")
         ringing = self.ringing[:, : channels.shape[1]]
-        # Between the ticks that were looked at a peak is a little higher.
-        share = min(1.0, largest_factor(ringing, channels))
+        # Between the checked ticks a peak is a little higher.
+        fraction = min(1.0, largest_factor(ringing, channels))
         now = covariance_of(self.record.after(None, 0), estimate)
-        after = covariance_of(self.record.after(share * chosen.total("rows"), samples), estimate)
+        after = covariance_of(self.record.after(fraction * chosen.total("rows"), samples), estimate)
         return Piece(
             name=_in_words(chosen),
-            reference_rad=share * chosen.total("reference_rad"),
-            angle_rad=share * chosen.total("angle_rad"),
+            reference_rad=fraction * chosen.total("reference_rad"),
+            angle_rad=fraction * chosen.total("angle_rad"),
             names=estimate.names,
             covariance=after,
             now=quantities.precisions(now),
             expected=quantities.precisions(after),
             forecast=self.forecast(time_left_s),
-            share_of_limits=SHARE_OF_LIMITS * float(np.abs(ringing + share * channels).max()),
+            share_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
         )
 
     def with_ring_up(self) -> float:
-        """Compute the time of the best mixture with what its modes take to ring up.
+        """Return the time of the best mixture plus the time in which its modes ring up.
 
-        What a mode tells of its damping grows as ``1 - exp(-t / tau)`` when its amplitude is held.
+        The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.
         """
         times_s = self.mixture.times_s
         needed_s = float(times_s.sum())
         grid = np.geomspace(1e-3, 1e3, 400)
-        told = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
+        gained = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
         for mode in self.modes:
             reach_hz = 1.5 * _LINES[-1] * mode.damping_ratio * mode.frequency_hz
             at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < reach_hz].sum())
             decay_s = -1.0 / mode.pole_rad_s.real
             if at_mode_s > 0.01 * needed_s:
-                needed_s += decay_s * float(np.interp(at_mode_s / decay_s, told, grid)) - at_mode_s
+                needed_s += (
+                    decay_s * float(np.interp(at_mode_s / decay_s, gained, grid)) - at_mode_s
+                )
         return needed_s
 
     def forecast(self, time_left_s: float) -> Forecast:
-        """Tell how long it will take until everything asked is reached."""
+        """Forecast the time until all targets are reached."""
         impossible = [each.impossible for each in self.quantities.items if each.impossible]
         if impossible:
             return Forecast(inf, impossible[0])
         seconds = self.needed_s
         if not seconds < _NEVER_S:
-            return Forecast(inf, "the motor cannot drive what would tell it")
+            return Forecast(inf, "the motor cannot excite the modes that determine it")
         if seconds <= time_left_s:
             return Forecast(seconds, "")
         return Forecast(
@@ -526,13 +533,13 @@ class PieceSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mixture:
-    """Steady sines that lead to everything asked in the shortest time, none ringing up."""
+    """Mixture of steady sines, without ring-up, that reaches all targets in the shortest time."""
 
     times_s: Real
     """Shape (m,): time of each."""
     weights: Real
-    """Shape (q, k): the squares of these combinations of the derivatives of the torque, summed, are
-    what is worth telling on the way there."""
+    """Shape (q, k): combinations of the torque's derivatives; the sum of their squares is the
+    information that brings the targets closer."""
 
 
 def best_mixture(
@@ -543,28 +550,31 @@ def best_mixture(
     angle_rad: Real,
     missed: float = 1.0,
 ) -> Mixture:
-    """Find the times of steady sines that reach everything asked soonest.
+    """Find the times of steady sines that reach all targets soonest.
 
-    By multiplicative steps, as `shares_of_time`, with the multipliers of the quantities: by the
-    equivalence theorem all sines of the best mixture tell as much per second of the combinations
-    that are returned, and no other tells more (V. V. Fedorov, Theory of optimal experiments, 1972).
+    Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
+    equivalence theorem all sines of the best mixture give the same information per second on the
+    returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
+    experiments, 1972).
 
     Parameters
     ----------
     information
-        Shape (k, k): what is known already.
+        Shape (k, k): information that exists already.
     estimate
         Beam, damping and noise.
     quantities
-        What is asked, q quantities.
+        The q target quantities.
     frequency_hz, angle_rad
         Shape (m,): frequencies of the sines and amplitudes of the angle.
     missed
-        Factor by which all deviations may be larger than asked.
+        Factor by which all deviations may exceed their targets.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
-    asked = np.array([inf if each.impossible else each.asked_std for each in quantities.items])
-    wanted = quantities.gradients / (missed * asked[:, None])
+    target_stds = np.array(
+        [inf if each.impossible else each.asked_std for each in quantities.items]
+    )
+    wanted = quantities.gradients / (missed * target_stds[:, None])
     if not wanted.any():
         return Mixture(np.zeros(frequency_hz.size), wanted)
     multipliers = np.ones(len(wanted))
@@ -575,18 +585,20 @@ def best_mixture(
         variances = np.einsum("qi,qi->q", lines, wanted)
         multipliers = multipliers * np.maximum(variances, 1e-12) ** 0.5
         multipliers /= max(float(multipliers.sum()), 1e-300)
-        telling = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
-        times_s = times_s * np.sqrt(telling / max(float(times_s @ telling / times_s.sum()), 1e-300))
-        # As long as it takes, or as is too long.
+        gain_rates = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
+        times_s = times_s * np.sqrt(
+            gain_rates / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
+        )
+        # Scale the total time towards the targets, until they are met or the time is too long.
         times_s *= float(np.clip(np.sqrt(variances.max()), 0.5, 2.0))
         if times_s.sum() > _NEVER_S:
             break
-    worth = np.sqrt(multipliers / max(float(times_s @ telling / times_s.sum()), 1e-300))
+    worth = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
     return Mixture(times_s, worth[:, None] * lines)
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
-    """Information of steady sines per second of each, shape (m, k, k)."""
+    """Return the information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
     rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
     return rates
@@ -600,7 +612,7 @@ def least_deviations(
     angle_rad: Real,
     duration_s: float,
 ) -> Real:
-    """Compute the deviation of each quantity if the best mixture of sines is for it alone.
+    """Return the deviation of each quantity with the best mixture of sines for it alone.
 
     Parameters
     ----------
@@ -612,7 +624,7 @@ def least_deviations(
     Returns
     -------
     ndarray, shape (q,)
-        No record of that length is expected to have less.
+        Expected lower bound for a record of that length.
     """
     rates = _information_rates(estimate, frequency_hz, angle_rad)
     found = np.empty(len(quantities.gradients))
@@ -628,14 +640,14 @@ def least_deviations(
 
 
 def largest_factor(before: Real, unit: Real) -> float:
-    """Largest factor of a motion that keeps the sum with another within -1 and 1.
+    """Return the largest factor of a motion that holds its sum with another within -1 and 1.
 
-    Where the other one is beyond by itself, the sum may be as large, but no larger.
+    Where the other motion exceeds this range by itself, the sum may be as large, but no larger.
 
     Parameters
     ----------
     before, unit
-        Shape (c, n): channels of the motion that there is, and of the one that is added.
+        Shape (c, n): channels of the existing motion, and of the added one.
     """
     size = np.abs(unit)
     room = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
@@ -645,7 +657,7 @@ def largest_factor(before: Real, unit: Real) -> float:
 
 
 def _in_words(chosen: _Candidate) -> str:
-    """Say which modes a piece drives, and how."""
+    """Describe the bands of a segment, for the operator."""
     parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
     bands = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"

@@ -1,4 +1,4 @@
-"""Vibration that a move is predicted to leave, and what of it the sensor can show."""
+"""Vibration predicted after a move, and the least vibration that the sensor can show."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class DisturbedRig(Protocol):
 
     @property
     def settling_s(self) -> float:
-        """Time in which the loop follows up what the reference has done."""
+        """Time in which the loop catches up with the reference."""
 
     @property
     def torque_noise_nm(self) -> float:
@@ -50,7 +50,7 @@ class DisturbedRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MoveEnd:
-    """What follows the reference of a move.
+    """Arrival and residual vibration after the reference of a move.
 
     The vibration is the root of the sum of squares of the amplitudes of the modes below
     `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference; the modes above have
@@ -61,10 +61,10 @@ class MoveEnd:
     """Time from the move's start after which the angle stays within `ARRIVED_RAD`; None: that is
     more than a second after the reference's end."""
     residual_nm: float
-    """Vibration that is left, with friction, encoder steps and noise of the sensor."""
+    """Residual vibration, with friction, encoder steps and noise of the sensor."""
     floor_nm: float
-    """Vibration that the noise of the sensor alone makes one read from the ring-down after the
-    arrival, exceeded in one of 1000: less cannot be seen."""
+    """Vibration read from the ring-down after the arrival because of the sensor's noise alone,
+    exceeded in one of 1000 cases: less cannot be detected."""
 
 
 def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> MoveEnd:
@@ -77,14 +77,14 @@ def predict_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float) -> M
     reference_rad
         Shape (n,): at the ticks after the start, relative to the angle there.
     ring_down_s
-        Time for which the session goes on.
+        Time of the ring-down in the session.
     """
     rate_hz, end = rig.rate_hz, reference_rad.size
     ringing = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
     if not ringing.size:
         ringing = rig.poles_rad_s[:1]
     decay_per_s = -ringing.real
-    # The loop has followed up and the motor stands; from here on the amplitudes only decay.
+    # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
     measured = end + round(2 * rig.settling_s * rate_hz)
     held = np.full(max(measured - end + 1, round(_FOLLOWED_S * rate_hz)), reference_rad[-1])
     angle, torque = rig.disturbed(np.concatenate([[0.0], reference_rad, held]), ringing.size)

@@ -1,9 +1,9 @@
 """The shortest move that leaves no vibration within a rig's limits: a linear programme.
 
-For a given time the accelerations are found that take the smallest share of the limits of torque,
-speed, tracking error and sensor, and leave every mode at rest. The shortest time is the one at
-which that share is 1. The responses are those of the closed loop to a unit of acceleration, so that
-all limits are linear in the accelerations; Coulomb friction is taken off the torque.
+For a given duration the programme finds the accelerations that take the smallest fraction of the
+limits of torque, speed, tracking error and sensor, and leave every mode at rest. At the shortest
+duration that fraction is 1. The responses are those of the closed loop to a unit of acceleration:
+all limits are linear in the accelerations, and Coulomb friction is subtracted from the torque.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rigd.excitation._residual_vibration import predict_end
 from rigd.excitation._signals import (
-    SHARE_OF_LIMITS,
+    LIMIT_FRACTION,
     Excitation,
     ExcitationError,
     assemble,
@@ -41,27 +41,27 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 LONGEST_S: Final = 60.0
-"""A move that would take longer is refused."""
+"""A longer move is an error."""
 
 _HELD_S: Final = 2e-3
-"""Time for which an acceleration is held, where the move is not so long that it is more."""
-_MOST_PIECES: Final = 60
+"""Least time for which an acceleration is held; longer in long moves."""
+_MOST_INTERVALS: Final = 60
 _CLOSE: Final = 1.03
 _NEARLY_ALL: Final = 0.93
-"""The search ends at this ratio of a time that suffices to one that does not, or where the move
-takes this part of what it may: a time shorter by 4 % would take more than all."""
+"""The search ends at this ratio of a sufficient time to an insufficient one, or where the move
+takes this fraction of the limits: a time shorter by 4 % would exceed them."""
 _MOST_ROUNDS: Final = 14
 _FARTHEST: Final = 0.98
-"""Part of the limit of the angle at which a move may end: what is left is for what surpasses it."""
+"""Fraction of the angle limit at which a move may end; the remainder is for overshoot."""
 _BACKWARD: Final = 0.01
-"""Part of its mean speed with which a robust move may go backward."""
+"""Fraction of its mean speed with which a robust move may go backward."""
 _LEAST_RAD: Final = 1e-3
 _BRAKING_STARTS: Final = 16
 _BRAKING_S: Final = (0.02, 5.0)
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference: arrays (n,)."""
+    """Response of the closed loop to a reference, as arrays (n,)."""
 
     @property
     def angle_rad(self) -> Real:
@@ -82,7 +82,7 @@ class Response(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MovePlant:
-    """What planning a motion needs to know of a rig."""
+    """Model of a rig for planning a motion."""
 
     rate_hz: float
     """Ticks a second."""
@@ -94,19 +94,19 @@ class MovePlant:
     poles_rad_s: Complex
     """Shape (m,): poles of the closed loop at the modes of the beam, one of each pair."""
     torque_per_state_nm_s: Real
-    """Shape (m,): amplitude of the coupling torque for what `modal_state` says of a mode."""
+    """Shape (m,): amplitude of the coupling torque per `modal_state` of a mode."""
     frequency_uncertainty: Real
     """Shape (m,): relative standard uncertainty of the modes' frequencies."""
     torque_noise_nm: float
     """Standard deviation of the noise of one reading of the coupling torque."""
     settling_s: float
-    """Time in which the loop follows up what the reference has done."""
+    """Time in which the loop catches up with the reference."""
     peak_torque_nm: float
     """Largest torque of the motor."""
     friction_nm: float
-    """Torque that compensates friction, on top of the linear response's."""
+    """Torque for friction, in addition to the linear response's."""
     largest_acceleration_rad_s2: float
-    """Bound of the reference's acceleration; what the loop's filters make of it counts."""
+    """Bound of the reference's acceleration, including the effect of the loop's filters."""
     velocity_rad_s: float
     """Limit of the speed."""
     tracking_error_rad: float
@@ -116,7 +116,7 @@ class MovePlant:
     angle_rad: float
     """Limit of the angle from the rig's zero, either way."""
     model: IdentifiedBeam | None = None
-    """Beam of an analysis; None: it is the profile's, or an estimate."""
+    """Beam of an analysis; None: the profile's, or an estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,13 +127,13 @@ class Move:
     """Shape (n,): at the ticks after the start, relative to the angle there; the last one stays."""
     duration_s: float
     """Time of the reference."""
-    share: float
-    """Largest share of a limit that it is predicted to take; at most `SHARE_OF_LIMITS`."""
+    limit_fraction: float
+    """Largest predicted fraction of a limit; at most `LIMIT_FRACTION`."""
     residual_nm: float
-    """Coupling torque that the modes swing with afterwards in the linear loop: the sum of their
-    amplitudes, each for a frequency that is wrong by its standard uncertainty."""
+    """Residual coupling torque of the modes in the linear loop: the sum of their amplitudes, each
+    for a frequency that is wrong by its standard uncertainty."""
     quintic_residual_nm: float
-    """The same of a quintic that takes the same time."""
+    """The same for a quintic of the same duration."""
 
 
 def shortest_move(
@@ -155,24 +155,24 @@ def shortest_move(
     start_rad
         Angle of the start from the rig's zero.
     robust
-        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, so that frequencies that are
-        wrong by 1 % do no harm, and no turning back; the move takes longer.
+        Zeros of second order for the modes below `ROBUST_BELOW_HZ`, to tolerate a 1 % frequency
+        error, and no turning back; the move takes longer.
     ringing
-        Shape (m,): state of the modes at the start as of `modal_state`, which the move takes out;
+        Shape (m,): state of the modes at the start as of `modal_state`, which the move cancels;
         None: they are at rest.
 
     Raises
     ------
     ExcitationError
-        If no move of at most `LONGEST_S` keeps the limits.
+        If no move of at most `LONGEST_S` stays within the limits.
 
     Notes
     -----
     W. E. Singhose and others describe input shapers as such zeros; the linear programme is that of
     T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
-    the limits of the rig in place of an impulse's.
+    the limits of the rig instead of an impulse's.
     """
-    search = _Search(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
+    search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
     acceleration = search.shortest()
     reference = from_acceleration(acceleration, plant.rate_hz)
     n = reference.size
@@ -180,14 +180,14 @@ def shortest_move(
     return Move(
         reference_rad=reference,
         duration_s=n / plant.rate_hz,
-        share=search.share(reference),
+        limit_fraction=search.limit_fraction(reference),
         residual_nm=_residual_nm(plant, reference, ringing),
         quintic_residual_nm=_residual_nm(plant, usual, ringing),
     )
 
 
 def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
-    """Sum of the amplitudes of the modes left, each mode's frequency wrong by its uncertainty."""
+    """Sum the residual amplitudes of the modes, each frequency wrong by its uncertainty."""
     left = []
     for off in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
         poles = plant.poles_rad_s * (1.0 + off)
@@ -198,8 +198,8 @@ def _residual_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> 
     return float(np.maximum(*left).sum())
 
 
-class _Search:
-    """Search for the shortest time; one linear programme for each that is tried."""
+class _MoveSearch:
+    """Search for the shortest time, with one linear programme for each candidate."""
 
     def __init__(
         self,
@@ -218,12 +218,12 @@ class _Search:
         rung_nm = 0.0
         if ringing is not None:
             rung_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
-        # What still rings is fed forward to the motor, and is in the sensor.
+        # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
-            "torque": SHARE_OF_LIMITS * plant.peak_torque_nm - plant.friction_nm - rung_nm,
-            "velocity": SHARE_OF_LIMITS * plant.velocity_rad_s,
-            "tracking": SHARE_OF_LIMITS * plant.tracking_error_rad,
-            "coupling": SHARE_OF_LIMITS * plant.coupling_torque_nm - rung_nm,
+            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - rung_nm,
+            "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
+            "tracking": LIMIT_FRACTION * plant.tracking_error_rad,
+            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - rung_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -243,46 +243,46 @@ class _Search:
         most = round(LONGEST_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, found, share_short, share_found = 8, most + 1, inf, 0.0
+        too_short, found, fraction_short, fraction_found = 8, most + 1, inf, 0.0
         best: Real | None = None
         for _ in range(_MOST_ROUNDS):
-            share, acceleration = self._least_share(n)
-            if share <= 1.0:
-                found, share_found, best = n, share, acceleration
+            fraction, acceleration = self._least_limit_fraction(n)
+            if fraction <= 1.0:
+                found, fraction_found, best = n, fraction, acceleration
             else:
-                too_short, share_short = n, share
-            if share_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
+                too_short, fraction_short = n, fraction
+            if fraction_found >= _NEARLY_ALL or found <= max(_CLOSE * too_short, too_short + 1):
                 break
             if too_short >= most:
                 break
-            n = _next(too_short, found, share_short, share_found, n, share, self._order)
+            n = _next(too_short, found, fraction_short, fraction_found, n, fraction, self._order)
             n = min(n, most)
         if best is None:
             raise ExcitationError(
-                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad keeps the "
-                "limits of the profile; choose a smaller angle, or look at limits.velocity_rad_s."
+                f"No move of at most {LONGEST_S:g} s by {self._distance_rad:g} rad stays within "
+                "the limits of the profile; choose a smaller angle, or check limits.velocity_rad_s."
             )
         return best
 
-    def _least_share(self, n: int) -> tuple[float, Real | None]:
-        """Smallest share of the limits that a move of n ticks takes, and its accelerations (n,).
+    def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
+        """Return the smallest fraction of the limits for n ticks, and its accelerations (n,).
 
-        Without a solution the share is infinite.
+        The fraction is infinite without a solution.
         """
         from scipy.optimize import linprog
 
         plant, rate_hz = self._plant, self._plant.rate_hz
         held = max(1, round(_HELD_S * rate_hz))
-        pieces = min(ceil(n / held), _MOST_PIECES)
-        edges = np.round(np.linspace(0, n, pieces + 1)).astype(int)
+        intervals = min(ceil(n / held), _MOST_INTERVALS)
+        edges = np.round(np.linspace(0, n, intervals + 1)).astype(int)
         scale = plant.largest_acceleration_rad_s2
 
         zeros = zero_rows(n, rate_hz, plant.poles_rad_s, self._order)
-        per_piece = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
+        per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
         steps = np.diff(edges) / rate_hz
-        # The centre of a piece's held acceleration, as `from_acceleration` sums them up.
+        # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
         left_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
-        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_piece])
+        equal = np.concatenate([[steps * scale], [steps * left_s * scale], per_interval])
         goal = np.zeros(len(equal))
         goal[1] = self._distance_rad
         if self._ringing is not None:
@@ -290,18 +290,18 @@ class _Search:
         size = np.linalg.norm(equal, axis=1)
 
         limited, bounded, bounds = self._responses(n, edges, scale)
-        limited = np.concatenate([limited, np.eye(pieces)])
-        share_column = -np.ones((len(limited), 1))
+        limited = np.concatenate([limited, np.eye(intervals)])
+        fraction_column = -np.ones((len(limited), 1))
         none = np.zeros((len(bounded), 1))
-        least = np.block([[limited, share_column], [-limited, share_column], [bounded, none]])
+        least = np.block([[limited, fraction_column], [-limited, fraction_column], [bounded, none]])
         below = np.concatenate([np.zeros(2 * len(limited)), bounds])
         found = linprog(
-            np.append(np.zeros(pieces), 1.0),
+            np.append(np.zeros(intervals), 1.0),
             A_ub=least,
             b_ub=below,
             A_eq=np.column_stack([equal / size[:, None], np.zeros(len(equal))]),
             b_eq=goal / size,
-            bounds=[(None, None)] * pieces + [(0.0, None)],
+            bounds=[(None, None)] * intervals + [(0.0, None)],
             method="highs-ds",
         )
         if found.x is None or found.status != 0:
@@ -309,7 +309,7 @@ class _Search:
         return float(found.fun), np.repeat(found.x[:-1] * scale, np.diff(edges))
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return what still rings at the end of the start's state, row by row as of `zero_rows`."""
+        """Return the vibration of the initial state at the end, in the order of `zero_rows`."""
         assert self._ringing is not None
         rows: list[float] = []
         for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
@@ -321,38 +321,38 @@ class _Search:
         return rows
 
     def _responses(self, n: int, edges: NDArray[np.intp], scale: float) -> tuple[Real, Real, Real]:
-        """Return rows over the pieces: shares of limits; and what has bounds, with these.
+        """Return rows over the intervals: fractions of limits; bounded quantities and their bounds.
 
-        A robust move from rest does not turn back: it goes nowhere but to its end, and the friction
-        of the motor, whose sign the controller takes from the reference, turns round nowhere. One
-        that takes out a vibration has to go to and fro, as the shortest does, within the limit of
+        A robust move from rest does not turn back: it goes directly to its end, and the friction
+        of the motor, whose sign the controller takes from the reference, does not reverse. One
+        that cancels a vibration has to go to and fro, as the shortest does, within the limit of
         the angle.
         """
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
-        # The ends of all pieces and what lies between them: a programme finds every gap.
+        # The ends of all intervals and the ticks between them: the solution exploits every gap.
         middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_PIECES // 2]
+        tail = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MOST_INTERVALS // 2]
         fine = np.unique(np.concatenate([edges, middles if n > 2 * len(edges) else [], tail]))
         fine = fine.astype(int)
         coarse = fine[::2]
         unit = self._unit.up_to(end)
         rows = [
-            _over_pieces(unit[name], edges, coarse if name == "coupling" else fine)
+            _over_intervals(unit[name], edges, coarse if name == "coupling" else fine)
             * (scale / self._limits[name])
             for name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
             forward = np.copysign(scale, self._distance_rad)
-            backward = -forward * _over_pieces(unit["velocity"], edges, coarse)
+            backward = -forward * _over_intervals(unit["velocity"], edges, coarse)
             mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
             return np.concatenate(rows), backward, np.full(len(coarse), _BACKWARD * mean_rad_s)
-        angle = scale * _over_pieces(unit["angle"], edges, coarse)
+        angle = scale * _over_intervals(unit["angle"], edges, coarse)
         free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
         return np.concatenate(rows), np.vstack([angle, -angle]), np.repeat(free_rad, len(coarse))
 
-    def share(self, reference: Real) -> float:
-        """Largest share of a limit that a reference takes, at every tick."""
+    def limit_fraction(self, reference: Real) -> float:
+        """Return the largest fraction of a limit that a reference takes, over all ticks."""
         plant = self._plant
         held = round(plant.settling_s * plant.rate_hz)
         whole = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
@@ -370,31 +370,31 @@ class _Search:
 def _next(
     too_short: int,
     found: int,
-    share_short: float,
-    share_found: float,
+    fraction_short: float,
+    fraction_found: float,
     n: int,
-    share: float,
+    fraction: float,
     order: int,
 ) -> int:
-    """Choose the number of ticks to try next, from the shares of the limits on either side.
+    """Choose the number of ticks to try next, from the fractions of the limits on either side.
 
-    The share falls with a power of the time: about the third, and more where the modes set the
-    time and not the distance.
+    The fraction falls with a power of the time: about the third, and more where the modes, not the
+    distance, determine the time.
     """
-    if share_found == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(share, 4.0) ** 0.3)))
-    if share_short == inf and n == found:
-        guess = round(n * max(share, 0.02) ** (0.08 if order > 1 else 0.22))
-    elif share_short == inf:
+    if fraction_found == 0.0:  # none has sufficed yet
+        return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
+    if fraction_short == inf and n == found:
+        guess = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
+    elif fraction_short == inf:
         guess = round((too_short * found) ** 0.5)
     else:
-        power = np.log(share_short / share_found) / np.log(found / too_short)
-        guess = round(1.004 * found * share_found ** (1.0 / power))
+        power = np.log(fraction_short / fraction_found) / np.log(found / too_short)
+        guess = round(1.004 * found * fraction_found ** (1.0 / power))
     return int(min(max(guess, too_short + 1), found - 1))
 
 
 class _UnitResponse:
-    """Responses to a reference of acceleration 1, as long as needed."""
+    """Responses to a reference of acceleration 1, computed up to the needed length."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
@@ -402,7 +402,7 @@ class _UnitResponse:
         self._ticks = 0
 
     def up_to(self, ticks: int) -> dict[str, Real]:
-        """Return the rows at the first ticks at least."""
+        """Return the rows at least up to the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
@@ -418,8 +418,8 @@ class _UnitResponse:
         return self._rows
 
 
-def _over_pieces(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
-    """Response (ticks, pieces) to an acceleration of 1 in each piece."""
+def _over_intervals(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -> Real:
+    """Return the response (ticks, intervals) to an acceleration of 1 in each interval."""
     since = ticks[:, None] - edges
     begun: Real = np.where(since >= 0, unit[np.maximum(since, 0)], 0.0)
     return begun[:, :-1] - begun[:, 1:]
@@ -429,24 +429,24 @@ def _over_pieces(unit: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]) -
 
 
 def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
-    """Braking path that keeps the torque limit from wherever on a reference it starts.
+    """Return the shortest braking path that stays within the torque limit from any tick.
 
     Parameters
     ----------
     plant
         The rig.
     reference_rad
-        Shape (n,): the reference, from rest on, that may have to be braked.
+        Shape (n,): reference from rest, which may have to be braked.
 
     Raises
     ------
     ExcitationError
-        If none of at most 5 s does.
+        If no braking path of at most 5 s does.
 
     Notes
     -----
-    It is simulated with the closed loop from starts all along the reference. After them the torque
-    is linear in speed and acceleration of the reference there.
+    The closed loop is simulated from starts all along the reference. After them the torque is
+    linear in speed and acceleration of the reference at the start.
     """
     held = np.zeros(round(plant.settling_s * plant.rate_hz))
     starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
@@ -454,16 +454,16 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     duration_s, longest_s = _BRAKING_S
     while duration_s <= longest_s:
         braking = braking_path(duration_s, plant.rate_hz)
-        share = 0.0
+        fraction = 0.0
         for tick in starts:
             path = braked(reference_rad, int(tick), braking)
             response = plant.respond(np.concatenate([path, held + path[-1]]))
-            share = max(share, float(np.abs(response.torque_nm).max()) / free_nm)
-            if share > 1.0:
+            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / free_nm)
+            if fraction > 1.0:
                 break
-        if share <= 1.0:
+        if fraction <= 1.0:
             return braking
-        duration_s *= min(max(share, 1.1), 1.5)
+        duration_s *= min(max(fraction, 1.1), 1.5)
     raise ExcitationError(
         f"The reference cannot be braked within {longest_s:g} s by motor.peak_torque_nm = "
         f"{plant.peak_torque_nm:g} N·m; lower its speed."
@@ -474,11 +474,11 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
 
 
 class MoveRig(Protocol):
-    """What planning a move needs of a rig."""
+    """Interface to a rig for which a move is planned."""
 
     @property
     def start_rad(self) -> float:
-        """Where the motor stands, from the rig's zero."""
+        """Present angle of the motor, from the rig's zero."""
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the rig for planning, with the beam of an analysis; without a path the profile's.
@@ -488,7 +488,7 @@ class MoveRig(Protocol):
         path
             Document of ``analyze --json``, or empty.
         use
-            What the beam is for.
+            Purpose of the beam.
         """
 
 
@@ -510,26 +510,26 @@ def move(
     rate_hz
         Ticks a second.
     angle_rad
-        Where to, from the rig's zero.
+        Final angle, from the rig's zero.
     by_rad
-        By how much, in place of `angle_rad`; either sign.
+        Distance, instead of `angle_rad`; either sign.
     path
         JSON written by ``analyze --json``, whose beam the move is planned for; empty: the
         profile's.
     robust
-        1: frequencies that are wrong by 1 % do no harm and the motor does not turn back, but the
-        move takes longer. 0: the shortest.
+        1: the move tolerates a 1 % frequency error and does not turn back, but takes longer.
+        0: the shortest.
     rest_s, ring_down_s
         Time before and after the move.
     rig
-        Rig that is moved.
+        The rig.
 
     Raises
     ------
     ExcitationError
         If not exactly one angle is given, or the move would leave the limits.
     IdentifiedBeamError
-        If the file is not what it should be, or has what a move does not take into account.
+        If the file is invalid, or has an effect that a move does not take into account.
     """
     if rig is None:
         raise ExcitationError("A move is planned for a rig; run it with its profile.")
@@ -568,7 +568,7 @@ def move(
         "duration_s": planned.duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
-        "limits_share": planned.share,
+        "limits_share": planned.limit_fraction,
         "residual_nm": end.residual_nm,
         "residual_floor_nm": end.floor_nm,
         "frequency_residual_nm": planned.residual_nm,
@@ -581,6 +581,6 @@ def move(
 
 
 def _by_at_most(farthest_rad: float, start_rad: float) -> str:
-    """Say by how much the motor may move from where it stands."""
+    """Describe the largest allowed distance from the present angle."""
     low, high = -farthest_rad - start_rad, farthest_rad - start_rad
     return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"

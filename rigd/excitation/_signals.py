@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 SAMPLES_PER_PERIOD = 4
-"""Fewest samples in a period of the reference: with less it is not a sine any more."""
+"""Fewest samples in a period of the reference: with fewer it is not a sine any more."""
 
-SHARE_OF_LIMITS = 0.9
-"""Share of every limit that an excitation made for a rig is predicted to take; the rest is for a
-beam unlike the one it was made with."""
+LIMIT_FRACTION = 0.9
+"""Fraction of every limit that an excitation for a rig may use in the prediction; the remainder is
+for a beam that differs from the predicted one."""
 
 
 class ExcitationError(UserError, ValueError):
-    """An option of an excitation is absurd; the message names option, value, unit and remedy."""
+    """An option of an excitation is invalid; the message names option, value, unit and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Excitation:
         ``chirp``, ``hold``, ``step``, ``multisine``, ``file``, ``modes``, ``move``, ``touch`` or
         ``until``.
     parameters
-        The options it was made from, and what follows from them, with units in the names.
+        The options, and quantities derived from them, with units in the names.
     rate_hz
         Ticks a second.
     reference_rad
@@ -51,13 +51,13 @@ class Excitation:
         ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive); of a chirp there and
         back also ``there`` and ``back``, the two sweeps in ``sweep``.
     stays
-        The motor stays where the reference ends; else it returns to the start angle.
+        Whether the motor stays at the end of the reference; else it returns to the start angle.
     approach
-        What the loop does when it detects a touch; None: it does not look for one.
+        Reaction of the loop to a touch; None: the loop does not watch for touches.
     search
-        What is asked of a session that goes on until it has found it; None: its end is planned.
+        Targets of a session that ends when they are reached; None: its end is planned.
     model
-        Beam of an analysis that it was made for; None: the profile's.
+        Beam of an analysis for which it was planned; None: the profile's.
     """
 
     kind: str
@@ -72,12 +72,12 @@ class Excitation:
 
     @property
     def shows_modes(self) -> bool:
-        """Whether the record can tell of the beam's modes, unlike a move or a search."""
+        """Whether the record can show the beam's modes, unlike that of a move or a search."""
         return not self.stays and self.approach is None
 
 
 def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
-    """Return the frequency that a chirp has at a tick; None of others, and before and after it.
+    """Return the frequency of a chirp at a tick; None for other excitations, and outside the sweep.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
 
 
 def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
-    """Return a time as its number of ticks; refuse one that is not a whole number of them."""
+    """Return a time as a number of ticks; raise unless it is a whole number of them."""
     ticks = round(value_s * rate_hz)
     if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
         raise ExcitationError(
@@ -114,7 +114,7 @@ def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
 
 def finite(option: str, value: float, unit: str) -> None:
-    """Refuse what is not a finite number, or of a size that no rig has."""
+    """Raise unless a value is a finite number of a size that a rig can have."""
     if not isfinite(value):
         raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
     if not is_usable_size(value):
@@ -124,21 +124,21 @@ def finite(option: str, value: float, unit: str) -> None:
 
 
 def positive(option: str, value: float, unit: str) -> None:
-    """Refuse what is not a finite number above 0."""
+    """Raise unless a value is a finite number above 0."""
     finite(option, value, unit)
     if value <= 0.0:
         raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
 
 
 def not_negative(option: str, value: float) -> None:
-    """Refuse a time that is not finite or below 0 s."""
+    """Raise unless a time is finite and at least 0 s."""
     finite(option, value, "s")
     if value < 0.0:
         raise ExcitationError(f"{option} = {value:g} s must not be negative.")
 
 
 def within_a_turn(option: str, value_rad: float) -> None:
-    """Refuse an angle beyond a full turn to either side."""
+    """Raise if an angle is more than a full turn to either side."""
     if abs(value_rad) > 2.0 * pi:
         raise ExcitationError(
             f"{option} = {value_rad:g} rad is more than a full turn; give an angle in rad of at "
@@ -147,7 +147,7 @@ def within_a_turn(option: str, value_rad: float) -> None:
 
 
 def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
-    """Refuse a frequency that is not above 0, or has too few samples per period."""
+    """Raise unless a frequency is above 0 and has enough samples per period."""
     finite(option, value, "Hz")
     highest = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
@@ -166,7 +166,7 @@ def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool =
 def lay_out_segments(
     rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
 ) -> dict[str, tuple[int, int]]:
-    """Return rest, sweep and ring-down in ticks; the ring-down absorbs what rounding leaves."""
+    """Return rest, sweep and ring-down in ticks; the ring-down absorbs the rounding."""
     not_negative("rest_s", rest_s)
     positive("duration_s", duration_s, "s")
     not_negative("ring_down_s", ring_down_s)
@@ -184,7 +184,7 @@ def lay_out_segments(
 
 
 def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
-    """Refuse a record that would be too long to be analysed; `around_s` are rest and ring-down."""
+    """Raise if a record is too long to be analysed; `around_s` is rest plus ring-down."""
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
         between = (
@@ -231,10 +231,10 @@ def chirp(
     taper_s: float = 0.0,
     there_and_back: int = 0,
 ) -> Excitation:
-    """Linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from the sweep's first tick.
+    """Return a linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from its first tick.
 
-    The defaults are the paper's experiment (Section 5). There and back, the frequency returns to f0
-    in as long again, and angle and speed are continuous where it turns.
+    The defaults are the paper's experiment (Section 5). With ``there_and_back`` the frequency
+    returns to f0 in the same time, with continuous angle and speed at the turn.
 
     Parameters
     ----------
@@ -251,8 +251,8 @@ def chirp(
     taper_s
         Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
     there_and_back
-        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change in
-        time shows as such; 0: one.
+        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change
+        over time is visible; 0: one.
 
     Raises
     ------
@@ -392,11 +392,11 @@ def multisine(
     taper_s: float = 0.0,
     seed: int = 0,
 ) -> Excitation:
-    """Random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
+    """Return a random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
 
-    The period is turned so that it begins at its smallest magnitude (a shift in time: the
-    spectrum's magnitude stays flat), and scaled to the peak ``amplitude_rad``. The crest factor
-    reached, peak over rms, is reported in ``parameters["crest_factor"]``.
+    The period is shifted so that it begins at its smallest magnitude (the spectrum's magnitude
+    stays flat), and scaled to the peak ``amplitude_rad``. ``parameters["crest_factor"]`` is its
+    crest factor, peak over rms.
 
     Parameters
     ----------
@@ -469,7 +469,7 @@ def multisine(
 def _random_phase_period(
     ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
-    """One period of every harmonic in the band, shape (ticks,), of peak 1, from near zero on."""
+    """Return one period of all harmonics, shape (ticks,), with peak 1 and a start near zero."""
     frequency_hz = np.arange(1, ticks // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
     inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (

@@ -1,9 +1,9 @@
 """Passes in search of an obstacle: out at a constant speed until something is met, and back.
 
-Each pass has its own stretch of time, as long as it takes if nothing is met: rest, way out, pause,
-way back. When the loop detects a touch it leaves the reference for another one that fits into
-the same stretch (`after_touch`): it brakes, stays, and goes back to where the pass began. So a
-session has the same number of ticks whatever it meets. Neither way makes the beam ring.
+Each pass has its own block of time: rest, way out, pause, way back without an obstacle. When the
+loop detects a touch, it leaves the reference for another one that fits into the same block
+(`after_touch`): it brakes, holds, and returns to the beginning of the pass. A session therefore
+has the same number of ticks with and without a touch. Neither way makes the beam ring.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from rigd.identified_beam import TOUCH
 Real = NDArray[np.float64]
 
 _PEAK_SPEED = 2.0
-"""Largest speed of the way back over its mean: that of a path of least jerk, and some more."""
+"""Largest speed of the way back over its mean: that of a minimum-jerk path, with a margin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,27 +39,27 @@ class Pass:
     """Ticks of one pass."""
 
     begins: int
-    """The way out begins; the rest before it is the pass's own."""
+    """Start of the way out; the rest before it belongs to the pass."""
     returns: int
-    """The way back begins."""
+    """Start of the way back."""
     ends: int
-    """First tick after it."""
+    """First tick after the pass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """What the control loop needs to know of passes in search of an obstacle."""
+    """Passes in search of an obstacle, as the control loop needs them."""
 
     passes: tuple[Pass, ...]
-    """One after the other."""
+    """In their order."""
     braking: Braking
-    """Table of the path on which it brakes."""
+    """Table of the braking path."""
     hold_ticks: int
     """Ticks from a touch to the way back."""
     back: Real
     """Way back from 0 to 1, at the ticks after its start."""
     force_limit_n: float
-    """Contact force above which the torque is taken off."""
+    """Contact force above which the torque is switched off."""
 
 
 def touch(
@@ -90,18 +90,18 @@ def touch(
     acceleration_rad_s2
         Largest acceleration of the reference at the beginning and end of the way out.
     passes
-        How often it goes out.
+        Number of passes.
     hold_s
         Time from a touch to the way back, and at the farthest angle if there is none.
     settle_s
         Rest before each pass.
     force_limit_n
-        Contact force above which the torque is taken off and the session ends as a fault; it is
+        Contact force above which the torque is switched off and the session ends as a fault; it is
         watched where the rig measures the base shear.
     rest_s, ring_down_s
         Time before and after all passes.
     path
-        JSON written by ``analyze --json``, whose beam is looked for in the torque; empty: the
+        JSON written by ``analyze --json``, whose beam the torque is compared with; empty: the
         profile's.
     rig
         Rig that is moved.
@@ -111,7 +111,7 @@ def touch(
     ExcitationError
         If an option is not finite or out of range, or the rig cannot brake from that speed.
     IdentifiedBeamError
-        If the file is not what it should be, or has what a search for touches does not take into
+        If the file is invalid, or has an effect that a search for touches does not take into
         account.
     """
     if rig is None:
@@ -148,22 +148,22 @@ def touch(
             f"{braking.duration_s:.3g} s; hold longer."
         )
     slowest_rad_s = float(np.abs(plant.poles_rad_s).min(initial=np.inf))
-    # One period of the slowest mode at least, in which a path that leaves it at rest is gentle.
+    # At least one period of the slowest mode: a path that leaves it at rest is then gentle.
     back_s = max(_PEAK_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s)
     back = still_path(back_s, rate_hz, plant.poles_rad_s)
     settle = np.zeros(ceil(settle_s * rate_hz))
-    stretch = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
-    check_ticks("The session", passes * stretch.size, rate_hz)
-    segments = lay_out_segments(rate_hz, rest_s, passes * stretch.size / rate_hz, ring_down_s)
+    single_pass = np.concatenate([settle, out, np.full(hold_ticks, by_rad), by_rad * (1.0 - back)])
+    check_ticks("The session", passes * single_pass.size, rate_hz)
+    segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
     first = segments["sweep"][0]
     approach = Approach(
         passes=tuple(
             Pass(
                 begins=start + settle.size,
-                returns=start + stretch.size - back.size,
-                ends=start + stretch.size,
+                returns=start + single_pass.size - back.size,
+                ends=start + single_pass.size,
             )
-            for start in range(first, first + passes * stretch.size, stretch.size)
+            for start in range(first, first + passes * single_pass.size, single_pass.size)
         ),
         braking=braking,
         hold_ticks=hold_ticks,
@@ -184,7 +184,7 @@ def touch(
         "by_rad": by_rad,
         "braking_s": braking.duration_s,
     }
-    sweep = np.tile(stretch, passes)
+    sweep = np.tile(single_pass, passes)
     made = assemble("touch", parameters, rate_hz, segments, sweep, approach=approach)
     return replace(made, model=plant.model)
 
@@ -226,7 +226,7 @@ def after_touch(
     hold = min(approach.hold_ticks, returns)
     stays_rad = stopping[-1]
     reference[:hold] = stays_rad
-    # What is detected in the pause has the rest of it, and there is nothing left to brake.
+    # A touch during the pause needs no braking; the remaining pause follows.
     reference[: min(hold, len(stopping))] = stopping[:hold]
     reference[hold : hold + back.size] = stays_rad + (start_rad - stays_rad) * back
     return reference

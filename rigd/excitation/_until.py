@@ -1,7 +1,7 @@
-"""Sessions that go on until a precision is reached: what is asked, and the scan they begin with.
+"""Sessions that end when a precision is reached: their targets, and the initial scan.
 
-The reference of such a session is planned up to the end of a quick sweep over all modes. What
-follows is planned while it runs, from what the record has told by then (`_experiment_design`).
+The reference of such a session is planned up to the end of a quick sweep over all modes. The
+segments after it are planned during the session, from the record so far (`experiment_design`).
 """
 
 from dataclasses import dataclass
@@ -31,41 +31,40 @@ from rigd.units import with_share
 Real = NDArray[np.float64]
 
 PAUSE_S: Final = 0.5
-"""Pause in which a fit is made, such as the first: it tells as much as the beam still rings."""
+"""Pause for a fit, such as the first one: the record gains information while the beam rings."""
 _FADE_S: Final = 0.25
-_SHARE: Final = 0.8
-"""Share of the limits that the scan takes: the beam may be another than the profile says."""
+_SCAN_FRACTION: Final = 0.8
+"""Fraction of the limits that the scan uses: the beam may differ from the profile's."""
 _AT_MODES: Final = (0.2, 1.0, 2.3, 6.3, 12.0)
 _SIZES: Final = (1.0, 0.4, 0.19, 0.15, 1.0)
 """Amplitude of the scan at some frequencies over that of mode 1.
 
-Where the slope of the tip is limited, and a mode that was passed rings on, this gives each of the
-first three modes the share that tells the dampings of all alike. From random beams that differ by a
-fifth from the profile: after it, the worst damping is known to 0.63 times the deviation that is
-there with an amplitude that rises in a straight line.
+Where the slope of the tip is limited and passed modes still ring, these amplitudes determine the
+dampings of the first three modes equally well. For random beams within a fifth of the profile, the
+least certain damping then has 0.63 times the deviation of a scan whose amplitude rises linearly.
 """
 _BEND: Final = 1.25
-"""Power of the time with which the frequency rises: low modes take longer."""
+"""Power of the time with which the frequency rises: low modes get more time."""
 _MAX_UNIFORMITY_PERCENT: Final = 10.0
 _EXAMPLE: Final = "--damping 1%"
 
 
 class ScanRig(DesignRig, Protocol):
-    """What a scan may know of the rig."""
+    """Interface to a rig for which a scan is planned."""
 
     def share_of_limits(self, reference_rad: Real) -> float:
-        """Largest share of a limit that a reference (n,) is predicted to take."""
+        """Return the largest predicted fraction of a limit for a reference (n,)."""
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Largest slope of the free end that is predicted for a reference (n,)."""
+        """Return the largest predicted slope of the free end for a reference (n,)."""
 
     @property
     def beam(self) -> Beam:
-        """The specimen as the profile has it."""
+        """The specimen according to the profile."""
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """The specimen as the profile has it, with the noise of the sensor, all of it free."""
+        """Specimen of the profile with the sensor's noise, all parameters free."""
 
     @property
     def uniformity(self) -> float:
@@ -74,7 +73,7 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """What a session goes on for.
+    """Targets and planned beginning of a session that ends when a precision is reached.
 
     Attributes
     ----------
@@ -112,7 +111,7 @@ def until(
     uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
-    """Scan all modes quickly, then excite what tells most until a precision is reached.
+    """Scan all modes quickly, then choose the most informative excitation until a precision is met.
 
     Parameters
     ----------
@@ -124,28 +123,28 @@ def until(
     at_most_s
         Longest record.
     tip_slope_rad
-        Largest slope of the beam's free end, of which the scan uses 80 % and pieces 90 %. Beyond
+        Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 %. Beyond
         the default, the linear model is not exact.
     amplitude_rad
         Largest amplitude of the scan, at its end; a sixth of it at mode 2, two fifths at mode 1.
-        Lower where the rig's limits or the slope ask for it.
+        Lower where the rig's limits or the slope require it.
     start_hz, stop_hz
         Band of the scan.
     scan_s
         Duration of the scan.
     rest_s
-        Time before it.
+        Time before the scan.
     uniformity_percent
         Relative standard deviation of each mode's frequency from that of a uniform beam, for the
         fits; None: that of the profile.
     rig
-        Limits the amplitude and suits it to its modes; without it, it is one for all frequencies.
+        Limits the amplitude and adapts it to the modes; None: one amplitude for all frequencies.
 
     Raises
     ------
     ExcitationError
-        If an option is not what it should be, or a precision is below the floor that the tolerance
-        of the geometry sets.
+        If an option is out of range, or a target is below the floor that the tolerance of the
+        geometry sets.
 
     Examples
     --------
@@ -154,7 +153,7 @@ def until(
     >>> session.search.planned_ticks, session.reference_rad.size
     (6500, 60000)
     """
-    asked = _parsed(targets)
+    requested = _parsed(targets)
     positive("at_most_s", at_most_s, "s")
     positive("amplitude_rad", amplitude_rad, "rad")
     within_a_turn("amplitude_rad", amplitude_rad)
@@ -186,11 +185,11 @@ def until(
     scan_rad[first:] = amplitude_rad * _scan(end - first, rate_hz, start_hz, stop_hz, beam)
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
-        _refuse_below_floor(rig, asked, uniformity, at_most_s, tip_slope_rad)
-        share = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
-        if share > _SHARE:
-            amplitude_rad *= _SHARE / share
-            scan_rad *= _SHARE / share
+        _refuse_below_floor(rig, requested, uniformity, at_most_s, tip_slope_rad)
+        fraction = max(rig.share_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad)
+        if fraction > _SCAN_FRACTION:
+            amplitude_rad *= _SCAN_FRACTION / fraction
+            scan_rad *= _SCAN_FRACTION / fraction
     reference_rad = np.zeros(ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
@@ -216,7 +215,7 @@ def until(
             "sweep": (first, ticks),
         },
         search=PrecisionSearch(
-            asked, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
+            requested, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
         ),
     )
 
@@ -235,7 +234,7 @@ def _refuse_below_floor(
     below = [each for each in floors if each.below]
     if not below:
         return
-    said = "; ".join(
+    floors_text = "; ".join(
         f"{each.target} (standard deviation) is below the floor of "
         f"{with_share(each.std, each.value)}, {with_share(each.exact_std, each.value)} if the beam "
         "is exactly uniform"
@@ -243,14 +242,14 @@ def _refuse_below_floor(
     )
     raise ExcitationError(
         f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
-        f"(uniformity_percent), within {at_most_s:g} s: {said}. Request a larger standard "
+        f"(uniformity_percent), within {at_most_s:g} s: {floors_text}. Request a larger standard "
         "deviation, or one of the modes (--damping, --frequency), or state --uniformity 0 if the "
         "specimen is exactly uniform."
     )
 
 
 def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
-    """Sweep with an amplitude of 1 at most that suits a beam, (n,); at rest at both ends."""
+    """Return a sweep (n,) of amplitude up to 1 suited to a beam, at rest at both ends."""
     t = np.arange(n) / rate_hz
     u = t * (rate_hz / n)
     frequency_hz = start_hz + (stop_hz - start_hz) * u**_BEND
@@ -268,15 +267,15 @@ def _scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | 
 
 
 def _parsed(targets: str) -> tuple[Target, ...]:
-    """Read all that is asked."""
-    asked = []
+    """Parse the targets."""
+    requested = []
     for text in targets.split(";"):
         if text.strip():
             quantity, _, size = text.strip().partition(" ")
-            asked.append(parse_target(quantity, size))
-    if not asked:
+            requested.append(parse_target(quantity, size))
+    if not requested:
         raise ExcitationError(
-            f"No precision is asked for; give that of one or more of {', '.join(QUANTITIES)}, such "
+            f"No precision is requested; give one or more of {', '.join(QUANTITIES)}, such "
             f"as {_EXAMPLE}."
         )
-    return tuple(asked)
+    return tuple(requested)

@@ -1,10 +1,10 @@
-"""Design of excitation while a session runs: the piece that tells most of what is asked.
+"""Design of excitation while a session runs: the most informative segment comes next.
 
-A piece of a few seconds drives one mode or several at once, each by a narrow linear sweep with a
-phase that suits what still rings. Of all pieces tried, at the largest amplitude that the rig and
-the linear model allow, that one is taken which lowers the deviations asked for most per second, by
-the Fisher information of the whole record with it (`rigd.excitation._fisher_information`). The
-ringing that a piece leaves counts for it, since it goes on weighted while other modes are driven.
+A segment of a few seconds drives one or several modes, each by a narrow linear sweep. The phase of
+a sweep suits the present vibration. All candidates have the largest amplitude that the rig and the
+linear model allow. The chosen one reduces the standard deviations of the targets most per second,
+by the Fisher information of the whole record (`rigd.excitation._fisher_information`). Vibration
+after a segment counts as well, since it still gives information while other modes are driven.
 
 References
 ----------
@@ -26,7 +26,7 @@ from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
 from rigd.excitation._piece_search import (
-    LOOK_AHEAD_S,
+    HORIZON_S,
     SHORTEST_S,
     Piece,
     PieceSearch,
@@ -44,38 +44,38 @@ _BY_GEOMETRY: Final = 1.5
 
 
 class DesignRig(Protocol):
-    """Rig that pieces are designed for."""
+    """Interface to a rig for which segments are designed."""
 
     @property
     def start_rad(self) -> float:
-        """Where the motor stands, from the rig's zero."""
+        """Present angle of the motor, from the rig's zero."""
 
     def plant_with(self, beam: LoadedBeam) -> MovePlant:
-        """Return closed loop and limits with a beam in place of the profile's.
+        """Return closed loop and limits with a beam instead of the profile's.
 
         Parameters
         ----------
         beam
-            The beam as estimated, with what is at its ends.
+            The estimated beam, with tip mass and root compliance.
         """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """A session of designed pieces, one after the other."""
+    """A session of designed segments, one after the other."""
 
-    pieces: tuple[Piece, ...]
-    """In the order in which they are played."""
+    segments: tuple[Piece, ...]
+    """In the order of play."""
     reference_rad: Real
-    """Shape (n,): all of them."""
+    """Shape (n,): reference of all segments."""
     angle_rad: Real
-    """Shape (n,): the angle predicted."""
+    """Shape (n,): predicted angle."""
     names: tuple[str, ...]
     """Free parameters, in the order of the covariance."""
     covariance: Real
     """Shape (k, k): expected at the end."""
     expected: tuple[Precision, ...]
-    """Everything asked, as precise as it is expected to be at the end."""
+    """Precision of each target expected at the end."""
 
 
 def next_piece(
@@ -88,50 +88,50 @@ def next_piece(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
 ) -> Piece:
-    """Design the piece that lowers the deviations asked for most per second.
+    """Design the segment that reduces the deviations of the targets most per second.
 
     Parameters
     ----------
     estimate
-        Beam, damping and noise as they are known.
+        Present estimate of beam, damping and noise.
     angle_rad_so_far
-        Shape (n,): angle from the beginning of the record to that of the piece, at the rig's rate:
-        as measured, and as predicted (`Piece.angle_rad`) where a piece is still to be played. The
-        beam rested at the first.
+        Shape (n,): angle from the beginning of the record to that of the segment, at the rig's
+        rate: measured, or predicted (`Piece.angle_rad`) for segments that are not played yet. The
+        beam is at rest at the first tick.
     targets
-        What is asked.
+        Targets of the session.
     rig
         Closed loop and limits.
     time_left_s
-        Time in which the session has to end; a piece takes no more.
+        Remaining time of the session; the segment is not longer.
     tip_slope_rad
         Slope of the tip up to which the linear model is trusted.
     through
-        Modes one of which has to be driven; empty: whatever tells most.
+        Modes one of which has to be driven; empty: the most informative ones.
 
     Raises
     ------
     ExcitationError
-        If nothing is asked, or no piece fits into the time or drives a mode.
+        If there is no target, or no segment fits into the time or drives a mode.
     """
     driven = [mode.number for mode in estimate.modes() if mode.number in through]
     quantities = Quantities.of(targets, estimate)
     if not quantities.items:
-        raise ExcitationError("No precision is asked for; give for example --damping 1%.")
+        raise ExcitationError("No precision is requested; give for example --damping 1%.")
     plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, LOOK_AHEAD_S)
+    record = RecordSoFar.of(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
     decision = PieceSearch(
         estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
     )
-    return decision.piece(decision.best(time_left_s, driven), time_left_s)
+    return decision.segment(decision.best(time_left_s, driven), time_left_s)
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryFloor:
-    """Least standard deviation of a quantity that the tolerance of the geometry leaves."""
+    """Least standard deviation of a quantity with a given tolerance of the geometry."""
 
     target: Target
-    """What is asked."""
+    """The target."""
     value: float
     """Value of the quantity."""
     std: float
@@ -141,9 +141,9 @@ class GeometryFloor:
 
     @property
     def below(self) -> bool:
-        """Whether less than the floor is asked for, and the geometry is why it is out of reach."""
-        asked = self.target.std * (abs(self.value) if self.target.relative else 1.0)
-        return asked < self.std and self.std > _BY_GEOMETRY * self.exact_std
+        """Whether the target is below the floor, and the geometry is the reason."""
+        target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
+        return target_std < self.std and self.std > _BY_GEOMETRY * self.exact_std
 
 
 def geometry_floors(
@@ -154,7 +154,7 @@ def geometry_floors(
     duration_s: float,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> tuple[GeometryFloor, ...]:
-    """Compute how precisely the parameters asked for can be known of a nearly uniform beam.
+    """Compute how precisely the parameters of a nearly uniform beam can be determined.
 
     Each is that of the best mixture of steady sines for it alone, at the largest amplitudes that
     the rig and the linear model allow. Modes have no floor: they are those of the antenna, uniform
@@ -167,7 +167,7 @@ def geometry_floors(
     rig
         Closed loop and limits.
     targets
-        What is asked.
+        Targets of the session.
     uniformity
         Relative standard deviation of each mode's frequency from that of a uniform beam.
     duration_s
@@ -210,7 +210,7 @@ def geometry_floors(
 def expected_precisions(
     angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
 ) -> tuple[Precision, ...]:
-    """Compute how precisely a record is expected to determine what is asked.
+    """Compute how precisely a record is expected to determine the targets.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def expected_precisions(
     estimate
         Beam, damping and noise.
     targets
-        What is asked.
+        Targets of the session.
     rate_hz
         Rate of the angle.
     """
@@ -236,7 +236,7 @@ def design_excitation(
     angle_rad_so_far: Real | None = None,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> Design:
-    """Design a session: pieces until everything asked is reached, or the time is over.
+    """Design a session: segments until all targets are reached or the time is over.
 
     Parameters
     ----------
@@ -245,19 +245,19 @@ def design_excitation(
     rig
         Closed loop and limits: `rigd.runner.planning.LoopPreview`.
     targets
-        What is asked.
+        Targets of the session.
     duration_s
-        Time of all pieces together.
+        Total time of all segments.
     angle_rad_so_far
-        Shape (n,): angle of the record that the pieces continue; None: they begin with the beam
-        at rest.
+        Shape (n,): angle of the record before the segments; None: they begin with the beam at
+        rest.
     tip_slope_rad
         Slope of the tip up to which the linear model is trusted.
 
     Raises
     ------
     ExcitationError
-        If nothing is asked, or no piece fits into the time or drives a mode.
+        If there is no target, or no segment fits into the time or drives a mode.
 
     Examples
     --------
@@ -284,22 +284,24 @@ def design_excitation(
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     left_s = duration_s
-    pieces: list[Piece] = []
-    while not pieces or (
-        left_s >= SHORTEST_S and not all(each.reached for each in pieces[-1].expected)
+    segments: list[Piece] = []
+    while not segments or (
+        left_s >= SHORTEST_S and not all(each.reached for each in segments[-1].expected)
     ):
         so_far_rad = np.concatenate([before_rad, angle_rad])
-        piece = next_piece(estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad)
-        pieces.append(piece)
-        reference_rad = np.concatenate([reference_rad, piece.reference_rad])
-        # What one leaves in the loop is part of the next.
+        segment = next_piece(
+            estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
+        )
+        segments.append(segment)
+        reference_rad = np.concatenate([reference_rad, segment.reference_rad])
+        # The loop's state after one segment is the initial state of the next.
         angle_rad = plant.respond(reference_rad).angle_rad
-        left_s -= piece.reference_rad.size / plant.rate_hz
+        left_s -= segment.reference_rad.size / plant.rate_hz
     return Design(
-        pieces=tuple(pieces),
+        segments=tuple(segments),
         reference_rad=reference_rad,
         angle_rad=angle_rad,
         names=estimate.names,
-        covariance=pieces[-1].covariance,
-        expected=pieces[-1].expected,
+        covariance=segments[-1].covariance,
+        expected=segments[-1].expected,
     )

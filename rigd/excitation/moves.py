@@ -4,7 +4,7 @@ A reference is made of one acceleration a tick: ``r[k] = dt² Σ_{j<k} (k - j) a
 is linear, so that a mode with the pole s is left at rest where the accelerations' transform
 ``Σ a[j] exp(-s j dt)`` is zero: the angle that follows the reference has the same zero. A zero of
 second order (its derivative by s is zero as well) leaves little where the pole is not well known.
-The poles are those of the closed loop with the motor held, for its modes are what rings on.
+The poles are those of the closed loop with the motor held, since its modes continue to ring.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 ROBUST_BELOW_HZ = 60.0
-"""A robust move has zeros of second order for the modes below; those above are too weak to matter
+"""A robust move has zeros of second order for the modes below; higher ones are too weak to matter
 after a change of 1 % in their frequency."""
 
 _MOST_PEAK = 24.0
@@ -28,7 +28,7 @@ four times that of a quintic. A path shorter than about half a period of a mode 
 
 
 def quintic(duration_s: float, rate_hz: float) -> Real:
-    """Path of least jerk from 0 to 1, with speed and acceleration zero at both ends.
+    """Return the minimum-jerk path from 0 to 1, at rest at both ends.
 
     Parameters
     ----------
@@ -59,10 +59,10 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
 
 
 def still_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
-    """Path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
+    """Return the path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
 
-    The zeros are of second order where the time suffices, else of first order; below about half a
-    period of the slowest mode it is the quintic.
+    The zeros are of second order if the time suffices, else of first order; below about half a
+    period of the slowest mode the path is the quintic.
 
     Parameters
     ----------
@@ -97,10 +97,10 @@ def slew(
     rate_hz: float,
     poles_rad_s: Complex,
 ) -> Real:
-    """Slew at constant speed, in which no mode rings, neither on the way nor at the end.
+    """Return a reference at constant speed that leaves no mode ringing, on the way or at the end.
 
-    The speed is taken up by a pulse of acceleration that leaves all modes at rest, and given up by
-    the same with the other sign. A pulse takes half a period of the slowest mode at least.
+    A pulse of acceleration that leaves all modes at rest starts the motion, and the same pulse with
+    the other sign ends it. A pulse takes at least half a period of the slowest mode.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def slew(
     speed_rad_s
         Speed on the way; lower where the distance is too short to reach it.
     acceleration_rad_s2
-        Largest acceleration; the pulses become longer until they keep it.
+        Largest acceleration; the pulses are lengthened to stay below it.
     rate_hz
         Ticks a second.
     poles_rad_s
@@ -132,20 +132,20 @@ def slew(
     n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
     while True:
         pulse = _pulse(n, rate_hz, poles_rad_s)
-        # Both pulses together go as far as one at full speed.
+        # Both pulses together cover the distance of one at full speed.
         speed = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
         if pulse is not None and speed * np.abs(pulse).max() <= acceleration_rad_s2:
             break
         n = n + max(1, n // 20)
     cruise = round(abs(distance_rad) / speed * rate_hz) - n
-    # A whole number of ticks on the way: the speed is what fits, by less than a tick's part.
+    # With a whole number of cruise ticks the speed is slightly lower than requested.
     speed = abs(distance_rad) * rate_hz / (n + cruise)
     acceleration = np.concatenate([pulse, np.zeros(cruise), -pulse])
     return from_acceleration(np.copysign(speed, distance_rad) * acceleration, rate_hz)
 
 
 def _pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
-    """Accelerations (n,) of least norm that change the speed by 1; None: n is too short."""
+    """Return accelerations (n,) of least norm that change the speed by 1; None: n is too short."""
     rows = np.concatenate([_motion_rows(n, rate_hz)[:1], zero_rows(n, rate_hz, poles_rad_s, 1)])
     pulse, met = _least_norm(rows, np.array([1.0]))
     return pulse if met else None
@@ -166,15 +166,15 @@ def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
 
 
 def _motion_rows(n: int, rate_hz: float) -> Real:
-    """Rows (2, n) that give change of speed and distance of n accelerations."""
+    """Return rows (2, n) for the change of speed and the distance of n accelerations."""
     ticks_left = n - np.arange(n)
     return np.stack([np.full(n, 1.0 / rate_hz), ticks_left / rate_hz**2])
 
 
 def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
-    """Rows (rows, n) that give the real and imaginary part of what n accelerations leave in modes.
+    """Return rows (rows, n) for the real and imaginary part of the modes' state after n ticks.
 
-    Each mode is referred to the end of the path, where it has decayed. With ``order`` 2 those below
+    Each mode is referred to the end of the path. With ``order`` 2 the modes below
     `ROBUST_BELOW_HZ` have rows for the derivative by the pole as well.
 
     Parameters
@@ -201,7 +201,7 @@ def zero_rows(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
 
 
 def _least_norm(rows: Real, wanted: Real) -> tuple[Real, bool]:
-    """Solve ``rows @ a = wanted`` (0 for the other rows) by the least a, and say if it was met."""
+    """Solve ``rows @ a = wanted`` (0 for the other rows) by the least a, and check the solution."""
     goal = np.zeros(len(rows))
     goal[: wanted.size] = wanted
     scale = np.linalg.norm(rows, axis=1)
@@ -211,7 +211,7 @@ def _least_norm(rows: Real, wanted: Real) -> tuple[Real, bool]:
 
 
 def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
-    """Return what a reference has left in each mode at its end: its accelerations' transform.
+    """Return the state of each mode at the end of a reference: its accelerations' transform.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
         Complex, in rad/s. Zero: the mode is at rest.
     """
     acceleration = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
-    # r[k+1] - 2 r[k] + r[k-1] is of tick k: one before the sample in which it shows.
+    # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
     left_s = np.arange(acceleration.size, 0, -1) / rate_hz
     state: Complex = np.exp(np.outer(poles_rad_s, left_s)) @ acceleration / rate_hz
     return state
@@ -241,16 +241,16 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
 class Braking:
     """Table of a braking path: it starts at any tick, without planning.
 
-    The speed falls on a cubic from what it is to zero, and its slope from what it is to zero, so
-    that neither jumps. The path is linear in both: a tick takes two products.
+    The speed falls on a cubic from its present value to zero, and so does its slope: neither
+    jumps. The path is linear in both: a tick takes two products.
     """
 
     rate_hz: float
     """Ticks a second."""
     per_speed_s: tuple[float, ...]
-    """Way at the ticks after the start, per speed there."""
+    """Distance at the ticks after the start, per speed at the start."""
     per_acceleration_s2: tuple[float, ...]
-    """Way at the ticks after the start, per acceleration there."""
+    """Distance at the ticks after the start, per acceleration at the start."""
 
     @property
     def duration_s(self) -> float:
@@ -260,7 +260,7 @@ class Braking:
     def path(
         self, angle_rad: float, speed_rad_s: float, acceleration_rad_s2: float = 0.0
     ) -> list[float]:
-        """Return the reference at the ticks after the start, in microseconds; the last one stays.
+        """Return the reference at the ticks after the start; the last one stays.
 
         Parameters
         ----------
@@ -279,7 +279,7 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     Parameters
     ----------
     duration_s
-        Time to standstill: `braking_time_s` says which keeps a rig's limits.
+        Time to standstill: `braking_time_s` gives one within a rig's limits.
     rate_hz
         Ticks a second.
 
@@ -307,21 +307,21 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
 
 
 def braked(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
-    """Return a reference that is braked from a tick on, as the control loop does it.
+    """Return a reference that is braked after a tick, as the control loop does it.
 
     Parameters
     ----------
     reference_rad
         Shape (n,).
     tick
-        Last tick at which it is followed; from 2 on, for speed and acceleration.
+        Last tick at which the reference is followed; at least 2, for speed and acceleration.
     braking
         Table of the braking path.
 
     Returns
     -------
     ndarray, shape (tick + 1 + m,)
-        The last angle is where it stands still.
+        The last angle is the one at standstill.
     """
     before, last, now = (float(value) for value in reference_rad[tick - 2 : tick + 1])
     rate_hz = braking.rate_hz

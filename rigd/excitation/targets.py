@@ -1,4 +1,4 @@
-"""Precision that is asked of a session: which quantity, and with which standard deviation."""
+"""Target precision of a session: quantities and their standard deviations."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ Real = NDArray[np.float64]
 
 OF_MODES: Final = ("damping", "frequency")
 QUANTITIES: Final = (*OF_MODES, "zeta", "alpha", "gamma", "lambda")
-"""What a precision can be asked of: damping ratio and frequency of modes, or a parameter."""
+"""Quantities with a target: damping ratio and frequency of modes, or a parameter."""
 
 _UNITS: Final = {"frequency": "Hz"}
 _NO_ANSWER: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
-"""Deviations, in units of the quantity, that tell nothing: who asks for one has forgotten the %."""
+"""Deviations, in units of the quantity, that are useless: such a request has lost its %."""
 _MOST_MODES: Final = 20
 _OF_COEFFICIENT: Final = {"alpha": "zeta", "lambda": "gamma"}
 _KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "lambda": "external"}
@@ -27,40 +27,41 @@ _KIND: Final = {"zeta": "internal", "alpha": "internal", "gamma": "external", "l
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A standard deviation that a quantity is to have, as it was asked for."""
+    """Requested standard deviation of a quantity."""
 
     quantity: str
     """One of `QUANTITIES`."""
     std: float
-    """Standard deviation: a share of the value if `relative`, else in the unit of the quantity (a
-    ratio, Hz, s^alpha, s^lambda/m⁴)."""
+    """Standard deviation: a fraction of the value if `relative`, else in the unit of the quantity
+    (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
     relative: bool
-    """Whether it is a share of the value."""
+    """Whether it is a fraction of the value."""
     mode: int | None = None
-    """Which mode, from 1 on; None: every mode in the band, or no mode at all."""
+    """Number of the mode, from 1; None: every mode in the band, or not a quantity of modes."""
 
     @property
     def name(self) -> str:
-        """The quantity for people."""
+        """Name of the quantity, for the operator."""
         return self.quantity if self.mode is None else f"{self.quantity} of mode {self.mode}"
 
     def __str__(self) -> str:
-        """Return quantity and deviation for people."""
+        """Return quantity and deviation, for the operator."""
         unit = _UNITS.get(self.quantity, "")
         size = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
         return f"{self.name} to {size}"
 
 
 def parse_target(quantity: str, text: str) -> Target:
-    """Read the precision that an option asks for.
+    """Parse the target precision of an option.
 
     Parameters
     ----------
     quantity
         One of damping, frequency, zeta, alpha, gamma and lambda.
     text
-        ``1%``: standard deviation as a share of the value, of every mode in the band; ``2:0.5%``:
-        of mode 2; ``0.01``: in the unit of the quantity, which may be written: ``1:0.002Hz``.
+        ``1%``: standard deviation as a percentage of the value, of every mode in the band;
+        ``2:0.5%``: of mode 2; ``0.01``: in the unit of the quantity, optionally with the unit:
+        ``1:0.002Hz``.
 
     Raises
     ------
@@ -75,7 +76,7 @@ def parse_target(quantity: str, text: str) -> Target:
     """
     if quantity not in QUANTITIES:
         raise ExcitationError(
-            f"The precision of {quantity!r} cannot be asked for; choose from "
+            f"The precision of {quantity!r} cannot be requested; choose from "
             f"{', '.join(QUANTITIES)}."
         )
     option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
@@ -102,7 +103,7 @@ def parse_target(quantity: str, text: str) -> Target:
         std = float(number)
     except ValueError:
         raise ExcitationError(
-            f"{option}: {size!r} is no standard deviation; give a share of the value in % or a "
+            f"{option}: {size!r} is no standard deviation; give a percentage of the value or a "
             f"number{f' in {unit}' if unit else ''}, for example {example}."
         ) from None
     std = std / 100 if relative else std
@@ -115,73 +116,73 @@ def parse_target(quantity: str, text: str) -> Target:
     if not relative and std >= most:
         raise ExcitationError(
             f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
-            f"not below {most:g}; for a share of the value write {text.strip()}%."
+            f"not below {most:g}; for a percentage of the value write {text.strip()}%."
         )
     return Target(quantity, std, relative, mode)
 
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """What is known of one quantity, and what is asked."""
+    """Present precision of one quantity, and its target."""
 
     target: Target
-    """As asked, of one mode where it is of modes."""
+    """The target, of one mode if the quantity belongs to modes."""
     value: float
     """Estimated value."""
     std: float
     """Its standard deviation."""
     asked_std: float
-    """Standard deviation that is asked, in the same unit; 0 for a share of a value of 0."""
+    """Target standard deviation, in the same unit; 0 for a percentage of a value of 0."""
     impossible: str = ""
-    """Why no record will tell it; empty if one may."""
+    """Why no record can determine the quantity; empty if one can."""
 
     @property
     def ratio(self) -> float:
-        """Standard deviation over the one asked: reached at 1 and below."""
+        """Standard deviation over its target: reached at 1 and below."""
         if self.impossible:
             return inf
         return self.std / self.asked_std if self.asked_std > 0.0 else inf
 
     @property
     def reached(self) -> bool:
-        """Whether it is as precise as asked."""
+        """Whether the target is reached."""
         return self.ratio <= 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """Everything asked, linearised at an estimate."""
+    """All target quantities, linearised at an estimate."""
 
     items: tuple[Precision, ...]
-    """One for each quantity; the deviation is not known yet."""
+    """One for each quantity; their deviations are still unknown."""
     gradients: Real
     """Shape (q, k): derivatives by the free parameters."""
 
     @classmethod
     def of(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
-        """Linearise what is asked.
+        """Linearise the target quantities.
 
         Parameters
         ----------
         targets
-            What is asked; of modes without a number it is asked of every one in the band.
+            Targets; one without a mode number applies to every mode in the band.
         estimate
-            Where it is linearised.
+            Point of linearisation.
         """
         modes = estimate.modes()
         items, gradients = [], []
         for target in targets:
             for one in _of_single_modes(target, modes):
                 value, gradient, impossible = _linearised(one, estimate, modes)
-                asked = one.std * abs(value) if one.relative else one.std
-                if asked == 0.0 and not impossible:
-                    impossible = f"{one.name} is 0: a share of it is nothing"
-                items.append(Precision(one, value, inf, asked, impossible))
+                target_std = one.std * abs(value) if one.relative else one.std
+                if target_std == 0.0 and not impossible:
+                    impossible = f"{one.name} is 0: no percentage of it is a precision"
+                items.append(Precision(one, value, inf, target_std, impossible))
                 gradients.append(gradient)
         return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
 
     def ratios(self, covariance: Real) -> Real:
-        """Deviations over those asked, shape (q,), of what can be told; 0 for the others.
+        """Return deviations over their targets, shape (q,); 0 for impossible ones.
 
         Parameters
         ----------
@@ -189,12 +190,12 @@ class Quantities:
             Shape (k, k), of the free parameters.
         """
         variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
-        asked = np.array([inf if each.impossible else each.asked_std for each in self.items])
-        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / asked
+        target_std = np.array([inf if each.impossible else each.asked_std for each in self.items])
+        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / target_std
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
-        """Everything asked with the deviation for a covariance (k, k)."""
+        """Return the precision of every target for a covariance (k, k)."""
         return tuple(
             replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
             for each, slope in zip(self.items, self.gradients, strict=True)
@@ -210,7 +211,7 @@ def _of_single_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[T
 def _linearised(
     target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
-    """Value, derivatives (k,) and, where it cannot be told, the reason."""
+    """Return value, derivatives (k,) and, if it cannot be determined, the reason."""
     gradient = np.zeros(len(estimate.names))
     name = target.quantity
     if name in OF_MODES:
@@ -225,6 +226,6 @@ def _linearised(
     coefficient = _OF_COEFFICIENT.get(name, name)
     if estimate.values[coefficient] == 0.0 or name not in estimate.names:
         free = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_KIND[name]} damping {free} in what was found so far"
+        return value, gradient, f"{_KIND[name]} damping {free} in the estimate so far"
     gradient[estimate.names.index(name)] = value if name in LOGARITHMIC else 1.0
     return value, gradient, ""

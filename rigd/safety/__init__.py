@@ -1,4 +1,4 @@
-"""Limits and interlocks: what ends a session, what warns, and what the operator is told.
+"""Limits and interlocks: end of a session, warnings, and messages to the operator.
 
 Offers the checks of every tick (`LimitWatch`, `EncoderWatch`, `SensorWatch`), which the loop calls.
 Public modules: `limits` (the table of interlocks, the levels of a profile), `probing_move` and

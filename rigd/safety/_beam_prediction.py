@@ -11,20 +11,20 @@ _MODES = 4
 _FASTEST = 0.25
 """Fastest mode of the prediction, as a fraction of the rate."""
 _OBSERVER_RAD_S = 6.0
-"""Rate at which the prediction takes up vibration that the angle does not explain, as of a beam
-that was not at rest. Slow against a shaft that runs away, fast against the drift in phase of modes
-whose frequencies are a few per cent wrong."""
+"""Bandwidth of the observer for vibration that the angle does not explain, as of a beam that was
+not at rest. Slow against a shaft that runs away, fast against the phase drift of modes whose
+frequencies are wrong by a few per cent."""
 _OFFSET_RAD_S = 0.5
 """The same for the zero of the sensor."""
 
 
 class BeamPrediction:
-    """Coupling torque of a beam whose root turns as measured, by its first modes.
+    """Coupling torque of a beam whose root turns by the measured angle, from its first modes.
 
     On a root that turns by θ each clamped–free mode acts like a mass on a torsion spring:
     ``φ'' + 2 ζ ω φ' + ω² (φ - θ) = 0``, and the root exerts ``k (θ - φ)``, where the stiffness
-    ``k = 4 E I/L`` is the same for all modes. A Luenberger observer takes up what is measured
-    beyond that, slowly.
+    ``k = 4 E I/L`` is the same for all modes. A Luenberger observer slowly follows the remaining
+    measured torque.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class BeamPrediction:
         error[-1], error[2 * m] = 1.0, -1.0
         gain[2 * m] = _OFFSET_RAD_S * period_s
         for number, pole in enumerate(ringing):
-            # φ = 2 Re(r z) with z' = p z + θ, and θ runs straight from one tick to the next.
+            # φ = 2 Re(r z) with z' = p z + θ, and θ is linear between two ticks.
             rows = slice(2 * number, 2 * number + 2)
             turned = cexp(pole * period_s)
             now = (turned - 1.0 - pole * period_s) / (pole**2 * period_s)
@@ -92,7 +92,7 @@ class BeamPrediction:
         self._rest_rad = angle_rad
 
     def step(self, angle_rad: float, torque_nm: float) -> float:
-        """Return the measured coupling torque less the predicted one, in N·m.
+        """Return the measured minus the predicted coupling torque, in N·m.
 
         Parameters
         ----------
@@ -108,6 +108,6 @@ class BeamPrediction:
         return float(output[size])
 
     def skip(self, angle_rad: float) -> None:
-        """Go on by a tick without a measured torque."""
+        """Step by a tick without a measured torque."""
         error_nm = self.step(angle_rad, 0.0)
         self._vectors[0][: self._size] -= self._gain * error_nm

@@ -1,17 +1,17 @@
 """Encoder watch: detects an encoder that has failed while its messages stay fresh.
 
-A frozen encoder shows the angle of a shaft that stands still, and a controller that believes it
-turns the motor without limit. Three observations distinguish the two:
+A frozen encoder shows a shaft at rest, and a controller that trusts it turns the motor without
+limit. Three observations distinguish the two:
 
 * *Momentum.* A moving shaft does not stop within two ticks: torques and friction would have to
   supply an impulse of ``J v``.
-* *Net torque.* Motor torque less coupling torque, ``n = u - Γ``, turns the shaft as soon as it
-  exceeds the breakaway torque. It needs no model of the beam, but friction limits it.
-* *Coupling torque.* A beam that pulls at a shaft which seems to stand still, beyond what it does by
-  its own vibration, is driven by a shaft that moves, or is touched. This needs no knowledge of the
-  friction, but does not tell the two apart. So it only asks for a *test of the encoder*: the torque
-  of the motor is ramped until the encoder moves by two steps and so answers, or until the net
-  torque exceeds the breakaway torque, which is a fault.
+* *Net torque.* Motor minus coupling torque, ``n = u - Γ``, turns the shaft as soon as it exceeds
+  the breakaway torque. This needs no model of the beam, but friction limits it.
+* *Coupling torque.* If a beam pulls at an apparently resting shaft more than by its own vibration,
+  the shaft moves, or the beam is touched. This needs no knowledge of the friction, but does not
+  distinguish the two. It therefore only starts a *test of the encoder*: the torque of the motor is
+  ramped until the encoder moves by two steps, or until the net torque exceeds the breakaway
+  torque, which is a fault.
 
 An encoder that repeats readings, every second one for example, shows single ticks without movement
 in a steady motion.
@@ -25,10 +25,10 @@ from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
 from rigd.safety.limits import BY_NAME, Violation
 
 ENCODER_FAILURE_S = 0.004
-"""Time after which net torque on an encoder that stands still is a fault, if it is large."""
+"""Time after which large net torque on an encoder at rest is a fault."""
 _WINDOWS_S = ENCODER_FAILURE_S, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
-"""Durations over which torques are averaged: short ones within half a period of whatever the
-excitation contains, long ones in which noise averages out."""
+"""Durations over which torques are averaged: short ones within half a period of any excitation,
+long ones in which noise averages out."""
 _STANDSTILL_S = 0.016
 """Time without an encoder step after which the coupling torque is compared."""
 _SIGNIFICANT = 5.0
@@ -36,31 +36,32 @@ _SIGNIFICANT = 5.0
 _LEAST_PULL = 0.005
 """The same for a sensor without noise, as a fraction of the breakaway torque."""
 _MODEL_ERROR = 0.5
-"""Part of the coupling torque's rms that the prediction may miss, for beams differ from their
-model. It vibrates: of a mean over more than half a period of the first mode, less is allowed."""
+"""Error of the prediction, as a fraction of the coupling torque's rms: beams differ from their
+models. The error vibrates: a mean over more than half a period of the first mode has a lower
+one."""
 _VIBRATION_S = 0.25
 """Time constant of that rms."""
 _RAMP_S = 0.02
-"""Time in which the torque of a test grows by the breakaway torque."""
+"""Time in which the torque of a test rises by the breakaway torque."""
 _RAMP_LIMIT = 2.0
-"""Torque, in breakaway torques, at which a test begins again in the other direction."""
+"""Torque, in breakaway torques, at which a test starts again in the other direction."""
 _ANSWER_STEPS = 1.5
-"""Encoder steps above which a movement answers a test."""
+"""Encoder steps that answer a test."""
 _PAUSE_S = 0.5
-"""Time after an answer in which no other test is made."""
+"""Time after an answer without a further test."""
 _TORQUE_ERROR = 0.25
-"""Relative error of the motor's torque that is no fault."""
+"""Relative error of the motor's torque that is not a fault."""
 _MOMENTUM = 0.5
-"""Part of the shaft's momentum that has to be accounted for: inertias are known to a quarter."""
+"""Fraction of the shaft's momentum that needs an explanation: inertias are known to a quarter."""
 _STOP_TICKS = 2
 _STOP_STEPS = 4.0
-"""Speed, in encoder steps a tick over `SPEED_TICKS`, from which on a stop is examined."""
+"""Speed, in encoder steps a tick over `SPEED_TICKS`, from which a stop is examined."""
 _SCALE_STEPS = 3.0
-"""Encoder steps within `SPEED_TICKS` from which on a speed counts for the scales."""
+"""Encoder steps within `SPEED_TICKS` from which a speed counts for the scales."""
 _MOST_REPEATS = 6
 _REPEAT_TICKS = 32
 _REPEAT_STEPS = 3.5
-"""Encoder steps that a reading moves at least before and after one that it repeats."""
+"""Least encoder steps before and after a repeated reading."""
 
 
 class EncoderWatch:
@@ -77,11 +78,11 @@ class EncoderWatch:
     inertia_kg_m2
         Inertia of the motor.
     breakaway_nm
-        Net torque that no friction of the shaft withstands.
+        Net torque that exceeds any friction of the shaft.
     delay_ticks
         Ticks from a command to its torque.
     scales
-        Compares the scales of the readings; None: they are not compared.
+        Comparison of the readings' scales; None: none.
 
     Attributes
     ----------
@@ -137,7 +138,7 @@ class EncoderWatch:
         self._inertia_kg_m2 = inertia_kg_m2
         self._breakaway_nm = breakaway_nm
         lengths = [max(_STOP_TICKS + 1, round(w * rate_hz)) for w in _WINDOWS_S]
-        # Within an encoder step the shaft may turn round, with `8 step/T²` at the most.
+        # Within an encoder step the shaft may reverse, with at most `8 step/T²`.
         turn_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
         self._windows = [(ticks, turn_nm / ticks**2) for ticks in lengths]
         self._standstill = max(lengths[0], round(_STANDSTILL_S * rate_hz))
@@ -201,7 +202,7 @@ class EncoderWatch:
         Returns
         -------
         Violation or None
-            What shows that the encoder has failed; `test_nm` is then to be ignored.
+            Evidence of a failed encoder; `test_nm` is then to be ignored.
         """
         prediction = self._prediction
         pending = self._pending
@@ -249,13 +250,13 @@ class EncoderWatch:
         if self._test_step_nm:
             self.test_nm += self._test_step_nm
             if abs(self.test_nm) > _RAMP_LIMIT * self._breakaway_nm:
-                # The controller has taken the torque back, since its reference goes the other way.
+                # The controller has cancelled the torque, since its reference moves the other way.
                 self._test_step_nm = -self._test_step_nm
                 self.test_nm = 0.0
         return None
 
     def skip(self, ticks: int, angle_rad: float) -> None:
-        """Go on by some ticks that were missed, or whose readings are old; the torque was held.
+        """Step over ticks that were missed or have old readings; the torque was held.
 
         Parameters
         ----------
@@ -275,7 +276,7 @@ class EncoderWatch:
         self._uneven = self._angles.maxlen or 0
 
     def _check_standstill(self, standing: int) -> Violation | None:
-        """Check a shaft that has seemed to stand still for some ticks.
+        """Check a shaft that seems to be at rest for some ticks.
 
         The shortest window is checked in every tick, the others in turn.
         """
@@ -298,7 +299,7 @@ class EncoderWatch:
         return violation
 
     def _check_momentum(self) -> Violation | None:
-        """Check a stop within `_STOP_TICKS` against the impulse that it takes."""
+        """Check a stop within `_STOP_TICKS` against the impulse that it requires."""
         angles = self._angles
         before = -1 - _STOP_TICKS
         if len(angles) < SPEED_TICKS - before:
@@ -320,7 +321,7 @@ class EncoderWatch:
         return BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
 
     def _check_net_torque(self, ticks: int, turn_nm: float) -> Violation | None:
-        """Check the mean net torque on a shaft that seems to stand still."""
+        """Check the mean net torque on a shaft that seems to be at rest."""
         net, motor = self._over(ticks)
         net_nm, coupling_nm = net / ticks, (motor - net) / ticks
         limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
@@ -329,7 +330,7 @@ class EncoderWatch:
         return BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
 
     def _compare_coupling_torque(self, ticks: int) -> None:
-        """Begin a test of the encoder if the beam pulls at a shaft that seems to stand still."""
+        """Start a test of the encoder if the beam pulls at a shaft that seems to be at rest."""
         errors, noise_nm = self._errors, self._noise_nm
         error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
@@ -340,7 +341,7 @@ class EncoderWatch:
         )
         if -level_nm < error_nm < level_nm:
             return
-        # Against the pull, for a shaft that runs away is then braked; or the shorter way.
+        # Against the pull, which brakes a runaway shaft; or in the shorter direction.
         net_nm = self._over(ticks)[0] / ticks
         shorter = abs(net_nm) > 0.5 * self._breakaway_nm
         ramp_nm = self._breakaway_nm / (_RAMP_S * self._rate_hz)
@@ -373,7 +374,7 @@ class EncoderWatch:
         least_rad = _SCALE_STEPS * self._resolution_rad
         if now_rad * before_rad <= 0.0 or min(abs(now_rad), abs(before_rad)) < least_rad:
             return None
-        # The same weights as the difference of two mean speeds gives the acceleration.
+        # Weighting like the difference of two mean speeds gives the torque of that acceleration.
         net = motor = 0.0
         for j in range(1, SPEED_TICKS + 1):
             for last in (torques[-1 - j], torques[-2 - j]):

@@ -7,17 +7,17 @@ from math import exp, inf, isfinite, sqrt
 from rigd.safety.limits import BY_NAME, OVERLOADED, Limits, Violation
 
 LOOK_EVERY = 64
-"""Ticks between two checks of what changes slowly."""
+"""Ticks between two checks of slowly changing quantities."""
 
-SHARE_WINDOW_S = 10.0
-"""Missed ticks and old readings are counted against at least this much time, so that one early
-burst is not a fault."""
+FRACTION_WINDOW_S = 10.0
+"""Missed ticks and old readings are counted over at least this time, so that one early burst is not
+a fault."""
 
 REARM_S = 1.0
-"""How long a channel has to stay clear of its limit before it is announced as near it again."""
+"""Time for which a channel has to stay clear of its limit before the next warning."""
 
 _UNSURE_TICKS = 3
-"""After missed ticks the next latches come unevenly, and no jump can be told from that."""
+"""After missed ticks the next latches are irregular, and do not show a jump of the angle."""
 
 _BLAMED_S = 0.005
 """A stall of the loop this long explains a limit that is exceeded right after it."""
@@ -29,10 +29,10 @@ _Reading = tuple[str, str, str, float, float, float]
 
 
 class LimitWatch:
-    """The check of every tick, and of the ticks that were missed.
+    """Checks of every tick, and of missed ticks.
 
-    As long as nothing is near a limit it costs a few comparisons; details are looked for only
-    once these fail. Comparisons are written so that a reading that is not a number fails them.
+    Without a value near its limit a tick costs a few comparisons; only if these fail are details
+    computed. A reading that is not a number fails every comparison.
 
     Parameters
     ----------
@@ -45,19 +45,19 @@ class LimitWatch:
     resolution_rad
         Resolution of the encoder.
     peak_torque_nm
-        Peak torque of the motor: commands are cut there, and a warning begins.
+        Peak torque of the motor: commands are limited to it, with a warning.
     continuous_torque_nm, thermal_time_constant_s
         Continuous (rms) torque rating of the motor and its thermal time constant.
     tare_warning_nm
-        Drift of the coupling torque's zero from which on there is a warning.
+        Drift of the coupling torque's zero from which there is a warning.
 
     Attributes
     ----------
     warning
-        Whether something is near its limit, as of the last tick.
+        Whether a value is near its limit, as of the last tick.
     tared_nm
-        Coupling torque that was tared last, from which the next tare may not be far; None: none
-        was since the rig was connected.
+        Coupling torque of the last tare, to which the next one is compared; None: none since the
+        rig was connected.
     """
 
     __slots__ = (
@@ -66,14 +66,15 @@ class LimitWatch:
         "_continuous_nm",
         "_elapsed",
         "_error_warning",
+        "_fraction_near",
+        "_fraction_window",
         "_heat_nm2",
         "_jump_rad",
         "_jump_warning",
-        "_last_look_ns",
+        "_last_slow_check_ns",
         "_limits",
-        "_looks",
+        "_missed_at_check",
         "_missed_lately",
-        "_missed_look",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
@@ -81,10 +82,9 @@ class LimitWatch:
         "_previous_elapsed",
         "_previous_moved_rad",
         "_rate_hz",
-        "_rearm_looks",
+        "_rearm_checks",
         "_saturated",
-        "_share_near",
-        "_share_window",
+        "_slow_checks",
         "_slowly_near",
         "_stale_angles",
         "_stale_wrenches",
@@ -121,16 +121,16 @@ class LimitWatch:
         self._error_warning = _part("tracking error") * limits.tracking_error_rad
         self._step_warning = _part("velocity") * limits.velocity_rad_s / rate_hz
         self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
-        # A difference of two movements has four readings in it, each half a step wrong.
+        # A difference of two movements contains four readings, each wrong by half a step.
         self._jump_rad = 2.0 * resolution_rad
         self._jump_warning = _part("encoder jump") * (self._per_tick2_rad + self._jump_rad)
         self._wrench_limits = tuple(limits.sensor_range_percent / 100 * r for r in sensor_range)
         self._wrench_warnings = tuple(_part("wrench range") * w for w in self._wrench_limits)
-        self._share_window = SHARE_WINDOW_S * rate_hz
-        self._rearm_looks = max(1, round(REARM_S * rate_hz / LOOK_EVERY))
+        self._fraction_window = FRACTION_WINDOW_S * rate_hz
+        self._rearm_checks = max(1, round(REARM_S * rate_hz / LOOK_EVERY))
         self._heat_nm2 = 0.0
-        self._last_look_ns: int | None = None
-        self._looks = 0
+        self._last_slow_check_ns: int | None = None
+        self._slow_checks = 0
         self._warned: dict[str, int] = {}
         self._notices: list[str] = []
         self.tared_nm: float | None = None
@@ -138,7 +138,7 @@ class LimitWatch:
 
     @property
     def heat_nm2(self) -> float:
-        """Mean square of the motor's torque over its thermal time constant, at the last look."""
+        """Mean square of the motor's torque over its thermal time constant, at the last check."""
         return self._heat_nm2
 
     @heat_nm2.setter
@@ -146,7 +146,7 @@ class LimitWatch:
         self._heat_nm2 = heat_nm2
 
     def reset(self, angle_rad: float) -> None:
-        """Start from rest at ``angle_rad``; the motor is as warm as it was."""
+        """Start from rest at ``angle_rad``; the motor's temperature is unchanged."""
         self._previous_angle_rad = angle_rad
         self._previous_moved_rad = self._before_that_rad = 0.0
         self._previous_elapsed = self._elapsed = 1
@@ -154,26 +154,26 @@ class LimitWatch:
         self._stale_wrenches = 0
         self._saturated = 0
         self._unsure = 0
-        self._missed_lately = self._missed_look = 0
-        self._share_near = False
+        self._missed_lately = self._missed_at_check = 0
+        self._fraction_near = False
         self._slowly_near = False
         self.warning = False
 
     def skip(self, missed: int) -> None:
-        """Tell the next check that ``missed`` ticks passed unseen: the speed is taken over them."""
+        """Pass the number of missed ticks to the next check, which takes the speed over them."""
         self._elapsed += missed
         if missed:
             self._missed_lately = missed + (self._missed_lately if self.after_missed else 0)
-            self._missed_look = self._looks
+            self._missed_at_check = self._slow_checks
 
     @property
     def after_missed(self) -> str:
-        """Say how many ticks were missed just before, for who reports what came of it; or nothing.
+        """Return how many ticks were missed just before, in words; or nothing.
 
-        Just before is within the last 64 to 128 ticks.
+        Just before means within the last 64 to 128 ticks.
         """
         missed = self._missed_lately
-        if not missed or self._looks - self._missed_look > 1:
+        if not missed or self._slow_checks - self._missed_at_check > 1:
             return ""
         ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
         if missed < _BLAMED_S * self._rate_hz:
@@ -188,7 +188,7 @@ class LimitWatch:
         *,
         angle_stale: bool = False,
     ) -> Violation | None:
-        """Check one tick's readings, before they are used.
+        """Check one tick's readings before their use.
 
         Parameters
         ----------
@@ -197,12 +197,12 @@ class LimitWatch:
         wrench
             fx, fy, fz (N), tx, ty, tz (N·m).
         angle_stale
-            The angle is an old one: no speed is taken from it.
+            Whether the angle is an old one, which gives no speed.
 
         Returns
         -------
         Violation or None
-            The worst of what is beyond its limit; `warning` is set if something is near it.
+            The worst violation; `warning` is set if a value is near its limit.
         """
         moved, before = angle_rad - self._previous_angle_rad, self._previous_moved_rad
         a, e, v, j = (
@@ -243,8 +243,8 @@ class LimitWatch:
         wrench: Sequence[float],
         angle_stale: bool,
     ) -> Violation | None:
-        self.warning = self._slowly_near or self._share_near
-        self._share_near = False
+        self.warning = self._slowly_near or self._fraction_near
+        self._fraction_near = False
         limits = self._limits
         error_rad = reference_rad - angle_rad
         readings: list[_Reading] = [
@@ -258,19 +258,19 @@ class LimitWatch:
             )
         )
         if angle_stale:
-            # The next new angle will have moved over this tick as well.
+            # The movement of the next new angle includes this tick.
             self._elapsed += 1
         else:
             readings += self._movement(angle_rad)
-        return self._judge(readings)
+        return self._assess(readings)
 
     def _movement(self, angle_rad: float) -> list[_Reading]:
-        """Return speed and jump over the ticks since the last new angle, which is this one now."""
+        """Return speed and jump over the ticks since the last new angle; this is the new one."""
         elapsed, before_rad = self._elapsed, self._previous_moved_rad
         moved_rad = angle_rad - self._previous_angle_rad
         speed_rad_s = moved_rad * self._rate_hz / elapsed
-        # A latch may be late by most of a period, and the next one is not: the shaft has then moved
-        # for that much longer or shorter.
+        # A latch may be late by most of a period, and the next one is not: the shaft then moves for
+        # that much longer or shorter.
         possible_rad = (
             self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed) / 2
             + self._jump_rad
@@ -296,26 +296,26 @@ class LimitWatch:
     def check_stale(
         self, angle_stale: bool, wrench_stale: bool, saturated: bool = False
     ) -> Violation | None:
-        """Check for how long readings have not come or were at the end of the sensor's range.
+        """Check the time for which readings are missing or at the end of the sensor's range.
 
-        It has to be called in every tick that has such a reading, and in the next. A controller
-        that is fed an old angle turns the motor without limit, and neither speed nor tracking error
-        would show it.
+        Called in every tick with such a reading, and in the next. A controller that uses an old
+        angle turns the motor without limit, and neither speed nor tracking error would show it.
+
 
         Parameters
         ----------
         angle_stale, wrench_stale
-            No new angle, or no new wrench, came in this tick.
+            Whether no new angle, or no new wrench, arrived in this tick.
         saturated
-            The wrench is at the end of the sensor's range.
+            Whether the wrench is at the end of the sensor's range.
         """
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
         self._saturated = self._saturated + 1 if saturated else 0
-        if self._share_near:  # by a wrench alone, which the check of the angle has not seen
-            self._share_near, self.warning = False, True
+        if self._fraction_near:  # by a wrench alone, which the angle's check does not include
+            self._fraction_near, self.warning = False, True
         limits = self._limits
-        return self._judge(
+        return self._assess(
             (
                 _reading("stale angle", self._stale_angles, limits.stale_ticks_in_a_row),
                 _reading("stale wrench", self._stale_wrenches, limits.stale_ticks_in_a_row),
@@ -323,10 +323,10 @@ class LimitWatch:
             )
         )
 
-    def check_torque(self, asked_nm: float) -> Violation | None:
-        """Check what the controller asks for, wherever it is cut, before it is commanded."""
+    def check_torque(self, requested_nm: float) -> Violation | None:
+        """Check the controller's request before it is limited and commanded."""
         limit_nm = self._limits.torque_command_nm
-        return self._judge((("torque command", "", "", asked_nm, limit_nm, self._peak_nm),))
+        return self._assess((("torque command", "", "", requested_nm, limit_nm, self._peak_nm),))
 
     def check_missed(self, missed: int, missed_so_far: int, scheduled: int) -> Violation | None:
         """Check missed ticks; the next speed is then taken over them too.
@@ -340,7 +340,7 @@ class LimitWatch:
         """
         self.skip(missed)
         limits = self._limits
-        return self._judge_share(
+        return self._assess_fraction(
             _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
             _reading(
                 "missed share", self._percent(missed_so_far, scheduled), limits.missed_percent
@@ -350,10 +350,10 @@ class LimitWatch:
     def check_stale_share(
         self, stale_angles: int, stale_wrenches: int, scheduled: int
     ) -> Violation | None:
-        """Check how many readings did not come, after a tick in which one did not.
+        """Check the fraction of missing readings, after a tick with one.
 
-        No run of them need be long: a drive that answers every third SYNC has none of more than
-        two ticks, and yet the loop runs on old angles and the record is worth nothing.
+        Their runs may be short: a drive that answers every third SYNC has none of more than two
+        ticks, yet the loop uses old angles and the record is useless.
 
         Parameters
         ----------
@@ -362,19 +362,19 @@ class LimitWatch:
             record's first.
         """
         limit = self._limits.stale_percent
-        return self._judge_share(
+        return self._assess_fraction(
             _reading("stale angle share", self._percent(stale_angles, scheduled), limit),
             _reading("stale wrench share", self._percent(stale_wrenches, scheduled), limit),
         )
 
     def _percent(self, ticks: int, scheduled: int) -> float:
-        return 100.0 * ticks / max(scheduled, self._share_window)
+        return 100.0 * ticks / max(scheduled, self._fraction_window)
 
-    def _judge_share(self, *readings: _Reading) -> Violation | None:
+    def _assess_fraction(self, *readings: _Reading) -> Violation | None:
         before, self.warning = self.warning, False
-        violation = self._judge(readings)
-        # The next sample carries it.
-        self._share_near = self._share_near or self.warning
+        violation = self._assess(readings)
+        # The next sample is flagged.
+        self._fraction_near = self._fraction_near or self.warning
         self.warning = before or self.warning
         return violation
 
@@ -385,30 +385,32 @@ class LimitWatch:
         recorder_lag_s: float = 0.0,
         disk_free_mb: float = inf,
     ) -> Violation | None:
-        """Check what changes slowly; to be called every `LOOK_EVERY` ticks, at rest too.
+        """Check slowly changing quantities; called every `LOOK_EVERY` ticks, at rest too.
 
         Parameters
         ----------
         due_ns
             Time at which the present tick was due.
         torque_squares_nm2
-            Sum over the ticks since the last call, of the torques exerted.
+            Sum of the squared torques over the ticks since the last call.
         recorder_lag_s
             Time by which the recorder is behind the loop.
         disk_free_mb
             Free space on the disk that holds the session file.
         """
-        self._looks += 1
+        self._slow_checks += 1
         if self._warned:
-            gone = self._looks - self._rearm_looks
+            gone = self._slow_checks - self._rearm_checks
             self._warned = {name: last for name, last in self._warned.items() if last >= gone}
-        elapsed_s = 0.0 if self._last_look_ns is None else (due_ns - self._last_look_ns) * 1e-9
-        self._last_look_ns = due_ns
+        elapsed_s = (
+            0.0 if self._last_slow_check_ns is None else (due_ns - self._last_slow_check_ns) * 1e-9
+        )
+        self._last_slow_check_ns = due_ns
         self._heat_nm2 = self._heat_nm2 * exp(
             -max(0.0, elapsed_s) / self._time_constant_s
         ) + torque_squares_nm2 / (self._rate_hz * self._time_constant_s)
         before, self.warning = self.warning, False
-        violation = self._judge(
+        violation = self._assess(
             (
                 _reading("i²t", sqrt(self._heat_nm2), self._continuous_nm),
                 _reading("recorder lag", recorder_lag_s, self._limits.recorder_lag_s),
@@ -419,20 +421,20 @@ class LimitWatch:
         return violation
 
     def check_tare(self, drift_nm: float) -> Violation | None:
-        """Check by how much the coupling torque's zero has moved, since the tare before."""
+        """Check the change of the coupling torque's zero since the previous tare."""
         limit_nm = self._limits.tare_drift_nm
-        return self._judge((("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),))
+        return self._assess((("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),))
 
     def take_notices(self) -> list[str]:
-        """Return what has come near its limit since the last call, in words for the operator.
+        """Return the channels that came near their limits since the last call, in words.
 
-        A channel that stays near its limit, or keeps coming back to it, is told once.
+        A channel that stays near its limit, or returns to it repeatedly, is reported once.
         """
         notices, self._notices = self._notices, []
         return notices
 
-    def _judge(self, readings: Sequence[_Reading]) -> Violation | None:
-        """Return the reading that is furthest beyond its limit; no number at all is furthest."""
+    def _assess(self, readings: Sequence[_Reading]) -> Violation | None:
+        """Return the reading furthest beyond its limit; one that is not a number is furthest."""
         worst, worst_ratio = None, 1.0
         near = []
         for reading in readings:
@@ -454,11 +456,11 @@ class LimitWatch:
             channel = reading[1] or reading[0]
             if channel not in self._warned:
                 self._notices.append(str(_violation(reading, warns=True)))
-            self._warned[channel] = self._looks
+            self._warned[channel] = self._slow_checks
         return None
 
     def _left(self, reading: _Reading) -> Violation:
-        """Say what is beyond its limit, and of the beam only what is not the computer's doing."""
+        """Return the violation, with the computer's stall as its cause if there was one."""
         violation, missed = _violation(reading, warns=False), self.after_missed
         if not missed or not BY_NAME[reading[0]].follows_missed_ticks:
             return violation
@@ -468,7 +470,7 @@ class LimitWatch:
 
 
 def _part(name: str) -> float:
-    """Part of its limit at which an interlock begins to warn."""
+    """Return the fraction of its limit at which an interlock begins to warn."""
     part = BY_NAME[name].warning
     assert isinstance(part, float)
     return part

@@ -1,13 +1,13 @@
-"""Scale watch: the ratio of the net torque on the shaft to what its measured acceleration takes.
+"""Scale watch: ratio of the net torque on the shaft to its inertia times measured acceleration.
 
 A wrong encoder step, gear, torque constant or inertia makes it differ from 1, a wrong sign makes it
 negative. It is estimated while the shaft moves, in windows without a change of direction:
 
 ``u - Γ = r J θ'' + e Γ + F sign(θ') + B θ'``
 
-with the ratio r, Coulomb and viscous friction F and B, and e for an error of the motor's torque, of
-which a quarter is expected. Near a mode of the beam r and e are not distinguishable, which shows in
-the interval of r.
+with the ratio r, Coulomb and viscous friction F and B, and e for an error of the motor's torque
+with an expected standard deviation of a quarter. Near a mode of the beam r and e are not
+distinguishable, which widens the interval of r.
 """
 
 from math import copysign, inf, sqrt
@@ -19,31 +19,31 @@ from rigd.safety.limits import BY_NAME, Violation
 WINDOW_TICKS = 8
 """Ticks from one mean speed to the next."""
 SPEED_TICKS = 4
-"""Ticks over which a mean speed is taken."""
+"""Ticks over which a mean speed is computed."""
 _TORQUE_ERROR = 0.25
 _MEMORY = 0.995
-"""Weight of a window over that of the next."""
+"""Weight of a window relative to the next one."""
 _LEAST_WINDOWS = 60.0
 _NOISE_NM = 2e-3
-"""The least that torques of a window scatter by."""
+"""Least standard deviation of a window's torques."""
 _LEAST_NM = 2e-2
-"""Torque of the acceleration, rms, below which the encoder's steps distort the ratio."""
+"""Rms torque of the acceleration below which the encoder's steps distort the ratio."""
 _FRICTION_SPREAD = 1.0
-"""Inverse variance of the viscous friction before anything is known, in (rad/(N·m·s))²."""
+"""Inverse variance of the prior of viscous friction, in (rad/(N·m·s))²."""
 _SURE = 4.0
-"""Standard deviations by which the ratio has to be beyond its limit."""
+"""Standard deviations by which the ratio has to exceed its limit."""
 _CHECK_WINDOWS = 8
 
 
 class ScaleWatch:
-    """Estimates the ratio from windows of `WINDOW_TICKS`, and judges it.
+    """Estimates the ratio from windows of `WINDOW_TICKS`, and compares it with its limit.
 
     Parameters
     ----------
     inertia_kg_m2
         Inertia of the motor.
     limit
-        Ratio, or inverse ratio, that is a fault; infinite: none is.
+        Ratio, or inverse ratio, that is a fault; infinite: none.
     """
 
     __slots__ = ("_inertia_kg_m2", "_limit", "_normal", "_windows")
@@ -62,14 +62,14 @@ class ScaleWatch:
     def add(
         self, acceleration_rad_s2: float, speed_rad_s: float, coupling_nm: float, net_nm: float
     ) -> Violation | None:
-        """Take a window, and check the ratio after every few of them.
+        """Add a window, and check the ratio after every few of them.
 
         Parameters
         ----------
         acceleration_rad_s2, speed_rad_s
             Mean acceleration and speed, as measured.
         coupling_nm, net_nm
-            Means of the coupling torque, and of the motor's torque less that.
+            Means of the coupling torque, and of motor minus coupling torque.
         """
         inertia_nm = self._inertia_kg_m2 * acceleration_rad_s2
         row = np.array((inertia_nm, coupling_nm, copysign(1.0, speed_rad_s), speed_rad_s, net_nm))
@@ -81,7 +81,7 @@ class ScaleWatch:
         return self._check()
 
     def estimate(self) -> tuple[float, float]:
-        """Return the ratio and its standard deviation; infinite if nothing is known of it."""
+        """Return the ratio and its standard deviation, infinite without information."""
         normal = self._normal
         weight = float(normal[2, 2])
         if normal[0, 0] < weight * _LEAST_NM**2:

@@ -1,9 +1,9 @@
 """Sensor watch: detects a force-torque sensor, or a channel of it, that repeats its readings.
 
 Every reading of a working sensor contains noise, so that readings rarely repeat. How rarely depends
-on noise and resolution, and is measured at the tare, for each channel. Afterwards a run of
-identical readings that this makes next to impossible is a fault: of all channels together (a frozen
-sensor) or of one (a broken gauge, or one clipped at a plausible value).
+on noise and resolution, and is measured at the tare for each channel. Afterwards an improbably long
+run of identical readings is a fault: of all channels together (a frozen sensor) or of one (a broken
+gauge, or one clipped at a plausible value).
 """
 
 from collections.abc import Sequence
@@ -14,34 +14,34 @@ from rigd.safety.limits import BY_NAME, Violation
 
 _FROZEN_S = 0.02
 _FROZEN_READINGS = 3
-"""Duration and number of identical readings that are a fault at the earliest."""
+"""Least duration and number of identical readings of a fault."""
 _CHANNEL_FACTOR = 3
-"""A single channel is warned of at its limit, and is a fault after this many times as long."""
+"""A single channel causes a warning at its limit, and a fault after this many times as long."""
 _CHANCE = 1e-12
-"""Probability of a run of repeated readings that is taken for impossible."""
+"""Probability of a run of repeated readings that counts as impossible."""
 _QUIET = 0.98
 """Fraction of repeated readings at the tare above which repetitions mean nothing."""
 _COUNTED = 256
 """Ticks over which repeated readings are counted."""
-_LEAST_SHARE = 0.1
+_LEAST_FRACTION = 0.1
 _SIGNIFICANT = 8.0
-_LARGEST_SHARE = 0.45
-"""Fraction of repeated readings above which the sensor repeats them: so much, and so many standard
-deviations, more than at the tare. Beyond the largest, readings that repeat the one before every
-second time are not distinguishable."""
+_LARGEST_FRACTION = 0.45
+"""Fraction of repeated readings above which the sensor repeats them: an absolute margin, and so
+many standard deviations, above that at the tare. Above the largest, a sensor that repeats every
+second reading cannot be detected."""
 _LEARNED = 100
-"""Readings at the tare from which on the fractions are known."""
+"""Number of readings at the tare from which the fractions are known."""
 
 
 class SensorWatch:
-    """Compares each reading of the sensor with the one before.
+    """Compares each reading of the sensor with the previous one.
 
     Parameters
     ----------
     channels
-        Names of the channels, as messages have them.
+        Names of the channels for messages.
     noisy
-        Whether each channel has noise at all; a simulated one may have none.
+        Whether each channel has noise; a simulated one may have none.
     rate_hz
         Ticks a second.
     """
@@ -50,6 +50,7 @@ class SensorWatch:
         "_before",
         "_channels",
         "_counted",
+        "_fractions",
         "_learned",
         "_limits",
         "_noisy",
@@ -58,7 +59,6 @@ class SensorWatch:
         "_repeated",
         "_running",
         "_runs",
-        "_shares",
         "_warned",
     )
 
@@ -70,16 +70,16 @@ class SensorWatch:
         self.learn()
 
     def learn(self) -> None:
-        """Start over: the next readings, at rest, show how often a reading repeats."""
+        """Start over: the next readings, at rest, give the frequency of repetitions."""
         n = len(self._channels)
         self._before: tuple[float, ...] = ()
         self._learned = self._counted = 0
-        # Of each channel, and last of all together.
+        # For each channel, and last for all together.
         self._repeated = [0] * n
         self._runs = [0] * n
         self._running = False
         self._limits: list[int] | None = None
-        self._shares: list[float] = []
+        self._fractions: list[float] = []
         self._warned: set[str] = set()
 
     def judge(self) -> Violation | None:
@@ -87,28 +87,31 @@ class SensorWatch:
         n = max(1, self._learned)
         if n < _LEARNED:
             return None
-        shares = [repeated / n for repeated in self._repeated]
+        fractions = [repeated / n for repeated in self._repeated]
         least = max(_FROZEN_READINGS, ceil(_FROZEN_S * self._rate_hz)) - 1
         never = 2**62
         self._limits = []
-        for share, noisy in zip(shares, self._noisy, strict=True):
-            if not noisy or share > _QUIET:
+        for fraction, noisy in zip(fractions, self._noisy, strict=True):
+            if not noisy or fraction > _QUIET:
                 self._limits.append(never)
             else:
-                chance = max(share, 1.0 / n)
+                chance = max(fraction, 1.0 / n)
                 self._limits.append(max(least, ceil(log(_CHANCE) / log(chance))))
-        self._shares = [
-            share + max(_LEAST_SHARE, _SIGNIFICANT * sqrt(share * (1.0 - share) / _COUNTED))
+        self._fractions = [
+            fraction
+            + max(_LEAST_FRACTION, _SIGNIFICANT * sqrt(fraction * (1.0 - fraction) / _COUNTED))
             if noisy
             else 1.0
-            for share, noisy in zip(shares, self._noisy, strict=True)
+            for fraction, noisy in zip(fractions, self._noisy, strict=True)
         ]
-        self._repeated = [0] * len(shares)
+        self._repeated = [0] * len(fractions)
         self._counted = 0
-        if self._noisy[-1] and shares[-1] > _QUIET:
+        if self._noisy[-1] and fractions[-1] > _QUIET:
             return BY_NAME["frozen sensor"].violated(self._runs[-1], least)
-        for channel, share, noisy in zip(self._channels[:-1], shares, self._noisy, strict=False):
-            if noisy and share > _QUIET:
+        for channel, fraction, noisy in zip(
+            self._channels[:-1], fractions, self._noisy, strict=False
+        ):
+            if noisy and fraction > _QUIET:
                 self._notices.append(
                     f"The sensor's {channel} shows no noise at rest: a broken gauge or cable is "
                     "not detected there. Check the sensor."
@@ -116,7 +119,7 @@ class SensorWatch:
         return None
 
     def step(self, reading: tuple[float, ...]) -> Violation | None:
-        """Compare a fresh reading with the one before."""
+        """Compare a new reading with the previous one."""
         before, self._before = self._before, reading
         if not before:
             return None
@@ -145,11 +148,17 @@ class SensorWatch:
         if self._counted >= _COUNTED:
             repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
             for number, count in enumerate(repeated):
-                share, limit = count / _COUNTED, self._shares[number]
-                if limit < share and limit < _LARGEST_SHARE and runs[number] <= limits[number]:
+                fraction, limit = count / _COUNTED, self._fractions[number]
+                if (
+                    limit < fraction
+                    and limit < _LARGEST_FRACTION
+                    and runs[number] <= limits[number]
+                ):
                     together = 2 * repeated[-1] > count
                     part = "whole wrench" if together else self._channels[number]
-                    return BY_NAME["repeated wrench"].violated(100.0 * share, 100.0 * limit, part)
+                    return BY_NAME["repeated wrench"].violated(
+                        100.0 * fraction, 100.0 * limit, part
+                    )
         if max(runs) <= min(limits):
             return None
         for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):

@@ -1,7 +1,7 @@
 """Limits of the rig, and the table of interlocks.
 
-The table says for every interlock what is watched, against what, by whom, and what follows; the
-checks, the messages and docs/safety.md agree on it. The levels themselves stand in the profile.
+For every interlock the table states the monitored quantity, the limit, the process that checks it,
+and the action; the checks, the messages and docs/safety.md agree on it. The profile has the levels.
 """
 
 from dataclasses import dataclass, field
@@ -15,15 +15,15 @@ from rigd.beam.tip import SMALL_SLOPE_RAD
 
 Positive = Annotated[float, Gt(0)]
 BelowAll = Annotated[float, Gt(0), Lt(100)]
-"""Per cent; a share is never more than all."""
+"""Per cent; a fraction is never more than the whole."""
 
 BUFFERED_S = 16.0
-"""Time that shared memory buffers for the recorder, so that no stall of a disk loses a sample."""
+"""Time that shared memory buffers for the recorder: no stall of a disk loses a sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Levels that end a session; the table says from which part on there is a warning.
+    """Levels that end a session; the table states the fraction from which there is a warning.
 
     The angle is relative to the rig's zero; all but the free space of the disk are magnitudes that
     must not be exceeded.
@@ -32,50 +32,50 @@ class Limits:
     angle_rad: Positive
     """Angle from the zero, either way."""
     stop_angle_rad: Positive
-    """Where the shaft is stopped by force, or something tears; nothing checks it in a session, but
-    the rig has to come to rest by itself between `angle_rad` and here."""
+    """Angle of the mechanical stop, or at which something tears. No check in a session uses it, but
+    the rig has to come to rest by itself between `angle_rad` and this angle."""
     velocity_rad_s: Positive
     """Speed of the output shaft, either way."""
     acceleration_rad_s2: Positive
-    """More than the motor can do to the shaft: an angle that shows more has jumped."""
+    """More than the motor can cause: an angle that shows more has jumped."""
     tracking_error_rad: Positive
     """Reference minus measured angle."""
     torque_command_nm: Positive
-    """What the controller asks for, before it is cut to the motor's peak torque."""
+    """Request of the controller, before it is limited to the motor's peak torque."""
     sensor_range_percent: Annotated[float, Gt(0), Le(200)]
-    """Share of the range of each sensor axis; above 100 a clipped reading ends nothing (it is
+    """Percentage of the range of each sensor axis; above 100 a clipped reading ends nothing (it is
     flagged in its sample)."""
     saturated_ticks_in_a_row: Annotated[int, Ge(1)]
     """Ticks for which the sensor may report an axis or a gauge at the end of its range."""
     stale_ticks_in_a_row: Annotated[int, Ge(1)]
-    """Ticks for which an old angle or wrench may stand in for one that did not come."""
+    """Ticks for which an old angle or wrench may replace a missing one."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
-    """Ticks that the loop may miss one after the other."""
+    """Consecutive ticks that the loop may miss."""
     missed_percent: BelowAll
-    """Share of all ticks scheduled so far, counted as at least ten seconds' worth."""
+    """Percentage of all ticks scheduled so far, of at least ten seconds."""
     tare_drift_nm: Positive
-    """Change of the coupling torque's zero over a session, or since the one before."""
+    """Change of the coupling torque's zero over a session, or since the previous one."""
     recorder_lag_s: Positive
-    """Time by which the recorder may be behind the loop, less than shared memory holds."""
+    """Delay of the recorder behind the loop, less than shared memory holds."""
     disk_free_mb: Positive
-    """Free space of the disk that the session goes to, below which it ends; 1 MB is 10⁶ bytes."""
+    """Free space of the session's disk, below which it ends; 1 MB is 10⁶ bytes."""
     standstill_torque_nm: Annotated[float, Ge(0)] = field(default=0.0, metadata={"optional": True})
-    """Net torque on the shaft, motor less coupling torque, that friction never withstands: an
-    encoder that stands still has failed. 0: five times ``motor.coulomb_nm``."""
+    """Net torque on the shaft, motor minus coupling torque, that exceeds any friction: an encoder
+    at rest has then failed. 0: five times ``motor.coulomb_nm``."""
     torque_ratio: Annotated[float, Gt(1)] = field(default=2.0, metadata={"optional": True})
     """Ratio of the net torque on the shaft to its inertia times its measured acceleration, or its
     inverse: 1 if all scales of encoder and motor are right."""
     stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
-    """Share of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as for
-    `missed_percent`. ``analyze`` takes no record with more than 1 %."""
+    """Percentage of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as
+    for `missed_percent`. ``analyze`` accepts no record with more than 1 %."""
     tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
-    """Slope of the antenna's tip that an identification may be predicted to reach; checked before
-    the session, not in it. Beyond the default the linear model is not exact."""
+    """Largest slope of the antenna's tip that an identification may be predicted to reach; checked
+    before the session, not in it. Beyond the default the linear model is not exact."""
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """A limit that was left, or is near.
+    """A limit that is exceeded or near.
 
     Attributes
     ----------
@@ -84,11 +84,11 @@ class Violation:
     remedy
         Advice for the operator, a sentence; may be empty.
     key
-        Key of the profile where the limit stands; may be empty.
+        Key of the limit in the profile; may be empty.
     below
-        The value must not fall below the limit, instead of exceeding it.
+        Whether the value must not fall below the limit, instead of exceeding it.
     warning
-        The level that was reached instead, if the limit was not left yet.
+        Level of the warning, if the limit itself is not exceeded.
 
     Examples
     --------
@@ -129,16 +129,16 @@ class Violation:
 
 
 class Checked(Enum):
-    """Place and time of an interlock's check."""
+    """Process and time of an interlock's check."""
 
     TICK = "loop, every tick"
-    LOOK = "loop, every 64 ticks"
+    SLOW_CHECK = "loop, every 64 ticks"
     REST = "loop, at the tare before and after a session"
     DRIVE = "drive, and its driver in every tick"
 
 
 class Action(Enum):
-    """Consequence of a violated limit."""
+    """Consequence of an exceeded limit."""
 
     FAULT = "torque off, session ends as fault"
     STOP = "torque off, session ends as stopped"
@@ -153,22 +153,22 @@ class Interlock:
     name
         Name of the interlock.
     channel
-        Quantity that is watched, as messages name it.
+        Monitored quantity, as messages name it.
     unit
         Unit of value and limit; empty where nothing is measured.
     limit
         Key of the profile with the level that ends a session; empty where nothing is measured.
     warning
-        Level of the warning: a part of the limit, or a key of the profile; None: no warning.
+        Level of the warning: a fraction of the limit, or a key of the profile; None: no warning.
     checked, action
-        Who checks it, and what follows.
+        Where it is checked, and the consequence.
     remedy
         Advice for the operator.
     below
-        The limit is the least that the value may be.
+        Whether the limit is the least allowed value.
     follows_missed_ticks
-        A loop that stood still can set it off, though nothing is wrong with the rig: the drive goes
-        on exerting the last torque meanwhile.
+        Whether a stalled loop can trigger it although the rig is sound: meanwhile the drive
+        continues to exert the last torque.
     """
 
     name: str
@@ -190,18 +190,18 @@ class Interlock:
         Parameters
         ----------
         value, limit
-            The value, and the limit that it left.
+            The value, and the limit that it exceeds.
         part
-            Part of the channel that is meant, where the table leaves it open.
+            Part of the channel, where the table leaves it open.
         below
-            The value is less than the limit allows.
+            Whether the value is below the limit.
         """
         channel = self.channel.format(channel=part) if part else self.channel
         return Violation(channel, value, limit, self.unit, self.remedy, self.limit, below=below)
 
 
 OVERLOADED: Final = "The computer is overloaded: close other programs."
-"""Said of whatever came of a computer that was too busy."""
+"""Remedy for every violation caused by a busy computer."""
 
 _ENCODER_FAILED: Final = (
     "The encoder does not follow the torque: check the encoder, its cable and its coupling to the "
@@ -316,7 +316,7 @@ INTERLOCKS: Final = (
         "N·m",
         "motor.continuous_torque_nm",
         0.8,
-        Checked.LOOK,
+        Checked.SLOW_CHECK,
         Action.FAULT,
         "Let the motor cool down for a minute, then lower the amplitude.",
     ),
@@ -480,7 +480,7 @@ INTERLOCKS: Final = (
         "s",
         "limits.recorder_lag_s",
         0.5,
-        Checked.LOOK,
+        Checked.SLOW_CHECK,
         Action.FAULT,
         "The disk is too slow, or the computer is overloaded: check what else writes to it.",
     ),
@@ -490,7 +490,7 @@ INTERLOCKS: Final = (
         "MB",
         "limits.disk_free_mb",
         10.0,
-        Checked.LOOK,
+        Checked.SLOW_CHECK,
         Action.FAULT,
         "Make room, or choose another folder.",
         below=True,

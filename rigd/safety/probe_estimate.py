@@ -1,4 +1,4 @@
-"""Estimate of scales and friction from the record of a probing move, and the verdict on them."""
+"""Estimate of scales and friction from the record of a probing move, and its assessment."""
 
 from dataclasses import asdict, dataclass, replace
 from math import hypot, log, pi, sqrt
@@ -12,20 +12,19 @@ from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 Real = NDArray[np.float64]
 
 RATIO_BAND = (0.7, 1.42)
-"""Ratios that are accepted: half-way between 25 %, which is usual, and 50 % too much or too
-little."""
+"""Accepted ratios: half-way between 25 %, which is usual, and 50 % too much or too little."""
 WARNING_BAND = (0.8, 1.25)
-"""Ratios beyond which the operator is warned."""
+"""Ratios beyond which there is a warning."""
 
 _FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
-"""Factors on the beam's frequencies that are tried: a stiffer beam must not look like a scale."""
+"""Candidate factors on the beam's frequencies: a stiffer beam must not count as a wrong scale."""
 _SMOOTH_S = 0.008
-"""Standard deviation of the window through which all signals are seen."""
+"""Standard deviation of the window that smooths all signals."""
 _LEAST_SPEED_PART = 0.1
-"""Part of the largest speed below which friction has no certain sign."""
+"""Fraction of the largest speed below which friction has no certain sign."""
 _LEAST_SAMPLES = 50
 _TOP_HZ = 100.0
-"""Above it that window lets nothing through."""
+"""Frequency above which that window passes nothing."""
 _DECAY = 12.0
 _WORST_CONDITION = 1e6
 _LARGEST_STD = 0.1
@@ -33,7 +32,7 @@ _LARGEST_STD = 0.1
 _SAME_FACTOR = 1.3
 """Factor up to which two ratios count as the same."""
 _NOTHING = 0.15
-"""Share of the beam's torque below which the sensor shows none."""
+"""Fraction of the beam's torque below which the sensor counts as showing none."""
 _REMEDY = (
     "Correct the profile or the rig. A value that was measured by other means and is marked "
     'source = "measured" (docs/safety.md) is not probed.'
@@ -42,14 +41,14 @@ _REMEDY = (
 
 @dataclass(frozen=True, slots=True)
 class ProbeEstimate:
-    """Scales and friction as a probing move shows them, in the profile's units."""
+    """Scales and friction estimated from a probing move, in the profile's units."""
 
     coupling_ratio: float | None
     """Coupling torque over that of the profile's beam at the measured angle; None: unknown."""
     coupling_std: float | None
     """Its standard deviation."""
     torque_ratio: float | None
-    """Torque of the motor, against the sensor, over the torque commanded; None: unknown."""
+    """Torque of the motor, relative to the sensor, over the torque commanded; None: unknown."""
     torque_std: float | None
     """Its standard deviation."""
     inertia_ratio: float | None
@@ -66,7 +65,7 @@ class ProbeEstimate:
     """Largest measured speed."""
 
     def as_dict(self) -> dict[str, float | None]:
-        """Return the numbers by name, for documents."""
+        """Return the numbers by name for documents."""
         return asdict(self)
 
 
@@ -100,7 +99,7 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     found = _motor(smooth(command), acceleration, speed, beam_nm, moving, window.size)
     scale, scale_std, inertia, inertia_std, coulomb, viscous = found
     if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
-        # Both count in the torque of the beam as it was fitted.
+        # Both uncertainties enter the fitted torque of the beam.
         part = ratio_std / ratio
         scale_std = hypot(scale_std, part * scale)
         inertia_std = hypot(inertia_std, part * inertia)
@@ -132,7 +131,7 @@ def _coupling_ratio(
 ) -> tuple[float | None, float | None, Real]:
     """Fit the coupling torque by that of the beam at the measured angle.
 
-    Returns the ratio, its standard deviation, and the coupling torque so fitted, without noise.
+    Returns the ratio, its standard deviation, and the fitted coupling torque without noise.
     """
     best: tuple[float, float, float, Real] | None = None
     for beam_nm in _beam_torques(rig, angle):
@@ -155,10 +154,10 @@ def _correlated(window: Real) -> float:
 
 
 def _beam_torques(rig: ProbedRig, angle: Real) -> Real:
-    """Torque of the exact beam at the measured angle, for factors on its frequencies: (f, n)."""
+    """Return the exact beam's torque at the measured angle, for each frequency factor: (f, n)."""
     n = angle.size
     padded = 1 << (2 * n - 1).bit_length()
-    # On s = sigma + j omega what wraps round has decayed.
+    # On s = sigma + j omega the wrap-around has decayed.
     sigma = _DECAY * rig.rate_hz / padded
     frequency_hz = np.fft.rfftfreq(padded, 1.0 / rig.rate_hz)
     inside = frequency_hz <= _TOP_HZ
@@ -219,25 +218,25 @@ def _motor(
     )
 
 
-# Verdict
+# Assessment
 
 
 def contradiction(
     rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate, *, motor: bool = True
 ) -> str:
-    """Return what contradicts what in a probing move, for the operator; empty if nothing does.
+    """Return a contradiction in a probing move, for the operator; empty if there is none.
 
     Parameters
     ----------
     rig
         Data of the profile.
     end
-        Why the move ended.
+        Reason for the end of the move.
     estimate
         From `estimate_probe`.
     motor
-        Judge the motor's torque and inertia too, not only what the bounds of travel and speed rest
-        on.
+        Whether to check the motor's torque and inertia too, not only the quantities on which the
+        bounds of travel and speed depend.
     """
     found = _of_motion(rig, end)
     if not found and (end is ProbeEnd.PULLED or not _accepted(estimate.coupling_ratio)):
@@ -254,7 +253,7 @@ def contradiction(
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
-    """Return a warning for each ratio that is accepted and unusual."""
+    """Return a warning for each accepted but unusual ratio."""
     low, high = WARNING_BAND
     return [
         f"Probing move: {what} is {ratio:.2f} times what the profile states ({keys})."
@@ -276,7 +275,7 @@ def _accepted(ratio: float | None) -> bool:
 
 
 def _of_motion(rig: ProbedRig, end: ProbeEnd | None) -> str:
-    """Return what a shaft shows that moves the wrong way or, as far as is measured, not at all."""
+    """Describe a shaft that moves the wrong way or, as measured, not at all."""
     if end is ProbeEnd.REVERSED:
         return (
             "the encoder counts against the torque: one of both has the wrong sign. Check "
@@ -303,14 +302,14 @@ def _of_coupling(estimate: ProbeEstimate, *, motor: bool) -> str:
         return f"the coupling torque is not the beam's at the measured angle ({_SCALES})."
     if abs(ratio) < _NOTHING:
         if not motor:
-            return ""  # no antenna: the shaft moves no farther than the encoder says
+            return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
             f"the coupling torque is {ratio:.2f} times that of the profile's beam at the measured "
             "angle. Check that the antenna is mounted and the sensor works, and "
             "encoder.resolution_rad."
         )
     if not motor and 0.0 < ratio < 1.0:
-        return ""  # the shaft moves less than the encoder says: its bounds hold
+        return ""  # the shaft moves less than the encoder shows: its bounds hold
     size = f"{ratio:.2g} ± {std:.1g}"
     if ratio < 0.0:
         return (

@@ -1,13 +1,13 @@
-"""Probing move: strokes at two speeds under tight bounds, on a rig whose scales are not known yet.
+"""Probing move: strokes at two speeds within tight bounds, on a rig with unverified scales.
 
-A wrong scale or sign makes every limit wrong by the same factor, so nothing here relies on one
-alone. The shaft is driven by its speed, slowly at first. The coupling torque is a witness that
-knows neither the encoder nor the motor: what the profile's beam exerts at the measured angle is
-compared with it in every tick, and the move ends where the two part. The torque rises slowly enough
-that the shaft of a frozen or coarse encoder is stopped by that witness within a tenth of a radian.
+A wrong scale or sign makes every limit wrong by the same factor, so no check here relies on one
+alone. The shaft is driven by its speed, slowly at first. The coupling torque is independent of
+encoder and motor: in every tick it is compared with the torque of the profile's beam at the
+measured angle, and the move ends where they differ. The torque rises slowly enough that this
+comparison stops the shaft of a frozen or coarse encoder within a tenth of a radian.
 
-A speed controller at the same shaft as the beam is stable for a motor of a fifth to five times the
-inertia, because motor, beam and damping are passive; nothing is fed forward.
+A speed controller at the same shaft as the beam is stable for a motor with a fifth to five times
+the inertia, because motor, beam and damping are passive; nothing is fed forward.
 """
 
 from cmath import exp
@@ -18,20 +18,20 @@ from math import inf, pi
 from rigd.beam import Beam, Damping, participation, poles
 
 MEASURED = ("motor.inertia_kg_m2", "motor.rated_torque_nm", "encoder.resolution_rad")
-"""Values of a profile that no probing move verifies if all have the source "measured"."""
+"""Values of a profile that need no probing move if all have the source "measured"."""
 
 
 # Beam at the measured angle
 
 _MODES = 4
-"""Modes of the beam that the strokes move; the inertia of the others follows at once."""
+"""Modes of the beam that the strokes excite; the inertia of the others follows at once."""
 _REST_RAD_S = 300.0
-"""Angular frequency of a heavily damped stand-in for the tool and the higher modes."""
+"""Angular frequency of a heavily damped model of the tool and the higher modes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbedRig:
-    """Data of a profile that a probing move relies on, or verifies."""
+    """Data of a profile that a probing move uses or verifies."""
 
     rate_hz: float
     """Ticks a second."""
@@ -50,7 +50,7 @@ class ProbedRig:
     resolution_rad: float
     """Encoder step."""
     command_delay_s: float
-    """From the tick of a command to the tick whose angle shows its torque."""
+    """Delay from the tick of a command to the tick whose angle shows its torque."""
     angle_limit_rad: float
     """Limit of the angle, to either side of the rig's zero."""
     velocity_limit_rad_s: float
@@ -60,8 +60,8 @@ class ProbedRig:
 class BeamFollower:
     """Torque of the profile's beam at a measured angle, tick by tick from rest.
 
-    Each mode is an oscillator that the angle moves; fractional damping is only approximated, which
-    costs 5 % of the torque.
+    Each mode is an oscillator driven by the angle; fractional damping is only approximated, with an
+    error of 5 % of the torque.
 
     Parameters
     ----------
@@ -71,12 +71,12 @@ class BeamFollower:
 
     def __init__(self, rig: ProbedRig) -> None:
         beam = rig.beam
-        shares = participation(beam, _MODES) * beam.density_kg_per_m
-        rest = beam.inertia_kg_m2 - float(shares.sum()) + rig.tool_inertia_kg_m2
+        inertias = participation(beam, _MODES) * beam.density_kg_per_m
+        rest = beam.inertia_kg_m2 - float(inertias.sum()) + rig.tool_inertia_kg_m2
         own = poles(beam, rig.damping, _MODES)[:, 0]
         modes = [
-            (complex(pole), float(share))
-            for pole, share in zip(own, shares, strict=True)
+            (complex(pole), float(inertia))
+            for pole, inertia in zip(own, inertias, strict=True)
             if pole.imag > 0.0
         ]
         self._parts: list[tuple[complex, complex, complex, float]] = []
@@ -94,7 +94,7 @@ class BeamFollower:
         Parameters
         ----------
         angle_rad
-            Angle from where the rig was at rest.
+            Angle relative to the initial position at rest.
         """
         before_rad, self._angle_rad = self._angle_rad, angle_rad
         states, torque_nm = self._states, 0.0
@@ -130,20 +130,20 @@ _RAMP_S = 0.06
 _LEAST_CRUISE_S = 0.35
 _SPEED_LIMIT_PART = 0.2
 _ROOM_PART = 0.25
-"""Largest parts of the profile's limits that a stroke of the second speed uses."""
+"""Largest fractions of the profile's limits that a stroke of the second speed uses."""
 _TORQUE_PART = 0.5
-"""Part of the rated torque at which a shaft that has not moved counts as blocked."""
+"""Fraction of the rated torque at which a shaft that has not moved counts as blocked."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbePlan:
-    """What a probing move is to do, in the profile's units."""
+    """Plan of a probing move, in the profile's units."""
 
     speed_rad_s: float
     """Speed of the first pair of strokes; that of the second pair is twice as high."""
     cruise_s: float
-    """From the start of a stroke to the start of its end: periods of the beam's first mode, so that
-    the end takes away the vibration that the start made."""
+    """From the start of a stroke to the start of its end: a whole number of periods of the beam's
+    first mode, so that the end cancels the vibration of the start."""
     torque_limit_nm: float
     """Largest torque."""
     torque_rise_nm_per_s: float
@@ -161,12 +161,12 @@ class ProbePlan:
 
     @property
     def bound_rad(self) -> float:
-        """Angle from the start at which the move ends."""
+        """Angle from the start beyond which the move ends."""
         return 1.5 * self.travel_rad + 0.05
 
     @property
     def velocity_bound_rad_s(self) -> float:
-        """Speed at which the move ends."""
+        """Speed above which the move ends."""
         return 2.5 * self.fast_rad_s
 
 
@@ -197,7 +197,7 @@ def plan_probe(rig: ProbedRig) -> ProbePlan:
 
 
 class ProbeEnd(Enum):
-    """Why a probing move ended."""
+    """Reason for the end of a probing move."""
 
     COMPLETE = "all strokes were made"
     BLOCKED = "the shaft did not move"
@@ -209,28 +209,28 @@ class ProbeEnd(Enum):
 
 _BANDWIDTH_RAD_S = 25.0
 _INTEGRAL_RAD_S = 6.0
-"""Speed controller, for the inertia that the profile states for motor and beam."""
+"""Bandwidth of the speed controller, for the profile's inertia of motor and beam."""
 _SPEED_S = 0.004
-"""Time over which the speed is taken."""
+"""Time over which the speed is measured."""
 _SMOOTH_S = 0.012
 """Time constant of the comparison with the beam."""
 _MOVED_STEPS = 8
-"""Encoder steps that count as a motion: a number that is right whatever the step is."""
+"""Encoder steps that count as a motion: the number is valid for any size of the step."""
 _LEAST_MOVED_RAD = 2e-4
 _PULL_NM = 8e-3
 _PULL_NOISE = 2.0
 _PULL_PART = 0.6
 """Difference from the beam's torque that ends the move: the largest of a floor, of so many standard
-deviations at rest, and of a part of that torque."""
+deviations at rest, and of a fraction of that torque."""
 _STILL_S = 0.025
-"""Time without a new angle that shows an encoder that stands still, where the beam pulls."""
+"""Time without a new angle after which an encoder counts as frozen if the beam pulls."""
 _PAUSE_S = 0.15
 _LONGEST_S = 5.0
-"""Time for a stroke, which a sound one does not need."""
+"""Longest time for a stroke; a sound one takes less."""
 _KNOWN_FRICTION = 0.7
-"""Part of the torque of the last stroke at which the next one begins."""
+"""Fraction of the torque of the last stroke at which the next one begins."""
 _EARLY_BAND = 0.5, 2.0
-"""Ratio of coupling torque and beam with which a further stroke is begun."""
+"""Ratios of coupling torque and beam with which a further stroke begins."""
 
 
 class ProbingMove:
@@ -250,12 +250,12 @@ class ProbingMove:
     Attributes
     ----------
     end : ProbeEnd or None
-        Why the move ended; None: it goes on.
+        Reason for the end of the move; None: it continues.
     missed : int
         Ticks that were missed before the next step.
     angles_rad, torques_nm, coupling_nm : list of float
         The record: angle from the start, torque commanded at this tick, coupling torque; one entry
-        a period, missed ticks filled in.
+        per period, with missed ticks interpolated.
     """
 
     saturated = False
@@ -300,7 +300,7 @@ class ProbingMove:
         self.coupling_nm: list[float] = []
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
-        """Return the torque of this tick, N·m; 0 once the move has ended.
+        """Return the torque of this tick, N·m; 0 after the end of the move.
 
         Parameters
         ----------
@@ -322,7 +322,7 @@ class ProbingMove:
         return torque_nm
 
     def _fill_in(self, angle_rad: float, coupling_torque_nm: float) -> None:
-        """Take a straight line for what nobody saw of missed ticks; the torque was held."""
+        """Interpolate the readings of missed ticks linearly; the torque was held."""
         before_rad, before_nm = self.angles_rad[-1], self.coupling_nm[-1]
         for tick in range(1, self.missed + 1):
             part = tick / (self.missed + 1)
@@ -338,25 +338,25 @@ class ProbingMove:
         self.coupling_nm.append(coupling_nm)
 
     def _compare(self, angle_rad: float, coupling_nm: float) -> None:
-        """Follow the beam, and compare its torque with the sensor's."""
+        """Update the beam's torque, and compare it with the sensor's."""
         beam_nm = self._follower.step(angle_rad)
         self._smooth_beam_nm += self._smooth * (beam_nm - self._smooth_beam_nm)
         self._smooth_coupling_nm += self._smooth * (coupling_nm - self._smooth_coupling_nm)
         self._squares += self._smooth_beam_nm**2
         self._products += self._smooth_beam_nm * self._smooth_coupling_nm
-        # The largest torque of the last third of a second, so that a crossing of zero counts.
+        # Uses the largest torque of the last third of a second, so that zero crossings count.
         fade = 1.0 - 3.0 * self._period_s
         self._reach_nm = max(abs(self._smooth_beam_nm), fade * self._reach_nm)
         difference_nm = abs(self._smooth_coupling_nm - self._smooth_beam_nm)
         if self.end is None and difference_nm > max(self._pull_nm, _PULL_PART * self._reach_nm):
-            self.end = ProbeEnd.STILL if self._stands_still(angle_rad) else ProbeEnd.PULLED
+            self.end = ProbeEnd.STILL if self._is_still(angle_rad) else ProbeEnd.PULLED
 
-    def _stands_still(self, angle_rad: float) -> bool:
+    def _is_still(self, angle_rad: float) -> bool:
         recent = self.angles_rad[-max(3, self._ticks(_STILL_S)) :]
         return all(each == angle_rad for each in recent)
 
     def _check(self, angle_rad: float) -> None:
-        """End a move that leaves its bounds."""
+        """End a move outside its bounds."""
         plan = self._plan
         if (
             abs(angle_rad) > plan.bound_rad
@@ -401,7 +401,7 @@ class ProbingMove:
         return self._integral_nm
 
     def _next(self, angle_rad: float) -> float:
-        """Go on to the next stroke, if the strokes so far leave no doubt of the scales."""
+        """Start the next stroke, if the strokes so far leave no doubt of the scales."""
         self._stroke += 1
         ratio = self._products / self._squares if self._squares else inf
         if self._stroke == len(self._strokes):
@@ -424,7 +424,7 @@ class ProbingMove:
 
     @property
     def _speed_rad_s(self) -> float:
-        """Speed over the last ticks."""
+        """Return the speed over the last ticks."""
         angles, span = self.angles_rad, self._span
         if len(angles) <= span:
             return 0.0
@@ -432,6 +432,6 @@ class ProbingMove:
 
 
 def _rise(x: float) -> float:
-    """Rise smoothly from 0 to 1 over x in [0, 1]."""
+    """Return a smooth rise from 0 to 1 over x in [0, 1]."""
     x = min(max(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)

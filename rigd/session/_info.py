@@ -1,4 +1,4 @@
-"""Summary of a session file, for people and for programs."""
+"""Summary of a session file, as text and as a document."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ import numpy as np
 from rigd.printable import counts_text, grouped, listed, printable
 from rigd.session import limits
 from rigd.session._errors import SessionError
-from rigd.session._reader import SURVEY_FIELDS, Event, Session, read_session
+from rigd.session._reader import SURVEY_FIELDS, LoggedEvent, Session, read_session
 from rigd.session.layout import Status
 from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import fit_of
@@ -24,7 +24,7 @@ from rigd.units import suffix_of, unit_of
 _RECOVERED: Final = "recovered_"
 _MOST_CHARACTERS: Final = 200_000
 _AROUND: Final = 120
-"""Characters around an entry, whatever it says."""
+"""Characters around an entry in either form."""
 _LONGEST_KEY: Final = 200
 _LONGEST_TEXT: Final = 10_000
 _WIDEST_KEY: Final = 40
@@ -35,7 +35,7 @@ _UTC: Final = "_utc_ns"
 _START: Final = f"start{_UTC}"
 _DIGITS: Final = 6
 _MEASURED_DIGITS: Final = 3
-"""What the noise of half a second leaves of a tare."""
+"""Significant digits of a tare: more are noise in half a second."""
 _LONGEST_NUMBERS: Final = 200
 _LONGEST_COUNT: Final = 12
 """Digits of a number of ticks: of thirty years at 1 kHz."""
@@ -58,7 +58,7 @@ class SessionInfo:
     samples: int
     """Recorded samples."""
     ticks: int
-    """Ticks from the first recorded one to the last, both counted."""
+    """Number of ticks from the first recorded one to the last, both included."""
     duration_s: float
     """`ticks` at the nominal rate."""
     missing_ticks: int
@@ -68,20 +68,20 @@ class SessionInfo:
     segments: dict[str, tuple[int, int]]
     """Name → first tick and end (exclusive)."""
     metadata: dict[str, str]
-    """The record ``session``, texts cut to what can be read."""
+    """The record ``session``, with texts cut to a readable length."""
     outcome: dict[str, str] | None
-    """How the session ended; None if the file does not tell."""
-    events: list[Event]
-    """Its log, texts cut as well."""
+    """End of the session; None if the file does not state it."""
+    events: list[LoggedEvent]
+    """Its log, with texts cut as well."""
     attachments: dict[str, int]
     """Name → bytes."""
     left_out: list[str]
-    """What of the file is not here because it is too much to be shown, in words."""
+    """Parts of the file that are too long to be shown, in words."""
     absent: str = ""
-    """What was recorded and is not in the file, in words; empty: nothing, or not known."""
+    """Samples that were recorded but are not in the file, in words; empty: none, or unknown."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the summary as a document of JSON types."""
         return {
             "path": str(self.path),
             "size_bytes": self.size_bytes,
@@ -110,7 +110,7 @@ class SessionInfo:
         }
 
     def lines(self) -> list[str]:
-        """Return it as lines of text, numbers rounded, times local as well."""
+        """Return the summary as lines of text, with rounded numbers and local times as well."""
         rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", _clock(datetime.fromisoformat(self.start_utc))),
@@ -168,7 +168,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     ticks = session.samples["tick"]
     span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
     left_out: list[str] = []
-    # Ticks that are missing at the end leave no gap; only the outcome knows of them.
+    # Ticks missing at the end leave no gap; only the outcome states them.
     scheduled = (session.outcome or {}).get("scheduled", "")
     if scheduled.isascii() and scheduled.isdigit():
         if _is_count(scheduled):
@@ -185,15 +185,15 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         duration_s=span / rate_hz,
         missing_ticks=span - len(ticks),
         status_counts=_status_counts(session),
-        segments=_Shown("segments", 50_000, left_out).mapping(session.segments),
-        metadata=_Shown("keys", _MOST_CHARACTERS, left_out).texts(session.metadata),
+        segments=_Excerpt("segments", 50_000, left_out).mapping(session.segments),
+        metadata=_Excerpt("keys", _MOST_CHARACTERS, left_out).texts(session.metadata),
         outcome=None
         if session.outcome is None
-        else _Shown("keys of the outcome", 100_000, left_out).texts(session.outcome),
-        events=_Shown("messages of the log", 500_000, left_out).events(
+        else _Excerpt("keys of the outcome", 100_000, left_out).texts(session.outcome),
+        events=_Excerpt("messages of the log", 500_000, left_out).events(
             session.events, session.events_left_out
         ),
-        attachments=_Shown("attachments", 50_000, left_out).mapping(
+        attachments=_Excerpt("attachments", 50_000, left_out).mapping(
             {name: len(data) for name, data in session.attachments.items()}
         ),
         left_out=left_out,
@@ -202,7 +202,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
 
 
 def _absent(session: Session) -> str:
-    """Say which samples the outcome or the segments state and the file has not: it was trimmed."""
+    """Describe samples that outcome or segments state and the file lacks: it was trimmed."""
     ticks = session.samples["tick"]
     stated = (session.outcome or {}).get("recorded", "")
     recorded = int(stated) if _is_count(stated) else 0
@@ -237,30 +237,30 @@ def _cut(text: str, most: int) -> str:
 
 
 def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str], list[str]]:
-    """Cut texts of a file to what can be read, and make them harmless to a terminal.
+    """Cut texts of a file to a readable length, and make them harmless to a terminal.
 
     Parameters
     ----------
-    values : by their keys, of any number and length
-    what : they are, in the plural
+    values : texts by their keys, of any number and length
+    what : name of the texts, in the plural
 
     Returns
     -------
     The first of them, and a line on the others if there are any.
     """
     left_out: list[str] = []
-    shown = _Shown(what, _MOST_CHARACTERS, left_out).texts(values)
+    shown = _Excerpt(what, _MOST_CHARACTERS, left_out).texts(values)
     return {printable(key): printable(value) for key, value in shown.items()}, left_out
 
 
-class _Shown:
-    """What is shown of a part of the file that may be of any length.
+class _Excerpt:
+    """Beginning of a part of the file that may be of any length.
 
     Parameters
     ----------
-    what : the part, in the plural
-    most : characters of it that are shown, in either form; those of all parts stay below 1 MB
-    left_out : gets a line if not all of it is shown
+    what : name of the part, in the plural
+    most : characters to show, in either form; those of all parts stay below 1 MB
+    left_out : gets a line if the part is longer
     """
 
     def __init__(self, what: str, most: int, left_out: list[str]) -> None:
@@ -269,7 +269,7 @@ class _Shown:
         self._room = most
 
     def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
-        """Return the first entries, each cut to a length that can be read."""
+        """Return the first entries, each cut to a readable length."""
         shown: dict[str, _Value] = {}
         for count, (key, value) in enumerate(values.items()):
             short_key = _cut(key, _LONGEST_KEY)
@@ -283,9 +283,9 @@ class _Shown:
         """Return the first entries, with long values cut."""
         return self.mapping({key: _cut(value, _LONGEST_TEXT) for key, value in values.items()})
 
-    def events(self, events: Sequence[Event], unread: int) -> list[Event]:
+    def events(self, events: Sequence[LoggedEvent], unread: int) -> list[LoggedEvent]:
         """Return the first events, with long texts cut; `unread` more are in the file."""
-        shown: list[Event] = []
+        shown: list[LoggedEvent] = []
         for event in events:
             short = replace(
                 event,
@@ -299,7 +299,7 @@ class _Shown:
         return shown
 
     def _has_room(self, *texts: str) -> bool:
-        # In JSON a character may take twelve, and either form has something around a text.
+        # In JSON a character may take twelve, and both forms add something to a text.
         self._room -= sum(len(json.dumps(text)) for text in texts) + _AROUND
         return self._room >= 0
 
@@ -323,13 +323,13 @@ def _utc(utc_ns: int) -> datetime:
 
 
 def _outcome(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, str]]:
-    told = {"outcome", "reason", "touches", "fit"}
-    told |= {_RECOVERED + key for key in _recovery(outcome)}
+    shown_keys = {"outcome", "reason", "touches", "fit"}
+    shown_keys |= {_RECOVERED + key for key in _recovery(outcome)}
     text = outcome.get("outcome", "unknown")
     text = text.capitalize() if is_whole else f"Recorded as {text}"
-    with suppress(KeyError, ValueError):  # of another program, or of a recovery
+    with suppress(KeyError, ValueError):  # outcome of another program, or of a recovery
         text += f": {counts_text(outcome)}"
-        told |= _COUNTS
+        shown_keys |= _COUNTS
     reason = outcome.get("reason")
     yield "outcome", f"{text}. {reason}" if reason else text
     for touch in touches_of(outcome):
@@ -337,13 +337,15 @@ def _outcome(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[str, 
     for mode in (fit_of(outcome) or {"modes": []})["modes"]:
         if mode["shown"]:
             yield "fit", mode_line(mode)
-    yield from (_rounded(key, value) for key, value in outcome.items() if key not in told and value)
+    yield from (
+        _rounded(key, value) for key, value in outcome.items() if key not in shown_keys and value
+    )
 
 
 def _rounded(key: str, value: str) -> tuple[str, str]:
-    """Return a key and its value for people, a number to the digits that are read, with its unit.
+    """Return a key and its value as text, a number rounded and with its unit.
 
-    JSON has the key as it is, and all of the digits.
+    JSON has the original key and all digits.
     """
     if len(value) > _LONGEST_NUMBERS:
         return key, value
@@ -361,14 +363,14 @@ def _rounded(key: str, value: str) -> tuple[str, str]:
 
 
 def _clock(moment: datetime) -> str:
-    """Return a time in UTC and where this computer is."""
+    """Return a time in UTC and in the local time zone."""
     utc = f"{moment:%Y-%m-%d %H:%M:%S} UTC"
     local = moment.astimezone()
     return f"{utc} ({local:%Y-%m-%d %H:%M:%S %Z})" if local.utcoffset() else utc
 
 
 def _recovery(outcome: dict[str, str]) -> dict[str, str]:
-    """Return what the outcome says of a recovery, without the common part of the keys."""
+    """Return the outcome's items on a recovery, without the common prefix of the keys."""
     return {
         key.removeprefix(_RECOVERED): value
         for key, value in outcome.items()

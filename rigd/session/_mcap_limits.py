@@ -1,8 +1,8 @@
 """Limits on memory and time for reading an MCAP file, and the unpacking of its chunks.
 
-A few bytes may unpack to any number of records. So the size that a chunk claims is bounded by
-`MAX_CHUNK_BYTES` and the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked piece by
-piece; and whatever takes a step of the program is counted against `MAX_STEPS`.
+A few bytes may unpack to any number of records. Therefore `MAX_CHUNK_BYTES` bounds the stated size
+of a chunk, and `MAX_TOTAL_BYTES` their sum over the file; a long chunk is unpacked in parts; and
+every step of the program counts against `MAX_STEPS`.
 """
 
 import struct
@@ -17,23 +17,23 @@ from rigd.session import limits
 from rigd.session.layout import Buffer
 
 MAX_SKIPPED: Final = 20
-"""Most damaged records that are told one by one."""
+"""Most damaged records that are reported singly."""
 
 CHUNK_STEPS: Final = 20
 DECLARATION_STEPS: Final = 15
-"""Steps that a chunk and a declaration count as."""
+"""Steps for which a chunk and a declaration count."""
 
 _DECLARED_COST: Final = 1000
-"""Bytes that an object for one of them takes, about, however small its record."""
+"""Approximate bytes of an object for one declaration, however small its record."""
 
-PIECE_BYTES: Final = 4 << 20
-"""Longest chunk that is unpacked at once, and length of a piece of a longer one."""
+MOST_UNPACKED_BYTES: Final = 4 << 20
+"""Longest chunk that is unpacked at once, and length of a part of a longer one."""
 _FEED_BYTES: Final = 1 << 18
 _MAX_ZSTD_WINDOW: Final = 32 << 20
 
 
 class McapError(Exception):
-    """The bytes are no MCAP file of use; the message is a predicate to the file's name."""
+    """The bytes are not a usable MCAP file; the message is a predicate to the file's name."""
 
 
 class McapTooLargeError(McapError):
@@ -45,7 +45,7 @@ class McapDamageError(Exception):
 
 
 class Allowance:
-    """Memory and time that one file has taken so far."""
+    """Memory and time that one file has used so far."""
 
     def __init__(self) -> None:
         self._steps = 0
@@ -55,12 +55,12 @@ class Allowance:
         self._entries = 0
 
     def spend(self, steps: int) -> None:
-        """Count work.
+        """Count steps of work.
 
         Raises
         ------
         McapTooLargeError
-            If that is more than the file may take.
+            If the file takes more than it may.
         """
         self._steps += steps
         if self._steps > limits.MAX_STEPS:
@@ -71,12 +71,12 @@ class Allowance:
             )
 
     def unpack(self, size: int, where: str) -> None:
-        """Count the bytes that a chunk claims to hold before it is unpacked.
+        """Count the stated size of a chunk before it is unpacked.
 
         Raises
         ------
         McapDamageError
-            If they are more than a chunk or a file may have.
+            If it is more than a chunk or a file may have.
         """
         self._unpacked += size
         if size > limits.MAX_CHUNK_BYTES or self._unpacked > limits.MAX_TOTAL_BYTES:
@@ -87,19 +87,19 @@ class Allowance:
             )
 
     def declare(self, opcode: int, content: Buffer, where: str) -> None:
-        """Count what a declaration takes before it is parsed.
+        """Count the memory of a declaration before it is parsed.
 
         Parameters
         ----------
         opcode, content
             Opcode and content of the record.
         where
-            It stands, for messages.
+            Its position, for messages.
 
         Raises
         ------
         McapError
-            If there are too many, or they are too long.
+            If there are too many declarations, or they are too long.
         """
         self._declared += len(content) + _DECLARED_COST
         if opcode != Opcode.ATTACHMENT:
@@ -124,7 +124,7 @@ class Allowance:
 
 
 def zstd_decompressor() -> zstandard.ZstdDecompressor:
-    """Return one for the chunks of a file: to make one for each takes longer than a small chunk."""
+    """Return a decompressor for all chunks of a file: creating one for each would be slow."""
     return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
 
 
@@ -144,12 +144,12 @@ def unpacked(
     size
         Bytes that it claims to hold.
     where
-        It stands, for messages.
+        Its position, for messages.
 
     Raises
     ------
     McapDamageError
-        If it cannot be done.
+        If it is impossible.
     """
     try:
         if compression == b"":
@@ -158,7 +158,7 @@ def unpacked(
             _check_zstd_size(packed, size, where)
             records = zstd.decompress(packed, max_output_size=size)
         elif compression == b"lz4":
-            # One byte more than is right, so that what is too long is seen.
+            # One byte more than allowed, so that a longer chunk is detected.
             records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
         else:
             raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
@@ -169,33 +169,33 @@ def unpacked(
     return records
 
 
-def unpacked_pieces(
+def unpacked_parts(
     zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
 ) -> Iterator[Buffer]:
-    """Yield a chunk piece by piece, and at most one piece more than its `size`.
+    """Yield a chunk in parts, at most one part more than its `size`.
 
     Parameters and errors are those of :func:`unpacked`.
     """
     done = 0
     try:
         if compression == b"":
-            for start in range(0, len(packed), PIECE_BYTES):
-                yield packed[start : start + PIECE_BYTES]
+            for start in range(0, len(packed), MOST_UNPACKED_BYTES):
+                yield packed[start : start + MOST_UNPACKED_BYTES]
         elif compression == b"zstd":
             _check_zstd_size(packed, size, where)
             stream = zstd.stream_reader(packed)
-            while done <= size and (piece := stream.read(PIECE_BYTES)):
-                done += len(piece)
-                yield piece
+            while done <= size and (part := stream.read(MOST_UNPACKED_BYTES)):
+                done += len(part)
+                yield part
         elif compression == b"lz4":
             lz4_stream = lz4.frame.LZ4FrameDecompressor()
             for start in range(0, len(packed), _FEED_BYTES):
                 feed: Buffer = packed[start : start + _FEED_BYTES]
                 while not lz4_stream.eof and done <= size:
-                    piece = lz4_stream.decompress(feed, max_length=PIECE_BYTES)
-                    done += len(piece)
-                    if piece:
-                        yield piece
+                    part = lz4_stream.decompress(feed, max_length=MOST_UNPACKED_BYTES)
+                    done += len(part)
+                    if part:
+                        yield part
                     if lz4_stream.needs_input:
                         break
                     feed = b""
@@ -206,14 +206,14 @@ def unpacked_pieces(
 
 
 def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
-    """Compare the size that the frame may state, which the decompressor would believe."""
+    """Check the size in the frame, which the decompressor would trust."""
     stated = zstandard.get_frame_parameters(packed).content_size
     if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
         raise McapDamageError(f"states two different sizes{where}")
 
 
 def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
-    """Return the bytes behind a length of format `prefix`, and where they end."""
+    """Return the bytes after a length of format `prefix`, and their end."""
     (length,) = struct.unpack_from(prefix, content, position)
     start = position + struct.calcsize(prefix)
     if length > len(content) - start:
@@ -224,7 +224,7 @@ def prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryvie
 def _entries(content: Buffer, opcode: int, most: int) -> int:
     """Count the entries of the map at the end of a metadata or channel record, up to `most` + 1.
 
-    What is malformed has none: it is found out when the record is parsed.
+    A malformed map has none: parsing the record finds the error.
     """
     view = memoryview(content)
     count = 0

@@ -1,12 +1,12 @@
 """MCAP container, read record by record with every length checked and every checksum verified.
 
-The data section is walked from its beginning, which takes a millisecond for the chunks of a
-session. So one way of reading serves files of any chunking, with or without a summary, and tells
-for a file that was cut off how far it can be read. Messages are handed on stretch by stretch and
-not kept: those of equal length that follow one another, as a session's do, as one run of bytes.
+The data section is read from its beginning, which takes a millisecond for the chunks of a session.
+This one way of reading serves files of any chunking, with or without a summary, and finds how far a
+truncated file is readable. Messages are passed on block by block and not stored. Consecutive
+messages of equal length, as a session's are, are passed on as one run of bytes.
 
-Nothing in the file is believed before it is checked, and none can take more than its share of
-memory and time (:mod:`rigd.session._mcap_limits`).
+Every claim of the file is checked before use, and no file can exceed its limits of memory and time
+(:mod:`rigd.session._mcap_limits`).
 """
 
 import mmap
@@ -30,14 +30,14 @@ from rigd.session._mcap_limits import (
     CHUNK_STEPS,
     DECLARATION_STEPS,
     MAX_SKIPPED,
-    PIECE_BYTES,
+    MOST_UNPACKED_BYTES,
     Allowance,
     McapDamageError,
     McapError,
     McapTooLargeError,
     prefixed,
     unpacked,
-    unpacked_pieces,
+    unpacked_parts,
     zstd_decompressor,
 )
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
@@ -55,31 +55,31 @@ _CHANNEL_ID: Final = struct.Struct("<H")
 FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
 _BARE_MESSAGES: Final = 250
-"""Messages outside of chunks that belong together."""
+"""Messages outside of chunks that form one unit."""
 _SHORT_RUN: Final = 8
-"""Messages that are compared one by one before an array of them pays."""
-_FIRST_STRETCH: Final = 256
+"""Messages that are compared one by one before an array of them pays off."""
+_FIRST_STEP: Final = 256
 _MOST_RUNS: Final = 1 << 16
-"""Runs that are handed on at once."""
+"""Runs that are passed on at once."""
 _PASSED_BYTES: Final = 32 << 20
-"""Length of the file after which the memory of what was read is given back to the system."""
+"""Length of the file after which the memory of the part already read is given back."""
 
 _Record = TypeVar("_Record")
 Run = tuple[int, int, int, int]
-"""Messages of equal length that follow one another: channel, bytes of a record with its head, byte
-at which the first begins, and how many there are."""
+"""Consecutive messages of equal length: channel, bytes of a record with its head, byte at which the
+first begins, and their number."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """Message records that stand in one stretch of a file."""
+class MessageBlock:
+    """Consecutive message records of a file."""
 
     records: Buffer
-    """Buffer in which the runs lie; it is not kept by the reader."""
+    """Buffer with the runs; the reader does not hold it."""
     runs: list[Run]
     """Runs of messages of the wanted topics, in the order of the file."""
     unit: int
-    """Byte of the file at which their chunk begins, or that of some messages without chunk."""
+    """Byte of the file at which their chunk begins, or that of some messages without a chunk."""
 
 
 @dataclass(slots=True)
@@ -91,31 +91,31 @@ class McapContents:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
-    """Channel → how many messages were read, wanted or not."""
+    """Channel → number of messages read, wanted or not."""
     declared_in_chunks: set[int] = field(default_factory=set)
     """Channels that were declared where a checksum covers them and their schemas."""
     skipped: list[str] = field(default_factory=list)
-    """Damaged records that were skipped: sentences' predicates, as `damage`. The last one tells
-    how many more there are than `MAX_SKIPPED`."""
+    """Damaged records that were skipped, as predicates like `damage`. The last one states how many
+    more there are than `MAX_SKIPPED`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
-    """Channel → how many messages the file had, by its statistics; empty if they are not sound."""
+    """Channel → number of messages by the file's statistics; empty if these are damaged."""
     sound_bytes: int = 0
     """Length of the file that was read: up to the end of a record."""
     verified: bool = False
-    """Whether a checksum over the whole data section was there, and right."""
+    """Whether the file has a correct checksum over its whole data section."""
     complete: bool = False
     """Whether the file has its end."""
     damage: str | None = None
-    """Why reading stopped, None if it did not: a sentence's predicate, with the byte."""
+    """Reason why reading stopped: a sentence's predicate, with the byte. None: it did not stop."""
 
     def count(self, topic: str) -> int:
-        """Return how many messages of a topic were read."""
+        """Return the number of messages read of a topic."""
         channels = [channel.id for channel in self.channels.values() if channel.topic == topic]
         return sum(self.message_counts[channel] for channel in channels)
 
 
 def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return where each message begins if runs stand one behind the other.
+    """Return the offset of each message if the runs follow one another.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
     Returns
     -------
-    array (sum of the counts,) of bytes from the beginning of the first
+    array (sum of the counts,) of offsets from the beginning of the first
     """
     _, sizes, counts = runs.T
     lengths = sizes * counts
@@ -133,15 +133,15 @@ def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     )
 
 
-Taker = Callable[[McapContents, Stretch], None]
-"""Takes messages as they are read, with what was read before them."""
+OnBlock = Callable[[McapContents, MessageBlock], None]
+"""Callback for messages as they are read, with the contents read before them."""
 
 
 def read_mcap(
     data: memoryview,
     topics: Collection[str] | None,
     *,
-    take: Taker | None = None,
+    take: OnBlock | None = None,
     salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
@@ -150,18 +150,18 @@ def read_mcap(
     Parameters
     ----------
     data : the file; pages of an ``mmap`` are given back when they have been read
-    topics : of which the messages are wanted; None for all
+    topics : topics of the wanted messages; None for all
     take
-        Called with the wanted messages, stretch by stretch in the order of the file. What is wrong
-        with it may only turn out behind them.
+        Called with the wanted messages, block by block in the order of the file. Damage may be
+        found behind them only.
     salvage
-        Get as much as there is: skip damaged records outside of chunks, which no message depends
-        on, and look for the statistics of a damaged file.
-    on_progress : called now and then with the share of the file that is done
+        Read as much as possible: skip damaged records outside of chunks, on which no message
+        depends, and search a damaged file for its statistics.
+    on_progress : called now and then with the completed fraction of the file
 
     Returns
     -------
-    The contents; `McapContents.damage` tells whether, where and why reading stopped.
+    The contents; `McapContents.damage` states whether, where and why reading stopped.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def read_mcap(
         If the file does not begin as an MCAP file does, or declares more than
         `MAX_DECLARED_BYTES`.
     McapTooLargeError
-        If it, or a message of those wanted, is too long, or is made of too many parts.
+        If the file or a wanted message is too long, or the file has too many parts.
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
@@ -178,7 +178,7 @@ def read_mcap(
             f"has {len(data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB that are "
             "read"
         )
-    reader = _Reader(data, topics, take, salvage=salvage)
+    reader = _ContainerReader(data, topics, take, salvage=salvage)
     contents = reader.contents
     contents.complete = _has_end(data)
     try:
@@ -193,7 +193,7 @@ def read_mcap(
 
 
 def _has_end(data: memoryview) -> bool:
-    """Tell whether the file ends with a footer and the magic."""
+    """Return whether the file ends with a footer and the magic."""
     start = len(data) - len(MAGIC) - FOOTER.size
     if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
         return False
@@ -201,7 +201,7 @@ def _has_end(data: memoryview) -> bool:
 
 
 def _record_at(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
-    """Return the opcode of the record at `position`, where its content begins and where it ends."""
+    """Return opcode, start of the content and end of the record at `position`."""
     content = position + RECORD_HEAD.size
     if content > len(data):
         raise _torn(position, where)
@@ -222,14 +222,14 @@ def _no_record(position: int, where: str) -> McapDamageError:
     return McapDamageError(f"has no record where one must be, at byte {position}{where}")
 
 
-class _Reader:
+class _ContainerReader:
     """One pass over a file."""
 
     def __init__(
         self,
         data: memoryview,
         topics: Collection[str] | None,
-        take: Taker | None,
+        take: OnBlock | None,
         *,
         salvage: bool,
     ) -> None:
@@ -238,15 +238,15 @@ class _Reader:
         self._data = data
         self._topics = topics
         self._take = take
-        self._wanted: dict[int, bool] = {}  # channel → whether its messages are
+        self._wanted: dict[int, bool] = {}  # channel → whether its messages are wanted
         self._allowance = Allowance()
         self._zstd = zstd_decompressor()
         self._skipped = 0
-        self._unit = 0  # of messages without chunk: first byte, and how many go into it
+        self._unit = 0  # first byte of messages without chunk, and how many still belong to them
         self._unit_room = 0
         self._declarations: dict[tuple[int, bytes], bytes] = {}  # opcode and number → content
         self._crc = 0
-        self._passed = 0  # how far the checksum was computed, and the file given back
+        self._passed = 0  # end of the part whose checksum is computed and memory given back
 
     def read(self, on_progress: Callable[[float], None] | None) -> None:
         data, contents = self._data, self.contents
@@ -284,7 +284,7 @@ class _Reader:
         raise McapDamageError("has no end of its data section")
 
     def _skip(self, damage: str) -> None:
-        """Note a damaged record that is left out; of very many, how many they are."""
+        """Record a skipped damaged record; beyond the maximum, their number only."""
         self._skipped += 1
         skipped = self.contents.skipped
         if self._skipped > MAX_SKIPPED:
@@ -293,7 +293,7 @@ class _Reader:
         skipped.append(damage)
 
     def _give_back(self, end: int) -> None:
-        """Compute the checksum up to `end`, and let go of the file up to there."""
+        """Compute the checksum up to `end`, and release the memory of the file up to there."""
         self._crc = self._crc_of(self._passed, end, self._crc)
         self._passed = end
 
@@ -310,7 +310,7 @@ class _Reader:
             mapped.madvise(mmap.MADV_DONTNEED)
 
     def _read_bare_messages(self, start: int, first_end: int) -> int:
-        """Take the messages from `start` on that stand outside of chunks; return their end."""
+        """Read the messages outside of chunks from `start` on; return their end."""
         where = f" at byte {start}"
         if first_end - start < MESSAGE_HEAD.size:
             raise McapDamageError(f"has a message that is too short{where}")
@@ -319,7 +319,7 @@ class _Reader:
             raise McapDamageError(f"has a message outside of a chunk{where}")
         if self._unit_room == 0:
             self._unit, self._unit_room = start, _BARE_MESSAGES
-        limit = min(len(self._data), max(first_end, start + PIECE_BYTES))
+        limit = min(len(self._data), max(first_end, start + MOST_UNPACKED_BYTES))
         end, count = self._read_messages(
             self._data, start, limit, self._unit, where, self._unit_room
         )
@@ -330,12 +330,12 @@ class _Reader:
         return self._salvage and channel in self.contents.declared_in_chunks
 
     def _read_other(self, opcode: int, content: Buffer, where: str) -> None:
-        """Take a record that is neither chunk nor message; skip what is not needed."""
+        """Read a record that is neither chunk nor message; skip unnecessary ones."""
         contents = self.contents
         if opcode not in _DECLARATIONS:
             return
         self._allowance.spend(DECLARATION_STEPS)
-        # Many writers repeat schemas and channels in every chunk, which takes no room again.
+        # Many writers repeat schemas and channels in every chunk; a repetition takes no memory.
         number = (opcode, bytes(content[: _CHANNEL_ID.size]))
         if self._declarations.get(number) == content:
             return
@@ -371,7 +371,7 @@ class _Reader:
             raise McapDamageError(f"has a malformed head{where}") from None
         self._allowance.unpack(size, where)
         compression = bytes(name[:20])
-        if size <= PIECE_BYTES:
+        if size <= MOST_UNPACKED_BYTES:
             records = unpacked(self._zstd, compression, packed, size, where)
             if crc not in (0, zlib.crc32(records)):
                 raise McapDamageError(f"has a wrong checksum{where}")
@@ -379,32 +379,30 @@ class _Reader:
             if end < len(records):
                 raise _torn(end, where)
             return
-        # Too long to be held: unpacked once to be checked, and once more to be read.
+        # Too long for memory: unpacked once to be checked, and once more to be read.
         found, found_crc = 0, 0
-        for piece in unpacked_pieces(self._zstd, compression, packed, size, where):
-            found += len(piece)
-            found_crc = zlib.crc32(piece, found_crc)
+        for part in unpacked_parts(self._zstd, compression, packed, size, where):
+            found += len(part)
+            found_crc = zlib.crc32(part, found_crc)
             self._let_go()
         if found != size:
             raise McapDamageError(f"decompresses to a wrong size{where}")
         if crc not in (0, found_crc):
             raise McapDamageError(f"has a wrong checksum{where}")
-        self._read_pieces(
-            unpacked_pieces(self._zstd, compression, packed, size, where), start, where
-        )
+        self._read_parts(unpacked_parts(self._zstd, compression, packed, size, where), start, where)
 
-    def _read_pieces(self, pieces: Iterator[Buffer], unit: int, where: str) -> None:
-        """Read records that begin in one piece and end in another, and skip what is not wanted."""
+    def _read_parts(self, parts: Iterator[Buffer], unit: int, where: str) -> None:
+        """Read records that may begin in one part and end in another; skip unwanted ones."""
         rest = b""
-        base = 0  # where `rest` begins in the chunk
-        skip = 0  # bytes of a record that is not wanted
-        for piece in pieces:
+        base = 0  # offset of `rest` in the chunk
+        skip = 0  # remaining bytes of an unwanted record
+        for part in parts:
             self._let_go()
-            if skip >= len(piece):
-                skip -= len(piece)
-                base += len(piece)
+            if skip >= len(part):
+                skip -= len(part)
+                base += len(part)
                 continue
-            rest += piece[skip:]
+            rest += part[skip:]
             base += skip
             skip = 0
             used = self._read_records(rest, base, unit, where)
@@ -420,7 +418,7 @@ class _Reader:
             raise _torn(base, where)
 
     def _needless_bytes(self, records: bytes, base: int, where: str) -> int:
-        """Return the length of the record that `records` begin with if it is not needed, else 0."""
+        """Return the length of the first record if it is not needed, else 0."""
         opcode, length, channel = _RUN_HEAD.unpack_from(records)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             if length > limits.MAX_TEXT_BYTES:
@@ -433,7 +431,7 @@ class _Reader:
         return int(length) + RECORD_HEAD.size
 
     def _is_short(self, length: int, where: str) -> bool:
-        """Tell whether a message can be taken; what cannot is left out to save the others."""
+        """Return whether a message is short enough; in salvage mode a longer one is skipped."""
         if length <= limits.MAX_MESSAGE_BYTES:
             return True
         damage = (
@@ -446,9 +444,9 @@ class _Reader:
         return False
 
     def _read_records(self, records: bytes, base: int, unit: int, where: str) -> int:
-        """Read what is whole of the records of a chunk; return where the rest begins.
+        """Read the complete records of a chunk; return the start of the incomplete one.
 
-        `base` is where they begin in the chunk.
+        `base` is the offset of the records in the chunk.
         """
         end = 0
         while end < len(records):
@@ -483,10 +481,10 @@ class _Reader:
         where: str,
         most: int | None = None,
     ) -> tuple[int, int]:
-        """Hand on the messages that follow one another from `start` on and end before `limit`.
+        """Pass on consecutive messages from `start` on that end before `limit`.
 
-        At most `most` of those outside of chunks. Returns where the first other record begins, and
-        how many they were.
+        Outside of chunks at most `most`. Returns the start of the first other record and the number
+        of messages.
         """
         unpack = _RUN_HEAD.unpack_from
         wanted, counts = self._wanted, self.contents.message_counts
@@ -525,7 +523,7 @@ class _Reader:
                 passed += 1
         finally:
             if runs and self._take is not None:
-                self._take(self.contents, Stretch(records, runs, unit))
+                self._take(self.contents, MessageBlock(records, runs, unit))
         self._allowance.spend(passed)
         return position, taken
 
@@ -538,7 +536,7 @@ class _Reader:
         self.contents.verified = crc != 0
 
     def _check_summary(self, start: int) -> None:
-        """Compare the summary, if there is one, with what was found."""
+        """Compare the summary, if there is one, with the contents read."""
         data = self._data
         if not self.contents.complete:
             raise McapDamageError(
@@ -554,7 +552,7 @@ class _Reader:
             raise McapDamageError("has a wrong checksum over its summary")
         for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                # Those of channels without messages may stand here only.
+                # Declarations of channels without messages may be here only.
                 self._read_other(opcode, content, " in the summary")
             elif opcode == Opcode.STATISTICS:
                 statistics = parsed(Statistics.read, content, " in the summary")
@@ -571,13 +569,13 @@ class _Reader:
             if end - passed > _PASSED_BYTES:
                 passed = end
                 self._let_go()
-            # Each channel that statistics count takes its time.
+            # Each channel in the statistics takes time.
             is_statistics = opcode == Opcode.STATISTICS
             self._allowance.spend(1 + (end - content) // 4 if is_statistics else 1)
             yield opcode, data[content:end]
 
     def stated_counts(self) -> dict[int, int]:
-        """Return the statistics' message counts, if the summary has a checksum that is right."""
+        """Return the statistics' message counts, if the checksum of the summary is correct."""
         data = self._data
         footer = len(data) - len(MAGIC) - FOOTER.size
         *_, start, _, crc = FOOTER.unpack_from(data, footer)
@@ -608,18 +606,18 @@ def parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: st
 def _run_length(records: Buffer, start: int, size: int, limit: int) -> int:
     """Count the records of equal opcode, length and channel from `start` on, up to `limit`.
 
-    The stretch examined at once grows, so that short runs in long chunks stay cheap.
+    The examined step grows, so that short runs in long chunks stay cheap.
     """
     (head, tail) = np.frombuffer(records[start : start + _RUN_KEY.itemsize], _RUN_KEY)[0]
     most = (limit - start) // size
-    known, stretch = 1, _FIRST_STRETCH
+    known, step = 1, _FIRST_STEP
     while known < most:
-        count = min(stretch, most - known)
+        count = min(step, most - known)
         keys = np.ndarray(count, _RUN_KEY, records, start + known * size, (size,))
         equal = (keys["head"] == head) & (keys["tail"] == tail)
         first = int(equal.argmin())
         if not equal[first]:
             return known + first
         known += count
-        stretch *= 8
+        step *= 8
     return known

@@ -1,8 +1,8 @@
 """MCAP container, written a whole chunk at a time.
 
 The writer of the ``mcap`` package takes messages one by one, at several microseconds each. Here the
-caller hands over a chunk's records and their index as arrays; everything else of the container is
-serialised by the records of the ``mcap`` package. Format: https://mcap.dev/spec, version 0.
+caller passes a chunk's records and their index as arrays; the ``mcap`` package serialises all other
+records of the container. Format: https://mcap.dev/spec, version 0.
 """
 
 import struct
@@ -38,14 +38,14 @@ _CHUNK_HEAD: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
 _INDEX_HEAD: Final = struct.Struct("<BQ HI")
 _FOOTER_HEAD: Final = struct.Struct("<BQ QQ")
 RECORD_HEAD_SIZE: Final = 9
-"""Opcode and length of a record, which the length does not count."""
+"""Opcode and length of a record, which the length does not include."""
 
 MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
-"""Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
+"""Opcode, length, channel, sequence, log time, publish time: the bytes before a message's data."""
 LOG_TIME_OFFSET: Final = RECORD_HEAD_SIZE + 2 + 4
 
 INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
-"""One entry of a message index: where in the uncompressed chunk a message's record begins."""
+"""One entry of a message index: offset of a message's record in the uncompressed chunk."""
 
 
 class McapWriter:
@@ -54,7 +54,7 @@ class McapWriter:
     Parameters
     ----------
     stream : open for binary writing, at the beginning of an empty file
-    library : goes into the header
+    library : name of the writing library, for the header
     """
 
     def __init__(self, stream: BinaryIO, library: str) -> None:
@@ -72,7 +72,7 @@ class McapWriter:
         self._write(MAGIC + _serialised(Header(profile="", library=library)))
 
     def _write(self, data: bytes) -> int:
-        """Append to the data section and return the position at which `data` begins."""
+        """Append to the data section and return the position of `data`."""
         position = self._position
         self._stream.write(data)
         self._data_crc = zlib.crc32(data, self._data_crc)
@@ -80,7 +80,7 @@ class McapWriter:
         return position
 
     def declare(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
-        """Declare all channels, in a chunk of their own: there a checksum covers them at once."""
+        """Declare all channels, in a separate chunk: its checksum covers them at once."""
         self._schemas = list(schemas)
         self._channels = list(channels)
         self._message_counts = {channel.id: 0 for channel in self._channels}
@@ -117,7 +117,7 @@ class McapWriter:
 
         Parameters
         ----------
-        records : one behind the other
+        records : message records, one after another
         indexes : channel id → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
         """
         start = min((int(index["log_time"].min()) for index in indexes.values()), default=0)
@@ -208,7 +208,7 @@ class McapWriter:
         for offset in offsets:
             offset.write(summary)
         data = _contents(summary)
-        # The summary's checksum runs on into the footer, up to the checksum's own place.
+        # The summary's checksum covers the footer up to the checksum itself.
         footer = Footer(
             summary_start=self._position, summary_offset_start=offset_start, summary_crc=0
         )

@@ -1,9 +1,9 @@
 """Decoder of messages: samples, controls, timings and touches as arrays, from any writer.
 
-Messages of the fixed layout (`rigd.session.layout`) are taken as they are. Any other protobuf
-library may put the fields in another order, leave out zeros, number or type them differently: the
-places of the fields in one such message are found by its schema, and all others that have the same
-tags in the same places are taken together. What is left is decoded one by one, but not without end.
+Messages of the fixed layout (`rigd.session.layout`) are copied directly. Any other protobuf library
+may order the fields differently, omit zeros, number or type fields differently. The decoder then
+finds the offsets of the fields in one such message by its schema, and decodes all messages with the
+same tags at the same offsets together. It decodes the remaining ones singly, up to a limit.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rigd.session import limits
 from rigd.session._errors import SessionError
-from rigd.session._mcap_reader import McapContents, Stretch, message_starts
+from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
 from rigd.session._mcap_writer import MESSAGE_HEAD
 from rigd.session._schema import (
     CONTROL_SCHEMA,
@@ -55,31 +55,31 @@ if TYPE_CHECKING:
 
 
 _BLOCK_BYTES: Final = 1 << 18
-"""Size of the messages that are decoded together: they stay in a processor's cache."""
+"""Bytes of messages that are decoded together: they stay in the processor's cache."""
 _BLOCK_RUNS: Final = 1 << 16
 _FEW: Final = 16
-"""Messages that are sooner decoded one by one."""
+"""Below this number messages are decoded singly."""
 _MOST_LAYOUTS: Final = 16
-"""Layouts of messages of one channel and length: a writer that omits zeros makes a few."""
+"""Layouts of messages of one channel and length: a writer that omits zeros produces a few."""
 _MOST_GROUPS: Final = 100_000
-"""Times that messages of one layout are taken together, at some 100 µs each."""
+"""Times that messages of one layout are decoded together, at about 100 µs each."""
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 _MOST_FIELD_NUMBER: Final = (1 << 29) - 1
 _MOST_TAG_BYTES: Final = 5
 _MOST_VARINT_BYTES: Final = 9
-"""Bytes of 63 bits: what is longer is negative, or padded."""
+"""Bytes of 63 bits: a longer varint is negative or padded."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class MessageLayout:
     """A channel of fixed-layout messages."""
 
     topic: str
     schema_name: str
     types: dict[str, str]
     required: tuple[str, ...]
-    """Fields that a schema cannot leave out; any other absent one reads as 0."""
+    """Fields that a schema must have; any other absent one reads as 0."""
     record_dtype: np.dtype[np.void]
     """A message record in the file: its ``head``, then the ``wire`` form."""
     dtype: np.dtype[np.void]
@@ -95,7 +95,7 @@ def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
     return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
 
 
-SAMPLES: Final = Layout(
+SAMPLES: Final = MessageLayout(
     SAMPLE_TOPIC,
     SAMPLE_SCHEMA,
     SAMPLE_TYPES,
@@ -103,7 +103,7 @@ SAMPLES: Final = Layout(
     _record_dtype(SAMPLE_WIRE_DTYPE),
     SAMPLE_DTYPE,
 )
-CONTROLS: Final = Layout(
+CONTROLS: Final = MessageLayout(
     CONTROL_TOPIC,
     CONTROL_SCHEMA,
     CONTROL_TYPES,
@@ -111,7 +111,7 @@ CONTROLS: Final = Layout(
     _record_dtype(CONTROL_WIRE_DTYPE),
     CONTROL_DTYPE,
 )
-TIMINGS: Final = Layout(
+TIMINGS: Final = MessageLayout(
     TIMING_TOPIC,
     TIMING_SCHEMA,
     TIMING_TYPES,
@@ -120,7 +120,7 @@ TIMINGS: Final = Layout(
     TIMING_DTYPE,
 )
 
-TOUCHES: Final = Layout(
+TOUCHES: Final = MessageLayout(
     TOUCH_TOPIC,
     TOUCH_SCHEMA,
     TOUCH_TYPES,
@@ -129,7 +129,7 @@ TOUCHES: Final = Layout(
     TOUCH_DTYPE,
 )
 
-# Declared type → how to take it where the array has that type, if no value can be lost by it.
+# Declared type → how to read it as the array's type, where no value can be lost.
 _SAME: Final = {
     "double": {"TYPE_DOUBLE": "<f8", "TYPE_FLOAT": "<f4"},
     "sfixed64": {"TYPE_SFIXED64": "<i8", "TYPE_INT64": "varint", "TYPE_UINT32": "varint32"},
@@ -138,25 +138,25 @@ _SAME: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Places:
-    """Places of the fields in messages of one length whose bytes are `pattern` under `mask`."""
+class _FieldOffsets:
+    """Offsets of the fields in messages of one length whose bytes are `pattern` under `mask`."""
 
     mask: npt.NDArray[np.uint8]
     pattern: npt.NDArray[np.uint8]
     fields: tuple[tuple[str, int, int, str], ...]
     """Name, first byte, bytes, and numpy type, "varint" or "varint32"."""
     absent: tuple[str, ...]
-    """Fields that are not there, and read as 0."""
+    """Missing fields, which read as 0."""
 
 
-class Keeper(Protocol):
+class MessageSink(Protocol):
     """Destination of decoded messages."""
 
     def room(self, count: int) -> npt.NDArray[np.void]:
         """Return an array (count,) of the decoder's dtype to be filled with the next messages."""
         ...
 
-    def keep(self, messages: npt.NDArray[np.void]) -> None:
+    def store(self, messages: npt.NDArray[np.void]) -> None:
         """Take that array, filled."""
         ...
 
@@ -164,64 +164,64 @@ class Keeper(Protocol):
 class MessageDecoder:
     """Decodes the messages of one topic, in the order of the file.
 
-    What cannot be decoded is told at the end: a file that is damaged as well is first of all that.
+    An error is raised at the end only: damage of the file is reported first.
 
     Parameters
     ----------
     path : the file, for messages
-    layout : what the messages should hold
-    keeper : gets the decoded messages of `fields`, block by block
-    fields : those of the layout that are wanted; by default all
+    layout : layout of the messages
+    sink : gets the decoded messages of `fields`, block by block
+    fields : fields of the layout to decode; by default all
     """
 
     def __init__(
         self,
         path: Path,
-        layout: Layout,
-        keeper: Keeper,
+        layout: MessageLayout,
+        sink: MessageSink,
         fields: Sequence[str] | None = None,
     ) -> None:
         self._path = path
         self._layout = layout
-        self._keeper = keeper
+        self._sink = sink
         self.dtype = layout.dtype_of(fields)
         self.error: SessionError | None = None
         self._channels: dict[int, bool] = {}  # channel → whether it is of the topic
         self._fixed: dict[int, bool] = {}  # channel of the topic → whether its schema is the fixed
         self._classes: dict[int, type[Message]] = {}
-        self._places: dict[tuple[int, int], list[_Places]] = {}
+        self._offsets: dict[tuple[int, int], list[_FieldOffsets]] = {}
         self._contents: McapContents | None = None
-        self._pieces: list[Buffer] = []
+        self._parts: list[Buffer] = []
         self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
         self._length = 0
         self._single = 0
         self._groups = 0
 
-    def take(self, contents: McapContents, stretch: Stretch) -> None:
-        """Take the messages of the topic out of those read."""
+    def take(self, contents: McapContents, block: MessageBlock) -> None:
+        """Collect the messages of the topic in a block of records."""
         if self.error is not None:
             return
         self._contents = contents
         known = self._channels
-        records = memoryview(stretch.records)
-        for channel, size, start, count in stretch.runs:
+        records = memoryview(block.records)
+        for channel, size, start, count in block.runs:
             is_mine = known.get(channel)
             if is_mine is None:
                 is_mine = self.is_of_topic(contents, channel)
             if not is_mine:
                 continue
-            piece = records[start : start + size * count]
-            # A slice keeps all of the records in memory, which is well where it is most of them.
-            self._pieces.append(piece if 2 * len(piece) > len(records) else bytes(piece))
+            part = records[start : start + size * count]
+            # A slice holds all of the records in memory, which is fine where it is most of them.
+            self._parts.append(part if 2 * len(part) > len(records) else bytes(part))
             self._runs.append((channel, size, count))
-            self._length += len(piece)
+            self._length += len(part)
             if self._length >= _BLOCK_BYTES or len(self._runs) >= _BLOCK_RUNS:
                 self.flush()
                 if self.error is not None:
                     return
 
     def is_of_topic(self, contents: McapContents, channel: int) -> bool:
-        """Tell whether a channel is of the topic that is decoded."""
+        """Return whether a channel belongs to the decoded topic."""
         is_mine = self._channels.get(channel)
         if is_mine is None:
             is_mine = contents.channels[channel].topic == self._layout.topic
@@ -229,13 +229,13 @@ class MessageDecoder:
         return is_mine
 
     def flush(self) -> None:
-        """Decode what has been taken, and hand it on."""
-        pieces, runs = self._pieces, self._runs
-        self._pieces, self._runs, self._length = [], [], 0
+        """Decode the collected messages and pass them on."""
+        parts, runs = self._parts, self._runs
+        self._parts, self._runs, self._length = [], [], 0
         if not runs or self.error is not None:
             return
         try:
-            self._decode(pieces, np.array(runs, np.int64))
+            self._decode(parts, np.array(runs, np.int64))
         except SessionError as error:
             self.error = error
 
@@ -255,33 +255,33 @@ class MessageDecoder:
         else:
             raise self.error
 
-    def _decode(self, pieces: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
-        """Decode runs of messages, whose bytes stand one behind the other in `pieces`."""
+    def _decode(self, parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
+        """Decode runs of messages whose bytes follow one another in `parts`."""
         channel, size, _ = runs[0].tolist()
         if (runs[:, :2] == runs[0, :2]).all():
-            block = b"".join(pieces)
-            # A block is a little longer than asked for; what is much longer is cut.
+            block = b"".join(parts)
+            # A block is a little longer than `_BLOCK_BYTES`; a much longer one is cut.
             is_long = len(block) > 2 * _BLOCK_BYTES
             most = max(_BLOCK_BYTES // size, 1) * size if is_long else len(block)
             for first in range(0, len(block), most):
                 part = block[first : first + most]
-                out = self._keeper.room(len(part) // size)
+                out = self._sink.room(len(part) // size)
                 self._decode_group(channel, size, part, out)
-                self._keeper.keep(out)
+                self._sink.store(out)
             return
-        records = np.frombuffer(b"".join(pieces), np.uint8)
+        records = np.frombuffer(b"".join(parts), np.uint8)
         starts = message_starts(runs)
         kinds = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
-        out = self._keeper.room(len(starts))
+        out = self._sink.room(len(starts))
         for kind in np.unique(kinds).tolist():
-            (places,) = np.nonzero(kinds == kind)
+            (indices,) = np.nonzero(kinds == kind)
             size = kind & ((1 << 40) - 1)
             every = np.ndarray(len(records) - size + 1, f"V{size}", records, 0, (1,))
-            group = every[starts[places]].tobytes()
-            decoded = np.empty(len(places), self.dtype)
+            group = every[starts[indices]].tobytes()
+            decoded = np.empty(len(indices), self.dtype)
             self._decode_group(kind >> 40, size, group, decoded)
-            out[places] = decoded
-        self._keeper.keep(out)
+            out[indices] = decoded
+        self._sink.store(out)
 
     def _decode_group(
         self, channel: int, size: int, records: bytes, out: npt.NDArray[np.void]
@@ -301,26 +301,26 @@ class MessageDecoder:
             fixed = is_fixed_layout(wire, layout.types)
             if fixed.all():
                 return
-            (places,) = np.nonzero(~fixed)
+            (indices,) = np.nonzero(~fixed)
         else:
-            places = np.arange(len(out))
+            indices = np.arange(len(out))
         data = np.frombuffer(records, np.uint8).reshape(len(out), size)[:, MESSAGE_HEAD.size :]
-        self._decode_by_places(channel, data, places, out)
+        self._decode_by_offsets(channel, data, indices, out)
 
-    def _decode_by_places(
+    def _decode_by_offsets(
         self,
         channel: int,
         data: npt.NDArray[np.uint8],
-        places: npt.NDArray[np.int64],
+        indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode the messages (n, bytes) at `places`, those of one layout together."""
-        known = self._places.setdefault((channel, data.shape[1]), [])
+        """Decode the messages (n, bytes) at `indices`, those of one layout together."""
+        known = self._offsets.setdefault((channel, data.shape[1]), [])
         number = 0
-        while len(places) >= _FEW and self._groups < _MOST_GROUPS:
-            rows = data if len(places) == len(data) else data[places]
+        while len(indices) >= _FEW and self._groups < _MOST_GROUPS:
+            rows = data if len(indices) == len(data) else data[indices]
             if number == len(known):
-                found = self._find_places(channel, rows[0].tobytes())
+                found = self._find_offsets(channel, rows[0].tobytes())
                 if found is None or number == _MOST_LAYOUTS:
                     break
                 known.append(found)
@@ -329,13 +329,13 @@ class MessageDecoder:
             self._groups += 1
             number += 1
             if alike.any():
-                _take_places(layout, rows[alike], places[alike], out)
-                places = places[~alike]
-        if len(places):
-            self._decode_single(channel, [data[i].tobytes() for i in places], places, out)
+                _take_at_offsets(layout, rows[alike], indices[alike], out)
+                indices = indices[~alike]
+        if len(indices):
+            self._decode_single(channel, [data[i].tobytes() for i in indices], indices, out)
 
-    def _find_places(self, channel: int, message: bytes) -> _Places | None:
-        """Return where the fields of a message stand; None if it must be decoded by itself."""
+    def _find_offsets(self, channel: int, message: bytes) -> _FieldOffsets | None:
+        """Return the offsets of a message's fields; None if it must be decoded singly."""
         cls = self._class(channel)
         empty, descriptor = cls(), cls.DESCRIPTOR
         if not empty.IsInitialized() or any(len(group.fields) > 1 for group in descriptor.oneofs):
@@ -374,17 +374,17 @@ class MessageDecoder:
                 fields[declared.name] = (declared.name, begin, position - begin, kind)
         names = self.dtype.names or ()
         absent = {name: getattr(empty, name, 0) for name in names if name not in fields}
-        if any(absent.values()):  # not zero by default, and so perhaps out of range
+        if any(absent.values()):  # not zero by default, and possibly out of range
             return None
-        return _Places(
+        return _FieldOffsets(
             mask,
             np.frombuffer(message, np.uint8) & mask,
-            tuple(place for name, place in fields.items() if name in names),
+            tuple(entry for name, entry in fields.items() if name in names),
             tuple(absent),
         )
 
     def _kind(self, declared: "FieldDescriptor | UpbFieldDescriptor", wire: int) -> str | None:
-        """Tell how a field is taken out of many messages at once; None if it cannot be."""
+        """Return how to read a field of many messages at once; None if that is impossible."""
         kinds = _SAME.get(self._layout.types.get(declared.name, ""), {})
         for name, kind in kinds.items():
             if declared.type == getattr(declared, name):
@@ -396,7 +396,7 @@ class MessageDecoder:
         self,
         channel: int,
         messages: list[bytes],
-        places: npt.NDArray[np.int64],
+        indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
         """Decode messages with protobuf, absent fields as 0."""
@@ -412,7 +412,7 @@ class MessageDecoder:
         decoded = [decoded_message(self._path, self._layout.topic, decode, m) for m in messages]
         names = self.dtype.names or ()
         try:
-            out[places] = np.array(
+            out[indices] = np.array(
                 [tuple([getattr(each, name, 0) for name in names]) for each in decoded],
                 self.dtype,
             )
@@ -440,12 +440,12 @@ class MessageDecoder:
         return known
 
     def _check_schema(self, contents: McapContents, channel_id: int) -> bool:
-        """Tell whether a schema gives every field the number and type of the fixed layout.
+        """Return whether a schema gives every field the number and type of the fixed layout.
 
         Raises
         ------
         SessionError
-            If by that schema messages cannot be decoded to the layout's fields at all.
+            If messages of that schema cannot be decoded to the layout's fields at all.
         """
         layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
@@ -475,7 +475,7 @@ class MessageDecoder:
                     )
                 fixed = False
                 continue
-            # What an empty message holds tells singular numbers from everything else.
+            # The default value distinguishes singular numbers from everything else.
             if not isinstance(getattr(empty, name), float | int if kind == "double" else int):
                 raise SessionError(
                     f"{path}: the field {name} of {layout.topic} is not of a type that can be read "
@@ -492,7 +492,7 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
     Raises
     ------
     SessionError
-        If the channel is not of protobuf, or its schema cannot be used.
+        If the channel is not protobuf, or its schema cannot be used.
     """
     channel = contents.channels[channel_id]
     schema = contents.schemas.get(channel.schema_id)
@@ -537,13 +537,13 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:40] + "…")
 
 
-def _take_places(
-    layout: _Places,
+def _take_at_offsets(
+    layout: _FieldOffsets,
     rows: npt.NDArray[np.uint8],
-    places: npt.NDArray[np.int64],
+    indices: npt.NDArray[np.int64],
     out: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages (n, bytes) of one layout to `places` of the array."""
+    """Decode messages (n, bytes) of one layout to `indices` of the array."""
     rows = np.ascontiguousarray(rows)
     count, size = rows.shape
     for name, first, length, kind in layout.fields:
@@ -553,15 +553,15 @@ def _take_places(
                 value |= (rows[:, first + i] & 0x7F).astype(np.uint64) << np.uint64(7 * i)
             if kind == "varint32":
                 value &= np.uint64(0xFFFFFFFF)
-            out[name][places] = value.astype(out.dtype[name])
+            out[name][indices] = value.astype(out.dtype[name])
         else:
-            out[name][places] = np.ndarray(count, kind, rows, first, (size,))
+            out[name][indices] = np.ndarray(count, kind, rows, first, (size,))
     for name in layout.absent:
-        out[name][places] = 0
+        out[name][indices] = 0
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return a number and where it ends; negative if it is none, which ends behind the data."""
+    """Return a number and the offset of its end; negative, with an end behind the data, if none."""
     value = 0
     for i, byte in enumerate(data[position : position + 10]):
         value |= (byte & 0x7F) << 7 * i

@@ -1,4 +1,4 @@
-"""Reader of session files: the whole file as arrays, or an error that says what is wrong."""
+"""Reader of session files: returns the whole file as arrays, or raises an error with a remedy."""
 
 import mmap
 import shlex
@@ -17,15 +17,15 @@ import numpy.typing as npt
 from rigd.session import limits
 from rigd.session._errors import SessionAccessError, SessionError
 from rigd.session._mcap_limits import McapError, McapTooLargeError
-from rigd.session._mcap_reader import McapContents, Stretch, Taker, read_mcap
+from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock, read_mcap
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
 from rigd.session._message_decoder import (
     CONTROLS,
     SAMPLES,
     TIMINGS,
     TOUCHES,
-    Layout,
     MessageDecoder,
+    MessageLayout,
     class_of_channel,
     decoded_message,
     quoted,
@@ -39,38 +39,38 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
-"""Fields that tell how many samples there are, whether they are in order, and their flags."""
+"""Fields that give the number of samples, their order and their flags."""
 MAX_EVENTS: Final = 100_000
 """Most lines of a session's log that are read."""
 MAX_EVENT_BYTES: Final = 1 << 20
-"""Longest message of the log that is read; of a longer one its length is told."""
+"""Longest message of the log that is read; of a longer one its length is stated."""
 MAX_LOG_BYTES: Final = 16 << 20
 """Most of the log that is read."""
 
 _GROWTH: Final = 1 << 16
 _BYTES_A_SAMPLE: Final = 60
-"""Fewest that a sample takes in the file, unless it repeats itself."""
+"""Least size of a sample in the file, unless it repeats itself."""
 _LONGEST_NUMBER: Final = 400
 """Characters: the longest finite number in decimal, without its fraction, has 309."""
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """A line of the session's log."""
+class LoggedEvent:
+    """Line of a session's log."""
 
     t_ns: int
     """ns since the session start."""
     level: str
     """"unknown", "debug", "info", "warning", "error" or "fatal"."""
     name: str
-    """Process or part that spoke."""
+    """Process or part that logged it."""
     message: str
     """Text for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A session as recorded."""
+    """A recorded session."""
 
     path: Path
     """The file."""
@@ -83,21 +83,21 @@ class Session:
     segments: dict[str, tuple[int, int]]
     """Name → first tick and end (exclusive); may be empty."""
     outcome: dict[str, str] | None
-    """How the session ended, None if the file does not tell."""
-    events: list[Event]
+    """End of the session; None if the file does not state it."""
+    events: list[LoggedEvent]
     """Its log, in the order of time."""
     attachments: dict[str, bytes]
     """Name → contents."""
     events_left_out: int = 0
-    """Further lines of the log, for which there was no room."""
+    """Number of further log lines, which exceeded the limit."""
 
     def number(self, key: str, default: float | None = None) -> float:
         """Return a number of the metadata.
 
         Parameters
         ----------
-        key : of the record ``session``; its suffix is its unit
-        default : what to return without that key; None if the key is required
+        key : key of the record ``session``; its suffix is its unit
+        default : returned without that key; None if the key is required
 
         Raises
         ------
@@ -137,15 +137,15 @@ def read_session(
     Parameters
     ----------
     path : a complete file as docs/session_format.md defines it
-    fields : of the samples, those that are wanted, ``tick`` and ``t_ns`` among them; default all
-    max_samples : most that are kept; they take up to 112 bytes each
+    fields : fields of the samples to read, ``tick`` and ``t_ns`` among them; default all
+    max_samples : most samples that are stored; they take up to 112 bytes each
     on_samples : called with all fields of the samples, block by block, as they are read
 
     Raises
     ------
     SessionError
         If the file is missing, empty, not an MCAP file, incomplete, damaged, too large, of a later
-        format version, or no session.
+        format version, or not a session.
 
     Examples
     --------
@@ -158,11 +158,11 @@ def read_session(
     """
     path = Path(path)
     log = _Log()
-    samples = Kept(path, SAMPLES, fields, max_samples, on_samples)
+    samples = TopicBuffer(path, SAMPLES, fields, max_samples, on_samples)
 
-    def take(contents: McapContents, stretch: Stretch) -> None:
-        samples.decoder.take(contents, stretch)
-        log.take(contents, stretch)
+    def take(contents: McapContents, block: MessageBlock) -> None:
+        samples.decoder.take(contents, block)
+        log.take(contents, block)
 
     contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), take)
     metadata = merged_metadata(contents, "session") or {}
@@ -233,27 +233,27 @@ def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
     return _read_topic(Path(path), TOUCHES)
 
 
-def _read_topic(path: Path, layout: Layout) -> npt.NDArray[np.void]:
-    kept = Kept(path, layout, None, limits.MAX_SAMPLES)
-    return kept.finish(_load(path, (layout.topic,), kept.decoder.take))
+def _read_topic(path: Path, layout: MessageLayout) -> npt.NDArray[np.void]:
+    buffer = TopicBuffer(path, layout, None, limits.MAX_SAMPLES)
+    return buffer.finish(_load(path, (layout.topic,), buffer.decoder.take))
 
 
-class Kept:
+class TopicBuffer:
     """Decoded messages of a topic, in an array that grows with the file.
 
     Parameters
     ----------
-    path : the file, for messages
-    layout : what the messages hold
-    fields : of those the ones that are wanted; None for all
-    most : messages that may be kept
+    path : the file, for error messages
+    layout : layout of the messages
+    fields : fields to store; None for all
+    most : most messages that may be stored
     on_messages : called with all fields of the messages, block by block
     """
 
     def __init__(
         self,
         path: Path,
-        layout: Layout,
+        layout: MessageLayout,
         fields: Sequence[str] | None,
         most: int,
         on_messages: Callable[[npt.NDArray[np.void]], None] | None = None,
@@ -263,13 +263,13 @@ class Kept:
         self._topic = layout.topic
         self._most = most
         self._on_messages = on_messages
-        # Room that is not used takes no memory, and most files need no more.
+        # Unused memory of the array is never allocated, and most files need no more.
         expected = min(_file_size(path) // _BYTES_A_SAMPLE, most)
         self._array = np.empty(expected, layout.dtype_of(fields))
         self._length = 0
 
     def room(self, count: int) -> npt.NDArray[np.void]:
-        """Return room for messages; see `rigd.session._message_decoder.Keeper`."""
+        """Return room for messages; see `rigd.session._message_decoder.MessageSink`."""
         end = self._length + count
         if end > self._most:
             raise SessionError(
@@ -277,15 +277,15 @@ class Kept:
                 "into the memory that reading a session may take. Give a shorter session."
             )
         if end > len(self._array):
-            # In place, and by a part that hardly counts: two arrays at once would be too many.
+            # Resized without a copy, by a small fraction: two arrays would take too much memory.
             grown = max(end, len(self._array) + max(_GROWTH, len(self._array) // 8))
             self._array.resize(min(grown, self._most), refcheck=False)
         if self._on_messages is not None:
             return np.empty(count, self.decoder.dtype)
         return self._array[self._length : end]
 
-    def keep(self, messages: npt.NDArray[np.void]) -> None:
-        """Count the messages, which stand in the array already unless all fields were asked for."""
+    def store(self, messages: npt.NDArray[np.void]) -> None:
+        """Count the messages, which are in the array already unless all fields are requested."""
         end = self._length + len(messages)
         if self._on_messages is not None:
             self._on_messages(messages)
@@ -293,12 +293,12 @@ class Kept:
         self._length = end
 
     def finish(self, contents: McapContents) -> npt.NDArray[np.void]:
-        """Return what was kept.
+        """Return the stored messages.
 
         Raises
         ------
         SessionError
-            If the messages are not what the format asks for, or too many.
+            If the messages violate the format, or there are too many.
         """
         self.decoder.finish(contents)
         self._array.resize(self._length, refcheck=False)
@@ -308,54 +308,57 @@ class Kept:
 def _file_size(path: Path) -> int:
     try:
         return path.stat().st_size
-    except OSError:  # which is told when it is opened
+    except OSError:  # reported when the file is opened
         return 0
 
 
 class _Log:
-    """Messages of the session's log as they are read, as many as fit into its share of memory."""
+    """Messages of the session's log, up to a limit of memory."""
 
     def __init__(self) -> None:
         self.first_log_time: int | None = None
         """Log time of the first sample."""
         self.left_out = 0
-        """Messages of the log that were not kept."""
-        self._kept: list[tuple[int, int, bytes | int]] = []  # channel, log time, data or its length
+        """Number of messages of the log that were not stored."""
+        self._stored: list[tuple[int, int, bytes | int]] = []
+        """Channel, log time, and data or its length."""
         self._bytes = 0
 
-    def take(self, contents: McapContents, stretch: Stretch) -> None:
-        """Take the messages of the log."""
-        records = stretch.records
-        for channel, size, start, count in stretch.runs:
+    def take(self, contents: McapContents, block: MessageBlock) -> None:
+        """Store the messages of the log."""
+        records = block.records
+        for channel, size, start, count in block.runs:
             topic = contents.channels[channel].topic
             if topic == SAMPLE_TOPIC:
                 if self.first_log_time is None:
                     self.first_log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
                 continue
-            room = MAX_EVENTS - len(self._kept)
+            room = MAX_EVENTS - len(self._stored)
             for first in range(start, start + size * min(count, room), size):
                 log_time = int(MESSAGE_HEAD.unpack_from(records, first)[4])
                 length = size - MESSAGE_HEAD.size
                 if length > MAX_EVENT_BYTES:
-                    self._kept.append((channel, log_time, length))
+                    self._stored.append((channel, log_time, length))
                 elif self._bytes + length > MAX_LOG_BYTES:
                     self.left_out += 1
                 else:
                     self._bytes += length
                     data = bytes(records[first + MESSAGE_HEAD.size : first + size])
-                    self._kept.append((channel, log_time, data))
+                    self._stored.append((channel, log_time, data))
             self.left_out += max(count - room, 0)
 
-    def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[Event]:
-        """Decode the log; one that is not protobuf is left out, because no reader needs one."""
-        events: list[Event] = []
+    def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[LoggedEvent]:
+        """Decode the log; one that is not protobuf is left out, because no reader needs it."""
+        events: list[LoggedEvent] = []
         decoders: dict[int, Callable[[bytes], Message]] = {}
-        for channel, log_time, data in self._kept:
+        for channel, log_time, data in self._stored:
             if contents.channels[channel].message_encoding != "protobuf":
                 continue
             t_ns = log_time - start_utc_ns
             if isinstance(data, int):
-                events.append(Event(t_ns, "unknown", "", f"(a message of {data} bytes, not read)"))
+                events.append(
+                    LoggedEvent(t_ns, "unknown", "", f"(a message of {data} bytes, not read)")
+                )
                 continue
             if channel not in decoders:
                 if len(decoders) == limits.MAX_CHANNELS:
@@ -369,7 +372,7 @@ class _Log:
         return events
 
 
-def _load(path: Path, topics: Sequence[str], take: Taker) -> McapContents:
+def _load(path: Path, topics: Sequence[str], take: OnBlock) -> McapContents:
     """Read the container of a session file that must be complete and sound."""
     contents = load_contents(path, topics, take=take)
     if contents.damage is not None:
@@ -391,7 +394,7 @@ def load_contents(
     path: Path,
     topics: Sequence[str] | None,
     *,
-    take: Taker | None = None,
+    take: OnBlock | None = None,
     salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
@@ -400,7 +403,7 @@ def load_contents(
     Parameters
     ----------
     path : the file
-    topics, take, salvage, on_progress : as `rigd.session._mcap_reader.read_mcap` takes them
+    topics, take, salvage, on_progress : see `rigd.session._mcap_reader.read_mcap`
 
     Raises
     ------
@@ -415,7 +418,7 @@ def load_contents(
 
 
 def check_beginning(path: Path) -> None:
-    """Check that a file begins as session files do.
+    """Check that a file begins as a session file.
 
     Raises
     ------
@@ -428,7 +431,7 @@ def check_beginning(path: Path) -> None:
 
 @contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file, and say of it what goes wrong while it is read as MCAP."""
+    """Open a file; turn errors while it is read as MCAP into session errors."""
     try:
         _refuse_no_file(path)
         with path.open("rb") as file:
@@ -438,7 +441,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
     except McapTooLargeError as error:
         raise SessionError(f"{path} {error}. Give a shorter session.") from None
     except McapError as error:
-        raise _foreign(path, error) from None
+        raise _not_mcap(path, error) from None
 
 
 def _refuse_no_file(path: Path) -> None:
@@ -455,12 +458,12 @@ def _unreadable(path: Path, error: OSError) -> SessionAccessError:
     )
 
 
-def _foreign(path: Path, error: McapError) -> SessionError:
+def _not_mcap(path: Path, error: McapError) -> SessionError:
     return SessionError(f"{path} {error}. Give a session file (*.mcap).")
 
 
 def _damage_message(path: Path, contents: McapContents) -> str:
-    from rigd.session._recovery import remedy  # it reads files, too
+    from rigd.session._recovery import remedy  # imported here, because it imports this module
 
     if contents.complete:
         return f"{path} is damaged: it {contents.damage}{remedy(path, was_whole=True)}"
@@ -529,10 +532,10 @@ def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
     return segments
 
 
-def _event(message: "Message", t_ns: int) -> Event:
+def _event(message: "Message", t_ns: int) -> LoggedEvent:
     level = getattr(message, "level", 0)
     known = isinstance(level, int) and 0 <= level < len(EVENT_LEVELS)
-    return Event(
+    return LoggedEvent(
         t_ns=t_ns,
         level=EVENT_LEVELS[level if known else 0],
         name=str(getattr(message, "name", "")),

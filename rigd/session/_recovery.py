@@ -1,11 +1,11 @@
 """Recovery of damaged session files: the intact part of one is written to a valid file.
 
-Nothing is taken that is not proven: messages, channels and schemas stand in chunks with a checksum
-each, the records ``session`` and ``segments`` are taken from the copy in such a chunk, attachments
-have a checksum of their own, and the outcome counts only if that of the whole data section is
-right. A file of another writer may lack some of this; it is recovered and marked as unprotected.
+Only verified data is used: messages, channels and schemas are in chunks with a checksum each, the
+records ``session`` and ``segments`` are taken from the copy in such a chunk, and attachments have a
+checksum of their own. The outcome counts only if the checksum of the whole data section is correct.
+A file of another writer may lack some checksums; it is recovered and marked as unprotected.
 
-`remedy` tells the user of an incomplete file how much of it can be saved, and by which command.
+`remedy` states how much of an incomplete file can be recovered, and by which command.
 """
 
 import contextlib
@@ -26,12 +26,12 @@ import rigd
 from rigd.session import limits
 from rigd.session._errors import SessionError, SessionExistsError
 from rigd.session._mcap_limits import McapError
-from rigd.session._mcap_reader import McapContents, Stretch, message_starts, read_mcap
+from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts, read_mcap
 from rigd.session._mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session._message_decoder import SAMPLES, MessageDecoder
 from rigd.session._reader import (
     SURVEY_FIELDS,
-    Kept,
+    TopicBuffer,
     load_contents,
     merged_metadata,
     read_session,
@@ -54,14 +54,14 @@ _RECOVERED_SUFFIX: Final = ".recovered.mcap"
 _LEAST_CHUNK_BYTES: Final = 1 << 14
 _LONG_CHUNK: Final = 4 << 20
 _MOST_CHUNKS: Final = 10_000
-"""About so many chunks are written before they are made longer."""
+"""Number of chunks after which they are made longer."""
 _MOST_CHANNELS: Final = 32
-"""Most channels that are taken over, of the session's own topics and of others each."""
-_READING_SHARE: Final = 0.3
-"""Share of reading in the time that recovery takes."""
+"""Most channels that are copied, of the session's own topics and of others each."""
+_READING_FRACTION: Final = 0.3
+"""Fraction of the time of a recovery for reading."""
 
 _BEGINNING_BYTES: Final = 1 << 20
-"""Length of the beginning that holds the first samples, if there are any."""
+"""Length of the beginning that contains the first samples, if there are any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,24 +69,24 @@ class Recovery:
     """Result of a recovery."""
 
     source: Path
-    """The file that was given."""
+    """The given file."""
     path: Path | None
     """The new file; None if `source` is a sound session already."""
     samples: int
-    """Samples that are intact."""
+    """Number of intact samples."""
     outcome: Mapping[str, str]
-    """The record ``outcome`` of the new file, with what was lost."""
+    """The record ``outcome`` of the new file, with the losses."""
     damage: str | None
-    """What is wrong with `source`, a sentence's predicate; None if nothing is."""
+    """Damage of `source`, a sentence's predicate; None if it is sound."""
     bytes_lost: int
-    """Bytes of `source` behind the last intact record."""
+    """Bytes of `source` after the last intact record."""
     skipped: tuple[str, ...]
-    """Damaged records before that which were left out, predicates as well."""
+    """Damaged records before it that were left out, as predicates."""
     protected: bool
-    """Whether checksums cover rate, beam and segments, so that they are certainly right."""
+    """Whether checksums cover rate, beam and segments."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the result as a document of JSON types."""
         return {
             "source": str(self.source),
             "path": None if self.path is None else str(self.path),
@@ -99,7 +99,7 @@ class Recovery:
         }
 
     def lines(self) -> list[str]:
-        """Return it as lines of text."""
+        """Return the result as lines of text."""
         if self.path is None:
             return [f"{self.source} is complete and intact; there is nothing to recover."]
         if self.damage is None:
@@ -121,7 +121,7 @@ class Recovery:
 
 
 def recovered_path(path: Path) -> Path:
-    """Name the file that `recover` writes: ``X.mcap.part`` → ``X.mcap``, otherwise a new name."""
+    """Return the path of the recovered file: ``X.mcap.part`` → ``X.mcap``, else a new name."""
     if path.name.endswith(_SESSION_SUFFIX + PART_SUFFIX):
         return path.with_name(path.name.removesuffix(PART_SUFFIX))
     return path.with_name(path.name.removesuffix(_SESSION_SUFFIX) + _RECOVERED_SUFFIX)
@@ -130,26 +130,26 @@ def recovered_path(path: Path) -> Path:
 def recover(
     path: str | os.PathLike[str], on_progress: Callable[[float], None] | None = None
 ) -> Recovery:
-    """Write what is intact of a session file, up to the damage, to a new file beside it.
+    """Write the intact part of a session file, up to the damage, to a new file in its folder.
 
-    The file itself is left as it is. The new one appears under its name when it is complete, on
-    the disk, and was read back.
+    The original file is not changed. The new one gets its name when it is complete, on the disk,
+    and was read back.
 
     Parameters
     ----------
     path : an incomplete ``.part`` or a damaged session file
-    on_progress : called now and then with the share of the work that is done
+    on_progress : called now and then with the completed fraction of the work
 
     Raises
     ------
-    SessionExistsError
+        If the new name exists already.
         If the new name is taken.
     SessionError
-        If the file cannot be read, is still being recorded, or holds no sample before the damage;
-        or if the new one cannot be written.
+        If the file cannot be read, is still being recorded, or has no sample before the damage; or
+        if the new one cannot be written.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe would be waited for
+    if path.exists() and not path.is_file():  # reading a pipe would block
         raise SessionError(f"{path} is not a file. Give the path of a session file.")
     target = recovered_path(path)
     if is_being_written(path):
@@ -157,14 +157,14 @@ def recover(
     survey = _Survey(path)
     contents = load_contents(
         path, None, take=survey.take, salvage=True,
-        on_progress=_part(on_progress, 0.0, _READING_SHARE),
+        on_progress=_part(on_progress, 0.0, _READING_FRACTION),
     )  # fmt: skip
     survey.finish(contents)
     if contents.damage is None and not contents.skipped and survey.left_out is None:
         return _recover_sound(path, target)
     found = [contents.damage, *contents.skipped, survey.left_out]
     damage, *others = [each for each in found if each is not None]
-    if not survey.kept.any():
+    if not survey.retained.any():
         raise SessionError(
             f"{path} {damage}; no sample is intact before that, so there is nothing to recover."
         )
@@ -172,7 +172,7 @@ def recover(
     _refuse_taken(path, target)
     with _new_file(path, target) as temporary:
         expected = _write(
-            temporary, path, contents, survey, recovery, _part(on_progress, _READING_SHARE, 1.0)
+            temporary, path, contents, survey, recovery, _part(on_progress, _READING_FRACTION, 1.0)
         )
         written = SampleDigest()
         try:
@@ -194,7 +194,7 @@ def recover(
 
 
 class SampleDigest:
-    """Checksum of samples, all fields and bit by bit, however they are cut into blocks."""
+    """Checksum of samples, all fields and bit by bit, independent of their blocks."""
 
     def __init__(self) -> None:
         self._sums = {name: hashlib.blake2b() for name in SAMPLE_FIELDS}
@@ -210,60 +210,60 @@ class SampleDigest:
 
 
 class _Survey:
-    """What there is to be recovered: the samples that follow one another, and where they stand."""
+    """First pass of a recovery: finds the samples to copy, and the units that contain them."""
 
     def __init__(self, path: Path) -> None:
         self.left_out: str | None = None
-        """What is wrong with the order of the samples, a sentence's predicate."""
-        self.kept: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
-        """Whether each sample in the file is kept."""
+        """Error in the order of the samples, a sentence's predicate."""
+        self.retained: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+        """Whether each sample in the file is copied."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
-        """Tick and status of those that are."""
-        self._samples = Kept(path, SAMPLES, SURVEY_FIELDS, limits.MAX_SURVEYED)
+        """Tick and status of the copied samples."""
+        self._samples = TopicBuffer(path, SAMPLES, SURVEY_FIELDS, limits.MAX_SURVEYED)
         self._units: dict[int, int] = {}
 
-    def take(self, contents: McapContents, stretch: Stretch) -> None:
-        """Take messages as they are read."""
-        self._samples.decoder.take(contents, stretch)
+    def take(self, contents: McapContents, block: MessageBlock) -> None:
+        """Count the messages of a block."""
+        self._samples.decoder.take(contents, block)
         is_sample = self._samples.decoder.is_of_topic
-        count = sum(run[3] for run in stretch.runs if is_sample(contents, run[0]))
-        self._units[stretch.unit] = self._units.get(stretch.unit, 0) + count
+        count = sum(run[3] for run in block.runs if is_sample(contents, run[0]))
+        self._units[block.unit] = self._units.get(block.unit, 0) + count
 
     def finish(self, contents: McapContents) -> None:
-        """Decide which samples are kept.
+        """Decide which samples are copied.
 
         Raises
         ------
         SessionError
-            If they cannot be decoded.
+            If the samples cannot be decoded.
         """
         samples = self._samples.finish(contents)
         ticks = samples["tick"]
-        self.kept = _increasing(ticks)
-        (others,) = np.nonzero(~self.kept)
+        self.retained = _increasing(ticks)
+        (others,) = np.nonzero(~self.retained)
         if len(others):
             self.left_out = (
                 f"has {len(others)} samples that repeat or precede others, the first of them with "
                 f"tick {ticks[others[0]]}"
             )
-            samples = samples[self.kept]
+            samples = samples[self.retained]
         self.samples = samples
 
     def dropped_units(self) -> set[int]:
-        """Return the units that hold samples, but none that is kept: they stand there twice."""
+        """Return the units with samples of which none is copied: they are duplicates."""
         counts = np.array(list(self._units.values()), np.int64)
-        # How many are kept up to the end of each unit, and so in it.
-        kept = np.append(0, np.cumsum(self.kept))
+        # Number of copied samples up to the end of each unit, and from it in each unit.
+        retained = np.append(0, np.cumsum(self.retained))
         ends = np.cumsum(counts)
-        kept_in = kept[ends] - kept[ends - counts]
-        dropped = (counts > 0) & (kept_in == 0)
+        retained_in = retained[ends] - retained[ends - counts]
+        dropped = (counts > 0) & (retained_in == 0)
         return {unit for unit, is_dropped in zip(self._units, dropped, strict=True) if is_dropped}
 
 
 def holds_samples(path: Path) -> bool:
-    """Tell whether `recover` finds a sample in a file, as far as its beginning says.
+    """Return whether `recover` finds a sample in the beginning of a file.
 
-    That of a file that cannot be read is not known, and counts as if there were one.
+    Returns True for a file that cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -279,16 +279,16 @@ def holds_samples(path: Path) -> bool:
 
 
 def remedy(path: Path, *, was_whole: bool) -> str:
-    """Say how much of an incomplete or damaged file is intact, and how to save that.
+    """Describe how much of an incomplete or damaged file is intact, and how to recover that.
 
     Parameters
     ----------
     path : the file
-    was_whole : it was complete once, so that a sound one may be elsewhere
+    was_whole : whether it was complete once, so that a sound copy may exist
 
     Returns
     -------
-    What goes on behind what is wrong with it, from the mark after that on.
+    Continuation of the sentence on the damage, from the mark after it.
     """
     try:
         count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
@@ -311,10 +311,10 @@ def remedy(path: Path, *, was_whole: bool) -> str:
 
 
 def _increasing(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
-    """Tell which ticks to keep so that they increase.
+    """Return which ticks to copy so that they increase.
 
-    Those above all before them; or, if there are more, those below all behind them: a single tick
-    that is far too high takes nothing with it.
+    Those above all before them; or, if there are more, those below all after them: a single tick
+    that is far too high then costs no others.
     """
     above, below = np.ones((2, len(ticks)), np.bool_)
     above[1:] = ticks[1:] > np.maximum.accumulate(ticks)[:-1]
@@ -327,14 +327,14 @@ def _increasing(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
 def _part(
     on_progress: Callable[[float], None] | None, first: float, end: float
 ) -> Callable[[float], None] | None:
-    """Make a part's share of the work a share of the whole."""
+    """Scale the progress of one part of the work to its range of the whole."""
     if on_progress is None:
         return None
-    return lambda share: on_progress(first + (end - first) * share)
+    return lambda fraction: on_progress(first + (end - first) * fraction)
 
 
 def _recover_sound(path: Path, target: Path) -> Recovery:
-    """Give a file that is complete its name, if it has not got one."""
+    """Give a complete file its name, if it has another one."""
     session = read_session(path, fields=SURVEY_FIELDS, max_samples=limits.MAX_SURVEYED)
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
@@ -362,7 +362,7 @@ def _refuse_taken(path: Path, target: Path) -> None:
 
 @contextlib.contextmanager
 def _new_file(path: Path, target: Path, like: Path | None = None) -> Iterator[Path]:
-    """Give a name beside `target` to write to, and rename it once that went well."""
+    """Yield a temporary path in the folder of `target`; rename it to `target` on success."""
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
         if like is not None:
@@ -372,7 +372,7 @@ def _new_file(path: Path, target: Path, like: Path | None = None) -> Iterator[Pa
         rename_new(temporary, target)
         fsync_directory(target.parent)
     except FileExistsError:
-        _refuse_taken(path, target)  # it has appeared meanwhile
+        _refuse_taken(path, target)  # it may have appeared meanwhile
         raise
     except OSError as error:
         raise SessionError(
@@ -391,10 +391,10 @@ def _plan(
     damage: str,
     skipped: list[str],
 ) -> Recovery:
-    """Decide outcome and protection of the new file."""
+    """Return the result with outcome and protection of the new file."""
     samples = survey.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
-    # What it says of its end is of all its samples.
+    # The recorded outcome applies to all samples.
     is_whole = contents.verified and survey.left_out is None
     recovery = Recovery(
         source=path,
@@ -442,8 +442,8 @@ def _count(counts: Mapping[int, int], contents: McapContents) -> int:
 def _counts(samples: npt.NDArray[np.void], known_to_be_gone: int) -> dict[str, str]:
     """Account for every tick that is known to have been due.
 
-    A gap that the first sample after it does not call missed was lost, in the loop or with the
-    damage. `known_to_be_gone` samples were in the file once.
+    A gap whose next sample is not flagged as missed was lost, in the loop or by the damage.
+    `known_to_be_gone` samples were in the file once.
     """
     status = samples["status"]
     gaps = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
@@ -464,7 +464,7 @@ def _counts(samples: npt.NDArray[np.void], known_to_be_gone: int) -> dict[str, s
 
 
 def _protected_records(contents: McapContents) -> dict[str, dict[str, str]]:
-    """Return ``session`` and ``segments`` as a chunk has them; empty if none has."""
+    """Return ``session`` and ``segments`` from a chunk; empty if no chunk has them."""
     for channel in contents.channels.values():
         if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
             records = unprotected_metadata(channel.metadata)
@@ -474,7 +474,7 @@ def _protected_records(contents: McapContents) -> dict[str, dict[str, str]]:
 
 
 def _records(contents: McapContents) -> dict[str, dict[str, str]]:
-    """Return the metadata to take over, by name, without the outcome."""
+    """Return the metadata to copy, by name, without the outcome."""
     protected = _protected_records(contents)
     if protected and not contents.verified:
         return protected
@@ -490,7 +490,7 @@ def _write(
     recovery: Recovery,
     on_progress: Callable[[float], None] | None,
 ) -> SampleDigest:
-    """Write the new file; return the checksum of the samples that went into it."""
+    """Write the new file; return the checksum of its samples."""
     records = _records(contents)
     channels = _channels(contents, records)
     schema_ids = {channel.schema_id for channel in channels}
@@ -506,11 +506,11 @@ def _write(
             [schema for schema in contents.schemas.values() if schema.id in schema_ids], channels
         )
         copy = _Copy(source, mcap, survey, {channel.id for channel in channels})
-        # Read once more, as far as the first time: what was to be kept was not known then.
+        # Second pass, as far as the first one, which has found the samples to copy.
         again = load_contents(source, None, take=copy.take, salvage=True, on_progress=on_progress)
         digest = copy.finish(again)
         if on_progress is not None:
-            on_progress(1.0)  # what is damaged at the end was not read
+            on_progress(1.0)  # the damaged end is not read
         mcap.add_metadata("outcome", recovery.outcome)
         mcap.finish()
         stream.flush()
@@ -519,81 +519,81 @@ def _write(
 
 
 class _Copy:
-    """Copies messages as they are read, those that are kept.
+    """Second pass of a recovery: copies the messages.
 
     Parameters
     ----------
-    source : the file, for messages
-    mcap : where the channels are declared
-    survey : what is kept
-    channels : that are declared
+    source : the file, for error messages
+    mcap : the new file
+    survey : first pass, with the samples to copy
+    channels : declared channels
     """
 
     def __init__(self, source: Path, mcap: McapWriter, survey: _Survey, channels: set[int]) -> None:
         self._source = source
         self._mcap = mcap
-        self._kept = survey.kept
+        self._retained = survey.retained
         self._dropped = survey.dropped_units()
         self._channels = channels
         self._digest = SampleDigest()
         self._decoder = MessageDecoder(source, SAMPLES, self)
         self._read = 0  # samples of the file
         self._decoded = 0
-        self._pieces: list[bytes] = []
+        self._parts: list[bytes] = []
         self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
         self._length = 0
         self._written = 0
         self._unit = 0
 
     def room(self, count: int) -> npt.NDArray[np.void]:
-        """Return room for samples; see `rigd.session._message_decoder.Keeper`."""
+        """Return room for samples; see `rigd.session._message_decoder.MessageSink`."""
         return np.empty(count, SAMPLE_DTYPE)
 
-    def keep(self, messages: npt.NDArray[np.void]) -> None:
-        """Add the samples that are kept to the checksum."""
+    def store(self, messages: npt.NDArray[np.void]) -> None:
+        """Add the copied samples to the checksum."""
         end = self._decoded + len(messages)
-        kept = self._kept[self._decoded : end]
-        self._digest.take(messages if kept.all() else messages[: len(kept)][kept])
+        retained = self._retained[self._decoded : end]
+        self._digest.take(messages if retained.all() else messages[: len(retained)][retained])
         self._decoded = end
 
-    def take(self, contents: McapContents, stretch: Stretch) -> None:
-        """Copy messages."""
-        # Small chunks are put together, the more the longer the file: each takes room in its index.
+    def take(self, contents: McapContents, block: MessageBlock) -> None:
+        """Copy the messages of a block."""
+        # Small chunks are merged, to longer ones in longer files: each takes room in the index.
         least = max(_LEAST_CHUNK_BYTES, self._written // _MOST_CHUNKS)
-        if self._length >= least and (stretch.unit != self._unit or self._length > _LONG_CHUNK):
+        if self._length >= least and (block.unit != self._unit or self._length > _LONG_CHUNK):
             self._flush()
-        self._unit = stretch.unit
-        self._decoder.take(contents, stretch)
-        is_dropped = stretch.unit in self._dropped
-        records = memoryview(stretch.records)
-        for channel, size, start, count in stretch.runs:
+        self._unit = block.unit
+        self._decoder.take(contents, block)
+        is_dropped = block.unit in self._dropped
+        records = memoryview(block.records)
+        for channel, size, start, count in block.runs:
             parts = [(start, count)]
             if self._decoder.is_of_topic(contents, channel):
-                kept = self._kept[self._read : self._read + count]
+                retained = self._retained[self._read : self._read + count]
                 self._read += count
-                if count == 1:  # with channels in turn all are: nothing that costs a call each
-                    if not kept[0]:
+                if count == 1:  # frequent where channels alternate: avoid a function call each
+                    if not retained[0]:
                         continue
-                elif not kept.all():
-                    parts = [(start + size * first, n) for first, n in _stretches(kept)]
+                elif not retained.all():
+                    parts = [(start + size * first, n) for first, n in _retained_blocks(retained)]
             if is_dropped or channel not in self._channels:
                 continue
             for first, number in parts:
-                self._pieces.append(bytes(records[first : first + size * number]))
+                self._parts.append(bytes(records[first : first + size * number]))
                 self._runs.append((channel, size, number))
                 self._length += size * number
 
     def finish(self, contents: McapContents) -> SampleDigest:
-        """Write what is left; return the checksum of the samples.
+        """Write the remaining messages; return the checksum of the samples.
 
         Raises
         ------
         SessionError
-            If the file is no longer what it was.
+            If the file has changed since the first pass.
         """
         self._flush()
         self._decoder.finish(contents)
-        if not self._read == self._decoded == len(self._kept):
+        if not self._read == self._decoded == len(self._retained):
             raise SessionError(
                 f"{self._source} has changed while it was read. Recover it when nothing writes it."
             )
@@ -603,10 +603,10 @@ class _Copy:
         """Write a chunk, with a rebuilt index."""
         if not self._runs:
             return
-        data = b"".join(self._pieces)
+        data = b"".join(self._parts)
         runs = np.array(self._runs, np.int64)
         self._written += len(data)
-        self._pieces, self._runs, self._length = [], [], 0
+        self._parts, self._runs, self._length = [], [], 0
         starts = message_starts(runs)
         index = np.empty(len(starts), INDEX_DTYPE)
         times = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))
@@ -619,14 +619,14 @@ class _Copy:
         self._mcap.add_chunk(data, dict(zip(numbers.tolist(), parts, strict=True)))
 
 
-def _stretches(kept: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return where each stretch of what is kept begins, and how long it is."""
-    edges = np.flatnonzero(np.diff(kept, prepend=False, append=False))
+def _retained_blocks(retained: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return start and length of each block of retained samples."""
+    edges = np.flatnonzero(np.diff(retained, prepend=False, append=False))
     return list(zip(edges[::2].tolist(), (edges[1::2] - edges[::2]).tolist(), strict=True))
 
 
 def _channels(contents: McapContents, records: Mapping[str, Mapping[str, str]]) -> list[Channel]:
-    """Return the channels to take over, that of the samples with what a reader needs."""
+    """Return the channels to copy; that of the samples gets the metadata that readers need."""
     only_proven = bool(_protected_records(contents)) and not contents.verified
     metadata = protected_metadata(records.get("session", {}), records.get("segments", {}))
     proven = [

@@ -1,4 +1,4 @@
-"""Digests of a record's samples, by which the same samples are recognised in another file."""
+"""Digests of a record's samples, to recognise the same samples in another file."""
 
 import hashlib
 from typing import Final
@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 _WINDOW: Final = 128
-"""Samples of which a digest is made."""
+"""Number of samples in a digest."""
 _FEWEST_CHANGES: Final = 32
-"""Changes of the torque in a window: a sensor at rest repeats itself in any two files."""
+"""Least changes of the torque in a window: a sensor at rest gives the same values in any file."""
 _ANCHOR: Final = 8
-"""Samples that decide whether a window begins there."""
+"""Number of samples that decide whether a window begins."""
 _EVERY: Final = 256
-"""One in so many samples begins a window, wherever the record was cut."""
+"""On average one in so many samples begins a window, wherever the record was cut."""
 _MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -30,9 +30,9 @@ def sample_digests(
     Returns
     -------
     frozenset of bytes
-        Two records with one in common have samples in common: noise does not repeat itself.
-        Windows begin where the samples say, so that a record that was cut at either end has those
-        of the whole one. A torque without noise has none at rest.
+        Two records with a common digest have common samples: noise does not repeat itself. The
+        samples decide where windows begin, so that a record cut at either end has digests of the
+        whole one. A torque without noise has none at rest.
 
     Examples
     --------

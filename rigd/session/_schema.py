@@ -1,7 +1,7 @@
 """Channels of a session file and their protobuf schemas, built without a protobuf compiler.
 
-An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` that holds the message
-and everything it refers to.
+An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` with the message and
+all types to which it refers.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescript
 
 
 def _event_file() -> "FileDescriptorProto":
-    """Return the part of https://github.com/foxglove/foxglove-sdk's ``foxglove.Log`` in use."""
+    """Return the used part of ``foxglove.Log`` of https://github.com/foxglove/foxglove-sdk."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
     file = FileDescriptorProto(
@@ -112,7 +112,7 @@ def schema_data(schema_name: str) -> bytes:
 def message_class(schema_name: str, data: bytes) -> "type[Message]":
     """Return the class that decodes the messages of a protobuf schema.
 
-    It takes as long to build as dozens of messages to decode, so the last few are kept.
+    Building one takes as long as decoding dozens of messages, so the last few are cached.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
         pool = descriptor_pool.DescriptorPool()
 
         def add(name: str) -> None:
-            # A file goes into the pool after those it imports, in whatever order they stand.
+            # A file is added to the pool after its imports, in any order of the file.
             file = remaining.pop(name, None)
             if file is not None:
                 for dependency in file.dependency:
@@ -155,9 +155,9 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
 
 
 def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
-    """Return both records as the metadata of the sample channel, where a checksum covers them.
+    """Return both records as metadata of the sample channel, where a checksum covers them.
 
-    The format has no checksum of a metadata record, and that of the whole file comes at its end.
+    The format has no checksum for a metadata record, and that of the whole file is at its end.
     """
     return {
         **{f"session.{key}": value for key, value in session.items()},
@@ -166,7 +166,7 @@ def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) 
 
 
 def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Undo `protected_metadata`: return ``session`` and ``segments``; empty without them."""
+    """Return ``session`` and ``segments`` from `protected_metadata`; empty without them."""
     found: dict[str, dict[str, str]] = {}
     for key, value in channel.items():
         record, dot, name = key.partition(".")

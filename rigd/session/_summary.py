@@ -1,8 +1,8 @@
 """Summary of a session file from its two ends: metadata and counts, without its samples.
 
-A complete file tells in its summary section where its metadata stands and how many messages it
-has, so that a few reads serve a file of any length. A file without a usable summary is walked
-whole; of one without its end only the beginning is read, where ``session`` stands.
+The summary section of a complete file gives the offsets of its metadata and the number of messages:
+a few reads suffice for a file of any length. A file without a usable summary is read whole; of one
+without its end only the beginning is read, which contains ``session``.
 """
 
 import shlex
@@ -29,8 +29,8 @@ _BEGINNING_BYTES: Final = 1 << 18
 _MOST_SUMMARY_BYTES: Final = 16 << 20
 _MOST_METADATA_BYTES: Final = 1 << 20
 _MOST_RECORDS: Final = 100
-"""Longest summary, longest metadata record and most of them that are read by their index; what is
-beyond is left to the reader that counts memory and time."""
+"""Longest summary, longest metadata record and most of them that are read by their index; beyond
+that the general reader, which limits memory and time, is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,13 @@ class SessionSummary:
     metadata: dict[str, str]
     """The record ``session``; empty if an incomplete file has lost it."""
     outcome: dict[str, str] | None
-    """How the session ended; None if the file does not tell."""
+    """End of the session; None if the file does not state it."""
     samples: int | None
-    """Recorded samples; None of a file without its end."""
+    """Number of recorded samples; None for a file without its end."""
     problem: str
-    """What is wrong with the file and what to do, a sentence; empty of a sound file."""
+    """Problem of the file and remedy, a sentence; empty for a sound file."""
     recording: bool
-    """The session is being recorded to it."""
+    """Whether the session is still being recorded."""
 
 
 def read_summary(path: str | PathLike[str]) -> SessionSummary:
@@ -100,7 +100,7 @@ def _has_end(file: BinaryIO) -> bool:
 
 
 def _indexed(file: BinaryIO, size: int) -> McapContents | None:
-    """Read what the summary section leads to; None if there is no sound one that leads there."""
+    """Read the records to which the summary section points; None if it is not sound."""
     footer_start = size - len(MAGIC) - FOOTER.size
     if footer_start < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
         return None

@@ -1,6 +1,6 @@
 """Validity of the numbers that are estimated from a record.
 
-How exact the linear model is there, and whether a uniform beam predicts the modes.
+States the error of the linear model, and whether a uniform beam predicts the modes.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ _SHORT: Final = {"passed": "yes", "refused": "no", _NOT_TESTED: _NOT_TESTED}
 """Whether the beam is uniform, by status."""
 
 _LEAST_ERROR: Final = 1e-3
-"""Errors of the linear model below this are stated as being below it."""
+"""Errors of the linear model below this are stated as an upper bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,12 @@ class BeamUniformity:
 
     @classmethod
     def of_document(cls, document: object) -> "BeamUniformity | None":
-        """Return what a document states; None if it states nothing that can be used.
+        """Return the result in a document; None without a usable one.
 
         Parameters
         ----------
         document
-            What stands there as ``uniform_beam``, as anybody may have written it.
+            Value of ``uniform_beam`` in any document.
         """
         if not isinstance(document, Mapping) or document.get("status") not in _SHORT:
             return None
@@ -59,7 +59,7 @@ class BeamUniformity:
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The result as a sentence."""
         if self.status == "passed":
             return f"A uniform beam predicts the modes ({self.chance})."
         if self.status == "refused":
@@ -71,7 +71,7 @@ class BeamUniformity:
 
     @property
     def short(self) -> str:
-        """The same for a cell of a table."""
+        """The result for a cell of a table."""
         word = _SHORT[self.status]
         return word if self.p_value is None else f"{word} ({self.chance})"
 
@@ -82,7 +82,7 @@ class BeamUniformity:
         return f"p = {p_value:.2g}" if p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as documents have it, with the sentence."""
+        """Return the result as in documents, with the sentence."""
         return {"status": self.status, "p_value": self.p_value, "sentence": self.sentence}
 
 
@@ -114,12 +114,12 @@ class Validity:
 
     @classmethod
     def of_document(cls, document: object) -> "Validity":
-        """Return the validity that a document states; unknown if it states none.
+        """Return the validity in a document; unknown without one.
 
         Parameters
         ----------
         document
-            What stands there as ``validity``, as anybody may have written it.
+            Value of ``validity`` in any document.
         """
         if not isinstance(document, Mapping):
             return cls()
@@ -157,7 +157,7 @@ class Validity:
         return f"{at_most}{100.0 * error:.2g} %"
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as documents have it, with the sentences."""
+        """Return the validity as in documents, with the sentences."""
         uniform_beam = self.uniform_beam
         return {
             "predicted_peak_tip_slope_rad": self.predicted_peak_tip_slope_rad,

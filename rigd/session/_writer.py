@@ -1,8 +1,8 @@
 """Writer of session files.
 
-Samples, controls and timings come as blocks of records and are written chunk by chunk, events with
-them, an error at once. The file has the suffix ``.part`` and carries a lock until it is complete,
-and is then renamed to its own name, never over another file.
+Samples, controls and timings arrive as blocks of records and are written chunk by chunk, with the
+events; an error is written at once. The file has the suffix ``.part`` and a lock until it is
+complete, and is then renamed to its final name, never over another file.
 """
 
 import contextlib
@@ -62,9 +62,9 @@ PART_SUFFIX: Final = ".part"
 
 CHUNK_SAMPLES: Final = 250
 CHUNK_S: Final = 0.25
-"""Samples to a chunk, and time to a chunk: what a killed recorder loses at most is the lesser."""
+"""Samples and time per chunk: a killed recorder loses at most the lesser of the two."""
 SYNC_INTERVAL_S: Final = 1.0
-"""Wall time between two syncs to the disk: what a dead host loses on top."""
+"""Wall time between two syncs to the disk: the additional loss if the host fails."""
 
 _MESSAGE_HEAD_FIELDS: Final = [
     ("opcode", "u1"),
@@ -74,7 +74,7 @@ _MESSAGE_HEAD_FIELDS: Final = [
     ("log_time", "<u8"),
     ("publish_time", "<u8"),
 ]
-"""`MESSAGE_HEAD` as numpy has it."""
+"""`MESSAGE_HEAD` as numpy fields."""
 
 _CHANNELS: Final = {
     SAMPLE_TOPIC: (1, SAMPLE_SCHEMA),
@@ -83,19 +83,19 @@ _CHANNELS: Final = {
     EVENT_TOPIC: (4, EVENT_SCHEMA),
     TOUCH_TOPIC: (5, TOUCH_SCHEMA),
 }
-"""Topic → the channel's number in the file and the name of its schema."""
+"""Topic → number of the channel in the file, and name of its schema."""
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
 
 
 class _CountedFile(io.FileIO):
-    """A file that counts the bytes that were written to it."""
+    """A file that counts the bytes written to it."""
 
     written = 0
 
-    def write(self, data: Any, /) -> int:  # noqa: ANN401 - whatever bytes are in
-        """Write, and count."""
+    def write(self, data: Any, /) -> int:  # noqa: ANN401 - any bytes-like object
+        """Write and count."""
         count = super().write(data)
         self.written += count
         return count
@@ -104,8 +104,8 @@ class _CountedFile(io.FileIO):
 class SessionWriter:
     """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
 
-    After `begin`, messages arrive in blocks; a chunk goes to the file with every 250th sample,
-    and the file to the disk once a second. Whatever happens after that, what was written stays.
+    After `begin`, messages arrive in blocks. A chunk goes to the file with every 250th sample, and
+    the file to the disk once a second; data once written is never lost to a later failure.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class SessionWriter:
         self._failed = False
         with self._explained():
             try:
-                # Appended to, so that bytes which another program takes away are missed at the end.
+                # Append mode, so that the end detects bytes that another program has removed.
                 flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_APPEND
                 descriptor = os.open(self.part, flags, 0o666)
             except FileExistsError:
@@ -148,7 +148,7 @@ class SessionWriter:
             self._raw = _CountedFile(descriptor, "wb")
             self._stream = io.BufferedWriter(self._raw)
             mark_as_written(descriptor)
-            # Only now, so that a writer that finishes in between is seen.
+            # Checked only now, to detect a writer that finishes in between.
             if os.path.lexists(path):
                 self._stream.close()
                 self.part.unlink()
@@ -175,7 +175,7 @@ class SessionWriter:
         segments: Mapping[str, tuple[int, int]],
         attachments: Mapping[str, bytes],
     ) -> None:
-        """Write what is known before the first tick.
+        """Write the data known before the first tick.
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class SessionWriter:
             fsync_directory(self.part.parent)
 
     def write_samples(self, block: Buffer) -> None:
-        """Take n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
+        """Append n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
         arrived = self._checked(block, SAMPLE_SIZE)
         chunk_size = self._chunk_samples * SAMPLE_SIZE
         with self._explained():
@@ -220,36 +220,36 @@ class SessionWriter:
             self._sync_when_due()
 
     def write_controls(self, block: Buffer) -> None:
-        """Take n × ``CONTROL_SIZE`` bytes of packed control messages (n may be 0).
+        """Append n × ``CONTROL_SIZE`` bytes of packed control messages (n may be 0).
 
-        They share a chunk with the samples of the same time if they are written before these.
+        They go into the same chunk as the samples of that time if written before these.
         """
         self._controls += self._checked(block, CONTROL_SIZE)
         with self._explained():
             self._sync_when_due()
 
     def write_timings(self, block: Buffer) -> None:
-        """Take n × ``TIMING_SIZE`` bytes of packed ages, as `write_controls` does."""
+        """Append n × ``TIMING_SIZE`` bytes of packed ages, as `write_controls` does."""
         self._timings += self._checked(block, TIMING_SIZE)
         with self._explained():
             self._sync_when_due()
 
     def write_touches(self, block: Buffer) -> None:
-        """Take n × ``TOUCH_SIZE`` bytes of packed touches, which go with the chunk in progress."""
+        """Append n × ``TOUCH_SIZE`` bytes of packed touches, which go into the current chunk."""
         self._touches += self._checked(block, TOUCH_SIZE)
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
         """Record an event in the file.
 
-        It is written with the chunk in progress; an error or a fatal one at once, together with
-        what that chunk has so far.
+        It is written with the current chunk; an error or a fatal one at once, together with the
+        chunk so far.
 
         Parameters
         ----------
         t_ns : ns since the session start
         level : "debug", "info", "warning", "error" or "fatal"
         message : text for the operator
-        name : process or part that speaks
+        name : process or part that logs it
         """
         self._begun()
         log_time = self._start_utc_ns + t_ns
@@ -275,7 +275,7 @@ class SessionWriter:
         Parameters
         ----------
         outcome : the record ``outcome``
-        segments : those that were not known at the beginning, or were different
+        segments : those that were unknown at the beginning, or have changed
 
         Returns
         -------
@@ -284,8 +284,8 @@ class SessionWriter:
         Raises
         ------
         SessionExistsError
-            If a file of that name has appeared meanwhile; the session then is complete under the
-            name with ``.part``.
+            If a file of that name has appeared meanwhile; the complete session then has the name
+            with ``.part``.
         """
         mcap = self._begun()
         with self._explained():
@@ -295,7 +295,7 @@ class SessionWriter:
             mcap.add_metadata("outcome", outcome)
             mcap.finish()
             self._sync()
-            self._check_place()
+            self._check_part_file()
             self._stream.close()
             try:
                 rename_new(self.part, self.path)
@@ -308,19 +308,19 @@ class SessionWriter:
         return self.path
 
     def abandon(self) -> Path | None:
-        """Write what has arrived and leave the ``.part`` as it is, without an end.
+        """Write the received data and leave the ``.part`` file without an end.
 
-        If it was removed, its contents, which live as long as it is open, are saved to the
-        nearest folder above that takes them.
+        If it was removed, its contents, which exist while it is open, are saved to the nearest
+        writable folder above.
 
         Returns
         -------
-        Where the contents are; None if they could not be saved.
+        Path of the contents; None if they could not be saved.
 
         Raises
         ------
         SessionError
-            If what has arrived could not be written; what was written before is kept.
+            If the received data cannot be written; earlier data stays.
         """
         if self._stream.closed:
             return self.part
@@ -332,25 +332,25 @@ class SessionWriter:
                     self._stream.flush()
                     os.fsync(self._stream.fileno())
         finally:
-            kept = self._kept()
+            saved = self._saved_path()
             with contextlib.suppress(OSError):  # the failure to write was reported already
                 self._stream.close()
-        return kept
+        return saved
 
     def discard(self) -> None:
         """Remove the ``.part`` of a session that was never begun."""
         if self._mcap is not None:
-            raise RuntimeError("a session that was begun is kept")
+            raise RuntimeError("a session that was begun is not discarded")
         self._stream.close()
         with self._explained():
             self.part.unlink(missing_ok=True)
 
-    def _check_place(self) -> None:
-        """Check that the file is under its name and as long as what was written to it.
+    def _check_part_file(self) -> None:
+        """Check that the file has its name and the length of the data written to it.
 
-        Writing to one that was removed or shortened would still succeed.
+        Writing to a removed or shortened file would still succeed.
         """
-        if not self._is_in_place():
+        if not self._has_its_name():
             raise SessionError(
                 f"{self.part} was removed or moved while it was recorded. Do not change the folder "
                 "of a running session."
@@ -361,23 +361,23 @@ class SessionWriter:
                 "recorded. Do not change the files of a running session."
             )
 
-    def _is_in_place(self) -> bool:
+    def _has_its_name(self) -> bool:
         try:
             return os.path.samestat(self.part.stat(), os.fstat(self._stream.fileno()))
         except OSError:
             return False
 
-    def _kept(self) -> Path | None:
-        """Return where the contents are, saving them to another place if they have none."""
+    def _saved_path(self) -> Path | None:
+        """Return the path of the contents, saving them elsewhere if the file was removed."""
         descriptor = self._stream.fileno()
-        if self._is_in_place():
+        if self._has_its_name():
             return self.part
         if os.fstat(descriptor).st_nlink:
             with contextlib.suppress(OSError):
                 return Path(f"/proc/self/fd/{descriptor}").readlink()
             return None
         for folder in self.part.absolute().parents:
-            with contextlib.suppress(OSError):  # not there, not writable, full, name taken
+            with contextlib.suppress(OSError):  # missing, not writable, full, or name exists
                 copy = folder / self.part.name
                 copy_new(descriptor, copy)
                 return copy
@@ -387,7 +387,7 @@ class SessionWriter:
         if self._mcap is None:
             raise RuntimeError("begin() comes first")
         if self._failed:
-            # Part of a record may have gone to the file: behind it nothing could be read.
+            # Part of a record may be in the file: nothing after it could be read.
             raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
         return self._mcap
 
@@ -401,9 +401,9 @@ class SessionWriter:
         return view
 
     def _write_chunk(self, *, everything: bool) -> None:
-        """Write the messages at hand as a chunk.
+        """Write the collected messages as a chunk.
 
-        Messages beside samples that have not arrived wait for them, unless `everything` is to go.
+        Controls and timings wait for the samples of the same time, unless `everything` is written.
         """
         mcap = self._begun()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
@@ -411,8 +411,8 @@ class SessionWriter:
         timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
         if not everything:
             controls, timings = (
-                beside[: np.searchsorted(beside["t_ns"], samples["t_ns"][-1], side="right")]
-                for beside in (controls, timings)
+                others[: np.searchsorted(others["t_ns"], samples["t_ns"][-1], side="right")]
+                for others in (controls, timings)
             )
         parts: list[bytes] = []
         indexes: dict[int, npt.NDArray[np.void]] = {}
@@ -449,7 +449,7 @@ class SessionWriter:
     def _sync_when_due(self) -> None:
         if self._dirty and time.monotonic() - self._synced_at >= SYNC_INTERVAL_S:
             self._sync()
-            self._check_place()
+            self._check_part_file()
 
     def _sync(self) -> None:
         self._stream.flush()
@@ -483,7 +483,7 @@ def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.v
 def _event_records(
     events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
 ) -> tuple[bytes, npt.NDArray[np.void]]:
-    """Make message records of events (log time, message), and their index."""
+    """Return message records of events (log time, message), and their index."""
     records = b""
     index = np.empty(len(events), INDEX_DTYPE)
     for i, (log_time, data) in enumerate(events):
@@ -501,7 +501,7 @@ def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
 
 
 def _chunk_samples(metadata: Mapping[str, str]) -> int:
-    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
+    """Return the number of samples per chunk: `CHUNK_SAMPLES`, or fewer at a low rate."""
     try:
         in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
     except (ValueError, OverflowError):
@@ -510,7 +510,7 @@ def _chunk_samples(metadata: Mapping[str, str]) -> int:
 
 
 def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
-    """Make the channels of a session; that of the samples repeats what the file says of them."""
+    """Return the channels of a session; that of the samples repeats the file's metadata."""
     schemas, channels = [], []
     for topic, (number, schema_name) in _CHANNELS.items():
         schemas.append(
@@ -534,7 +534,7 @@ _COPY_BYTES: Final = 1 << 20
 
 
 def fsync_directory(path: Path) -> None:
-    """Bring the names in a folder to the disk."""
+    """Sync the names in a folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -543,7 +543,7 @@ def fsync_directory(path: Path) -> None:
 
 
 def copy_new(descriptor: int, target: Path) -> None:
-    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
+    """Copy an open file, of any name, to a new file and to the disk."""
     with target.open("xb") as copy:
         try:
             position = 0
@@ -572,8 +572,8 @@ def rename_new(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
             raise
-        # A file system without hard links (FAT, some network shares): reserve the name, which
-        # fails if the name is taken, and replace the empty file that then is our own.
+        # A file system without hard links (FAT, some network drives): reserve the name, which
+        # fails if the name exists, and replace the empty file, which then is our own.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         try:
             source.replace(target)
@@ -586,9 +586,9 @@ def rename_new(source: Path, target: Path) -> None:
 
 
 def mark_as_written(descriptor: int) -> None:
-    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
+    """Mark a file as being written while `descriptor` is open and its process lives.
 
-    An advisory lock; a file system without locks goes without it.
+    Uses an advisory lock; a file system without locks has no mark.
     """
     if fcntl is not None:
         with contextlib.suppress(OSError):
@@ -596,11 +596,11 @@ def mark_as_written(descriptor: int) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Tell whether a living process holds the mark of `mark_as_written`."""
+    """Return whether a living process holds the mark of `mark_as_written`."""
     if fcntl is None:
         return False
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would be waited for
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # opening a pipe would block
     except OSError:
         return False
     try:

@@ -2,12 +2,12 @@
 
 Every message of ``/rig/sample``, ``/rig/control``, ``/rig/timing`` and ``/rig/touch`` is protobuf
 of *fixed layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the
-order below, and all are written, zero or not. Tags are then constant bytes and every message is
-equally long, so one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of
-them, and any protobuf decoder still understands it.
+order below, and all are written, zero or not. Tags are then constant bytes and all messages have
+the same length: one ``struct.pack_into`` writes a message, one ``numpy.frombuffer`` reads a block
+of them, and any protobuf decoder can read them.
 
-The control process packs with this module, which therefore imports numpy and the standard library
-only.
+The control process packs messages with this module, which therefore imports numpy and the standard
+library only.
 """
 
 import struct
@@ -84,7 +84,7 @@ _WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protob
 
 
 class Status(IntFlag):
-    """Bits of the field ``status``; those not named here are reserved."""
+    """Bits of the field ``status``; the others are reserved."""
 
     TORQUE_SATURATED = 1
     """The torque command was cut to the limit."""
@@ -143,25 +143,25 @@ SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
 SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
 """A decoded sample."""
 SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
-"""A sample as it is in the file: each field after its tag byte ``tag_NAME``."""
+"""A sample in the file: each field after its tag byte ``tag_NAME``."""
 SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
 
 CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
 """A decoded message of the controller's terms."""
 CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
-"""A control message as it is in the file: each field after its tag byte ``tag_NAME``."""
+"""A control message in the file: each field after its tag byte ``tag_NAME``."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 
 TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
 """A decoded message of the readings' ages."""
 TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
-"""A timing message as it is in the file: each field after its tag byte ``tag_NAME``."""
+"""A timing message in the file: each field after its tag byte ``tag_NAME``."""
 TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
 
 TOUCH_DTYPE: Final = _native_dtype(TOUCH_TYPES)
 """A decoded touch."""
 TOUCH_WIRE_DTYPE: Final = _wire_dtype(TOUCH_TYPES)
-"""A touch as it is in the file: each field after its tag byte ``tag_NAME``."""
+"""A touch in the file: each field after its tag byte ``tag_NAME``."""
 TOUCH_SIZE: Final = TOUCH_WIRE_DTYPE.itemsize
 
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
@@ -227,7 +227,7 @@ def pack_sample_into(
         lateness_ns = 0 if lateness_ns < 0 else 0xFFFFFFFF
     if not 0 <= work_ns <= 0xFFFFFFFF:
         work_ns = 0 if work_ns < 0 else 0xFFFFFFFF
-    # The tags are literals because this line is a good part of the loop's own time.
+    # The tags are literals because this line takes a good part of the loop's own time.
     # fmt: off
     _pack_sample(
         buffer, offset,
@@ -300,7 +300,7 @@ def pack_timing_into(
     tick
         Number of the tick.
     angle_age_s, wrench_age_s
-        Age of either reading when it was used.
+        Age of each reading at its use.
     """
     _pack_timing(buffer, offset, 0x09, t_ns, 0x15, tick, 0x19, angle_age_s, 0x21, wrench_age_s)
 
@@ -325,8 +325,8 @@ def pack_touch(
     tick
         Tick in which the loop detected it.
     x_m, x_std_m
-        Distance of the point from the motor's axis and its standard deviation; NaN, as what
-        follows, where it is not known.
+        Distance of the point from the motor's axis and its standard deviation; NaN, as for the
+        following, if unknown.
     force_n, force_std_n
         Peak of the contact force's magnitude.
     stiffness_n_per_m, stiffness_std_n_per_m
@@ -342,12 +342,12 @@ def pack_touch(
 
 
 def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
-    """Encode samples in the fixed layout, as `decode_samples` reads them.
+    """Encode samples in the fixed layout, for `decode_samples`.
 
     Parameters
     ----------
     columns : mapping of str to array (n,)
-        Fields of a sample, ``tick`` among them; those that are absent are 0.
+        Fields of a sample, ``tick`` among them; absent ones are 0.
 
     Examples
     --------
@@ -375,15 +375,15 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     Parameters
     ----------
     wire : array (n,) of a wire dtype
-    types : of its fields, such as ``SAMPLE_TYPES``
+    types : types of its fields, such as ``SAMPLE_TYPES``
 
     Returns
     -------
     array (n,) of bool
     """
-    places, tags = _tags(wire.dtype, tuple(types.items()))
+    offsets, tags = _tags(wire.dtype, tuple(types.items()))
     data = np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
-    fixed: npt.NDArray[np.bool_] = (data[:, places] == tags).all(axis=1)
+    fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
     return fixed
 
 
@@ -391,15 +391,15 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
 def _tags(
     wire_dtype: np.dtype[np.void], types: tuple[tuple[str, str], ...]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
-    """Return where the tag bytes of a message are, and what they are."""
+    """Return offsets and values of the tag bytes of a message."""
     assert wire_dtype.fields is not None
-    places = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
+    offsets = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
     tags = [field_tag(number, kind) for number, (_, kind) in enumerate(types, start=1)]
-    return np.array(places), np.array(tags, dtype=np.uint8)
+    return np.array(offsets), np.array(tags, dtype=np.uint8)
 
 
 def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:
-    """Copy fields of messages as they are in the file into an array of decoded messages.
+    """Copy fields of messages in file format into an array of decoded messages.
 
     Parameters
     ----------

@@ -1,17 +1,17 @@
-"""Limits of session files: what is recorded, read, recovered and analysed at most.
+"""Limits of session files: most data that is recorded, read, recovered and analysed.
 
-A reader takes memory and time in proportion to what a file claims, so every claim is bounded.
+Memory and time of a reader are proportional to the claims of a file, so every claim is bounded.
 """
 
 from typing import Final
 
 MAX_SAMPLES: Final = 2_400_000
 """Most samples of a record: 40 minutes at 1 kHz, for planning, recording, import, analysis, export
-and replay. Read into memory they take 0.27 GB, and an analysis, which is to do with 1 GB, takes
-0.29 kB a sample and 0.16 GB (0.53 GB for 1.27 million)."""
+and replay. In memory they take 0.27 GB. An analysis, which is limited to 1 GB, takes 0.29 kB a
+sample and 0.16 GB (0.53 GB for 1.27 million)."""
 MAX_SURVEYED: Final = 7_200_000
-"""Most samples of which only times, ticks and flags are read: two hours at 1 kHz, the longest that
-an earlier version recorded."""
+"""Most samples of which only times, ticks and flags are read: two hours at 1 kHz, the longest
+recording of an earlier version."""
 
 MAX_FILE_BYTES: Final = 2 << 30
 MAX_CHUNK_BYTES: Final = 256 << 20
@@ -20,13 +20,13 @@ MAX_TOTAL_BYTES: Final = 2 << 30
 MAX_DECLARED_BYTES: Final = 64 << 20
 """Most memory for schemas, channels, metadata and attachments together."""
 MAX_TEXT_BYTES: Final = 32 << 20
-"""Most of that for all but the attachments: as text it takes up to four times as much."""
+"""Most of that for all but the attachments: as text it takes up to four times as much memory."""
 MAX_ENTRIES: Final = 100_000
 """Most keys in all metadata."""
 MAX_MESSAGE_BYTES: Final = 16 << 20
-"""Longest message that is read where it is wanted."""
+"""Longest message that is read."""
 MAX_STEPS: Final = 6_000_000
-"""Most work on a file, in what a run of messages costs: about a microsecond."""
+"""Most work on a file, in units of a run of messages: about a microsecond."""
 
 MAX_SCHEMA_BYTES: Final = 1 << 17
 """Longest schema that is interpreted; those of this package take some hundred bytes."""

@@ -4,11 +4,11 @@ A process of rigd that watches a session starts ``python -m analysis.online`` an
 standard input:
 
 * one line of JSON, UTF-8: ``version`` (1), ``metadata`` and ``segments`` as `SessionWriter.begin`
-  takes them, and ``every_s``: time between two estimates that are made unasked, null for none;
+  takes them, and ``every_s``: time between two estimates without a request, null for none;
 * frames: one byte of kind, four bytes of length (little-endian), and as many bytes of content:
 
   ======  ===========================================================================
-  ``S``   consecutive samples as they stand in a session file (``SAMPLE_WIRE_DTYPE``)
+  ``S``   consecutive samples in the format of session files (``SAMPLE_WIRE_DTYPE``)
   ``R``   JSON: `EstimateRequest`
   ======  ===========================================================================
 
@@ -42,14 +42,14 @@ _LONGEST_FRAME: Final = 1 << 26
 
 @dataclass(frozen=True, slots=True)
 class StreamStart:
-    """What is known of a session before its first sample."""
+    """Metadata of a session that are known before its first sample."""
 
     metadata: dict[str, str]
-    """The record ``session`` of the file to be."""
+    """The record ``session`` of the future file."""
     segments: dict[str, tuple[int, int]]
     """Name → first tick and end (exclusive), as planned."""
     every_s: float | None
-    """Time between two estimates that are made unasked; None: on request only."""
+    """Time between two estimates without a request; None: on request only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,9 @@ class EstimateRequest:
     tick: int
     """Samples from this tick on are left out."""
     whole: bool
-    """Whether every structure is tried, as `analyze` does; else the freest alone is fitted."""
+    """Whether every structure is tried, as in `analyze`; else the freest one alone is fitted."""
     from_last: bool = False
-    """Whether that may start from what the last such estimate found, in a third of the time."""
+    """Whether the fit may start from the last such estimate, in a third of the time."""
 
 
 def write_start(stream: BinaryIO, start: StreamStart) -> None:
@@ -101,7 +101,7 @@ def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
     stream
         Stream that was begun.
     request
-        The samples before its tick have been sent.
+        The request; the samples before its tick have been sent.
     """
     _write(stream, _REQUEST, json.dumps(asdict(request)).encode())
 
@@ -144,7 +144,7 @@ def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateReq
     Raises
     ------
     SessionError
-        What came is not a frame, or ended within one.
+        If the data is not a frame, or ends within one.
     """
     while head := stream.read(_HEAD.size):
         if len(head) < _HEAD.size:
@@ -188,7 +188,7 @@ def mode_line(mode: Mapping[str, Any]) -> str:
     Parameters
     ----------
     mode
-        As quick looks and online fits have it.
+        Mode in the format of quick looks and online fits.
 
     Examples
     --------
@@ -216,7 +216,7 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     Parameters
     ----------
     answer
-        As docs/online_fit.md has it.
+        Answer in the format of docs/online_fit.md.
     before
         The answer with which the modes are compared; None: no comparison.
     """
@@ -246,7 +246,7 @@ def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
     Parameters
     ----------
     modes
-        As answers of the online fit have them.
+        Modes in the format of the online fit's answers.
 
     Examples
     --------

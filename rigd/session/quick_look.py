@@ -1,8 +1,8 @@
-"""Quick looks: the files that the analyzer writes beside session files, and how they are read.
+"""Quick looks: the reports that the analyzer writes next to session files, and their reader.
 
-docs/quick_look.md describes them. Any user may have put such a file there: what is read of it is
-checked here, once for the live view, the page, the library and the analyzer. So is the fit that a
-session file has of its record.
+docs/quick_look.md describes the files. Any user may have written such a file: its contents are
+checked here, once for the live view, the page, the library and the analyzer. The same checks apply
+to the fit in a session file.
 """
 
 import json
@@ -19,9 +19,9 @@ from rigd.units import finite_number
 Document = dict[str, Any]
 
 LOOK_SUFFIX: Final = ".look.json"
-"""Ending of the file of a quick look, in place of the session file's."""
+"""Ending of a quick look's file, instead of the session file's."""
 LOOK_VERSION: Final = 1
-"""Version of its layout."""
+"""Version of the file's layout."""
 
 _MOST_BYTES: Final = 1 << 20
 _WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -29,7 +29,7 @@ _WITHOUT_WAITING: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY",
 _MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_READ: Final = 200
-"""Most looks that are read to find the last one: some thousand would take seconds."""
+"""Most quick looks that are read to find the last one: some thousand would take seconds."""
 _TEXTS: Final = ("file", "session_id", "specimen", "excitation")
 _TIMES: Final = ("start_utc_ns", "made_utc_ns")
 _LINES: Final = ("flags", "text")
@@ -58,15 +58,14 @@ def read_look(path: Path) -> Document | None:
     Parameters
     ----------
     path
-        The file, as of `look_path`.
+        Path of the quick look, from `look_path`.
 
     Returns
     -------
     dict or None
-        As docs/quick_look.md has it, what is missing being empty: all numbers are finite, texts
-        printable, `modes` those that can be used, and `response` and `model` None if they cannot
-        be. None if
-        there is no such file, it cannot be read, or is of another version.
+        Document of docs/quick_look.md, with empty values for missing ones. All numbers are finite,
+        texts printable, `modes` the valid ones, and `response` and `model` None if invalid. None if
+        the file does not exist, cannot be read, or is of another version.
     """
     try:
         found = json.loads(_content(path), parse_constant=lambda _: None, parse_float=_parsed)
@@ -102,31 +101,31 @@ def last_look(
     specimen
         Name of the specimen; empty: sessions that name none.
     before_utc_ns
-        The session began before this time; None: whenever.
+        The session began before this time; None: at any time.
     but
-        Name of a session, without ending, that is left out.
+        Name of a session, without ending, to be left out.
     usable
-        Whether a look is of use, by its document.
+        Returns whether a quick look can be used, by its document.
 
     Returns
     -------
     tuple of Path and dict, or None
-        Path of the session file, and the look as `read_look` returns it.
+        Path of the session file, and the quick look as `read_look` returns it.
     """
     for path in sorted(_newest(folder), key=_start_utc_ns, reverse=True):
         if (
             path.name != but + LOOK_SUFFIX
-            and (look := read_look(path)) is not None
-            and look["specimen"] == specimen
-            and (before_utc_ns is None or look["start_utc_ns"] < before_utc_ns)
-            and usable(look)
+            and (report := read_look(path)) is not None
+            and report["specimen"] == specimen
+            and (before_utc_ns is None or report["start_utc_ns"] < before_utc_ns)
+            and usable(report)
         ):
-            return path.with_name(path.name.removesuffix(LOOK_SUFFIX) + ".mcap"), look
+            return path.with_name(path.name.removesuffix(LOOK_SUFFIX) + ".mcap"), report
     return None
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Return the looks that were made last."""
+    """Return the newest quick looks of a folder."""
     made: list[tuple[float, Path]] = []
     with suppress(OSError):
         for path in folder.glob(f"*{LOOK_SUFFIX}"):
@@ -136,7 +135,7 @@ def _newest(folder: Path) -> list[Path]:
 
 
 def _start_utc_ns(path: Path) -> int:
-    """Return when the session of a look began, in a sixth of the time that checking it takes."""
+    """Return the start of a quick look's session, six times faster than by checking the file."""
     try:
         return int(json.loads(_content(path)).get("start_utc_ns") or 0)
     except (*_UNREADABLE, AttributeError):
@@ -150,12 +149,12 @@ def _content(path: Path) -> bytes:
 
 
 def modes_of(documents: object) -> list[Document]:
-    """Return the modes of a quick look or a report that can be used.
+    """Return the valid modes of a quick look or a report.
 
     Parameters
     ----------
     documents
-        What stands there as `modes`.
+        Value of `modes` in any document.
 
     Returns
     -------
@@ -169,9 +168,9 @@ def modes_of(documents: object) -> list[Document]:
 
 
 def _modes(documents: list[object]) -> Iterator[Document]:
-    for place, mode in enumerate(documents[:_MOST_MODES], start=1):
+    for index, mode in enumerate(documents[:_MOST_MODES], start=1):
         if isinstance(mode, dict):
-            number, shown = mode.get("mode", place), mode.get("shown") is not False
+            number, shown = mode.get("mode", index), mode.get("shown") is not False
             frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
             if (
                 type(number) is int
@@ -191,22 +190,21 @@ def _modes(documents: list[object]) -> Iterator[Document]:
 
 
 def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
-    """Return the fit that was made of a record while it was recorded.
+    """Return the fit of a record that was made during its session.
 
     Parameters
     ----------
     outcome
-        The record ``outcome`` of a file, as anybody may have written it.
+        The record ``outcome`` of any file.
 
     Returns
     -------
     dict or None
-        ``duration_s`` of the record that was fitted, ``problem``, ``validity`` as of
+        ``duration_s`` of the fitted record, ``problem``, ``validity`` as of
         `Validity.as_json`, ``modes`` as of `modes_of`,
-        ``parameters`` by name, ``findings``, and ``search`` of a session that went on until a
+        ``parameters`` by name, ``findings``, and ``search`` of a session that ended when a
         precision was reached: ``reason`` of its end, and ``targets`` with ``name``,
-        ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None if there is none that can
-        be used.
+        ``quantity``, ``mode``, ``value``, ``std`` and ``asked_std``. None without a valid fit.
     """
     try:
         text = (outcome or {})["fit"]
@@ -242,7 +240,7 @@ def _targets(documents: object) -> Iterator[Document]:
                 mode = target.get("mode")
                 yield {
                     "name": _text(target.get("name") or ""),
-                    # Older files name them alone.
+                    # Older files have names only.
                     "quantity": _text(target.get("quantity") or ""),
                     "mode": mode if type(mode) is int else None,
                     **numbers,
@@ -266,7 +264,7 @@ def _quantity(document: object) -> Document | None:
 
 
 def _response(document: object) -> Document | None:
-    """Return a response with its coherence and resolution, None for what cannot be used."""
+    """Return a response with its coherence and resolution; None if it is invalid."""
     curves = _curves(document, _CURVES)
     if curves is None or not isinstance(document, dict):
         return None
@@ -279,7 +277,7 @@ def _response(document: object) -> Document | None:
 
 
 def _curves(document: object, names: tuple[str, ...]) -> Document | None:
-    """Return curves of one length, which is not 0."""
+    """Return curves of equal length above 0."""
     if not isinstance(document, dict):
         return None
     curves = {name: _finite_numbers(document.get(name)) for name in names}
@@ -290,7 +288,7 @@ def _curves(document: object, names: tuple[str, ...]) -> Document | None:
 
 
 def _finite_numbers(values: object) -> list[float]:
-    """Return numbers; none at all if anything else is among them."""
+    """Return the numbers; none at all if there is any other value."""
     numbers = [finite_number(value) for value in values] if isinstance(values, list) else []
     return [] if None in numbers else numbers  # type: ignore[return-value]
 

@@ -21,12 +21,12 @@ _MOST_CHARACTERS: Final = 100
 
 
 def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """Return the touches that the outcome of a session lists; anything else there is left out.
+    """Return the valid touches in the outcome of a session.
 
     Parameters
     ----------
     outcome
-        The record ``outcome`` of a file, as anybody may have written it.
+        The record ``outcome`` of any file.
     """
     try:
         listed = json.loads((outcome or {}).get("touches", "[]"))
@@ -48,7 +48,7 @@ def _touch(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _estimated(stated: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
-    """Return a number with its uncertainty; None if it is none."""
+    """Return a number with its uncertainty; None if it is invalid."""
     if not isinstance(stated, dict):
         return None
     ends = stated.get("interval_95")

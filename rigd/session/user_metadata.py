@@ -1,6 +1,6 @@
 """Metadata that users add to a session, such as ``temperature_c``: rules, and text in the file.
 
-The ending of a name is the unit: a name that ends in one has a finite number, any other a text.
+The ending of a name is the unit: such a name has a finite number as value, any other a text.
 """
 
 import re
@@ -13,7 +13,7 @@ from rigd.units import finite_number, unit_of
 NOTES: Final = ("operator", "specimen", "note")
 """Texts with separate options and keys."""
 META_PREFIX: Final = "meta_"
-"""Begins the key in the record ``session``."""
+"""Prefix of the key in the record ``session``."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _MOST_NAMES: Final = 32
@@ -26,12 +26,12 @@ class MetadataError(UserError, ValueError):
 
 
 def check_name(name: str) -> None:
-    """Check that metadata may have a name.
+    """Check that a name is allowed for metadata.
 
     Raises
     ------
     MetadataError
-        If not.
+        If it is not allowed.
     """
     if not _NAME.fullmatch(name):
         raise MetadataError(
@@ -43,7 +43,7 @@ def check_name(name: str) -> None:
 
 
 def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
-    """Check metadata that a user adds, and return it as the record ``session`` has it.
+    """Check a user's metadata, and return it in the form of the record ``session``.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def metadata_keys(given: Mapping[str, object]) -> dict[str, str]:
 
 
 def added_metadata(session: Mapping[str, str]) -> dict[str, float | str]:
-    """Return what users added to a session, by its names.
+    """Return the metadata that users added to a session, by their names.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def _number(name: str, value: object) -> str:
 
 
 def _as_number(value: object) -> float | None:
-    """Return a finite number, of itself or from its text; None if there is none."""
+    """Return a finite number from a number or its text; None if there is none."""
     try:
         return finite_number(float(value) if isinstance(value, str) else value)
     except ValueError:

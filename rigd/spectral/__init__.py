@@ -3,7 +3,7 @@
 Offers Welch's estimate (`welch_response`: H1, H2, Hv), the instrumental-variable estimate within a
 control loop (`instrumental_response`: Hiv), the transform of a whole record (`fft_response`),
 Welch's estimate of a record that still grows (`RunningResponse`) and a running spectrogram
-(`RunningSpectrogram`). It works on arrays and knows neither sessions nor the beam.
+(`RunningSpectrogram`). It works on arrays and depends on neither sessions nor the beam.
 """
 
 import lazy_loader as lazy

@@ -6,9 +6,9 @@ H1, H2, Hv
 Hiv
     Response within a control loop, with the loop's reference as instrument [3]_. A controller that
     feeds a measured output back lets the sensor's noise move the input. Noise and input are then
-    correlated, and the estimates that average products of the two take that for response: H1 by the
-    share that such motion has in the input's power. The reference is independent of the noise, so
-    the cross-spectra with it average the noise out.
+    correlated, and the estimates that average products of the two are biased: H1 by the fraction of
+    such motion in the input's power. The reference is independent of the noise, so the
+    cross-spectra with it average the noise out.
 FFT
     Empirical transfer function estimate: ratio of the transforms of the whole records [4]_. The
     paper compares Welch's estimate with it.
@@ -34,7 +34,7 @@ Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
 
 
 class SpectralError(ValueError):
-    """A record or a setting from which no frequency response can be estimated."""
+    """The record or a setting does not allow the estimation of a frequency response."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,9 @@ class FrequencyResponse:
         Output over input, in the unit of the one per unit of the other. An output that lags the
         input has a negative phase. NaN in a bin where the input has no power at all.
     coherence : ndarray of float, shape (n,), or None
-        Ordinary coherence, 0 to 1; None where fewer than two segments leave it without meaning.
+        Ordinary coherence, 0 to 1; None with fewer than two segments, where it has no meaning.
     segments : int
-        Number of segments that were averaged.
+        Number of averaged segments.
     estimator : {"h1", "h2", "hv", "iv", "fft"}
     """
 
@@ -62,7 +62,7 @@ class FrequencyResponse:
     estimator: Estimator
 
     def band(self, first_hz: float, last_hz: float) -> "FrequencyResponse":
-        """Bins from `first_hz` to `last_hz`, both included.
+        """Return the bins from `first_hz` to `last_hz`, both included.
 
         Parameters
         ----------
@@ -74,7 +74,7 @@ class FrequencyResponse:
         SpectralError
             If no bin lies in the band.
         """
-        # A rounding error in the caller's arithmetic must not cost the bin at either end.
+        # Rounding errors of the caller must not lose the bin at either end.
         slack = 1e-9 * max(abs(first_hz), abs(last_hz))
         first = int(np.searchsorted(self.frequency_hz, first_hz - slack, side="left"))
         end = int(np.searchsorted(self.frequency_hz, last_hz + slack, side="right"))
@@ -97,7 +97,7 @@ class FrequencyResponse:
         Parameters
         ----------
         input_delay_s, output_delay_s : float
-            Age of a sample at the time it is stamped with, in s; positive: the value is older.
+            Age of a sample at its time stamp, in s; positive: the value is older.
 
         Notes
         -----
@@ -112,12 +112,12 @@ class FrequencyResponse:
 def checked_records(
     input_: ArrayLike, output: ArrayLike, rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both records as float arrays of one dimension, equal length and finite values.
+    """Return both records as float arrays of one dimension, equal length and finite values.
 
     Raises
     ------
     SpectralError
-        Naming which record is wrong, and how.
+        With the wrong record and the problem.
     """
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise SpectralError(f"The sampling rate must be a positive number of Hz, not {rate_hz!r}.")
@@ -166,11 +166,11 @@ class Segmentation:
 
 
 def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
-    """Segments for a record of which nothing but the length is known.
+    """Return segments for a record of known length.
 
-    They last as long as the paper's, whose transform they share. A record too short for one of
-    those is divided like the paper's, into eight with 15 % of overlap; one too short even for that
-    is a single segment.
+    They have the paper's duration and transform. A record too short for one of those is divided
+    like the paper's, into eight with 15 % of overlap; one too short even for that is a single
+    segment.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(samples: int, segment_length: int, overlap: int) -> int:
-    """Count the whole segments in a record; a rest at its end is unused.
+    """Return the number of whole segments in a record; a remainder at its end is unused.
 
     Parameters
     ----------
@@ -209,20 +209,20 @@ def segment_count(samples: int, segment_length: int, overlap: int) -> int:
 
 
 def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tuple[int, int]:
-    """Longest segments that fit a record `segments` times, and their overlap in samples.
+    """Return the longest segments that fit a record `segments` times, and their overlap.
 
     The overlap is rounded to the nearest sample. Rounding it down, as is usual, makes eight
     segments of 15 % overlap miss a record of 120 000 samples by five: seven are then averaged
-    without a word, the record ends at 105.3 s and the third resonance of a 120 s chirp is lost.
+    without a message, the record ends at 105.3 s and the third resonance of a 120 s chirp is lost.
 
     Parameters
     ----------
     samples
         Length of the record.
     segments
-        How many are to fit.
+        Number of segments.
     overlap_fraction
-        Overlap as a share of the segment, from 0 to below 1.
+        Overlap as a fraction of the segment, from 0 to below 1.
 
     Returns
     -------
@@ -249,7 +249,7 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
     def end_of_last(length: int) -> int:
         return length + (segments - 1) * (length - round(overlap_fraction * length))
 
-    # The end grows with the length but for jumps of rounding, so start above and walk down.
+    # The end grows with the length except for rounding, so start above and decrease.
     length = int(samples / (1 + (segments - 1) * (1 - overlap_fraction))) + segments + 1
     while length > 1 and end_of_last(length) > samples:
         length -= 1
@@ -263,12 +263,12 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
 
 
 def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
-    """Refuse lengths that make no sense together.
+    """Raise if the lengths are inconsistent.
 
     Raises
     ------
     SpectralError
-        Naming which, and why.
+        With the wrong length and the reason.
     """
     if segment_length < 2 or not 0 <= overlap < segment_length:
         raise SpectralError(
@@ -290,7 +290,7 @@ class CrossSpectra:
     """Sums over segments, bin by bin.
 
     Common factors of the densities (rate, power of the window, number of segments) cancel in every
-    ratio that is formed, so they are left out.
+    ratio and are left out.
 
     Attributes
     ----------
@@ -299,7 +299,7 @@ class CrossSpectra:
     sxy : ndarray of complex, shape (n,)
         Sum of the conjugate of the input times the output.
     segments : int
-        Number of segments that were added.
+        Number of added segments.
     """
 
     sxx: NDArray[np.float64]
@@ -309,11 +309,11 @@ class CrossSpectra:
 
     @classmethod
     def of_nothing(cls, bins: int) -> "CrossSpectra":
-        """Return sums of no segment."""
+        """Return sums of no segments."""
         return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
 
     def copy(self) -> "CrossSpectra":
-        """Return sums of the same segments, to be added to apart from these."""
+        """Return an independent copy of the sums."""
         return CrossSpectra(self.sxx.copy(), self.syy.copy(), self.sxy.copy(), self.segments)
 
     def add(self, fx: NDArray[np.complex128], fy: NDArray[np.complex128]) -> None:
@@ -341,7 +341,7 @@ class CrossSpectra:
             if estimator == "h1":
                 return self.sxy / self.sxx
             if estimator == "h2":
-                # Syx, the conjugate of Sxy, is what leaves the phase as H1 has it.
+                # Syx, the conjugate of Sxy, gives the same phase as H1.
                 return self.syy / self.sxy.conj()
             return self.sxy / np.abs(self.sxy) * np.sqrt(self.syy / self.sxx)
 
@@ -367,7 +367,7 @@ def welch_response(
     nfft: int = PAPER_NFFT,
     estimator: Literal["h1", "h2", "hv"] = "h1",
 ) -> FrequencyResponse:
-    """Frequency response from averaged cross- and auto-spectra of windowed segments.
+    """Return the frequency response from averaged cross- and auto-spectra of windowed segments.
 
     The window is Hamming's, symmetric as MATLAB's is. No trend is removed from the segments.
 
@@ -394,7 +394,7 @@ def welch_response(
     Raises
     ------
     SpectralError
-        If the record is shorter than one segment, or a record or setting makes no sense.
+        If the record is shorter than one segment, or a record or setting is invalid.
 
     References
     ----------
@@ -426,9 +426,9 @@ def welch_response(
         )
     bins = nfft // 2 + 1
     sums = CrossSpectra.of_nothing(bins)
-    # Kept, because allocating this much memory again is slow.
+    # Allocated once, because allocating this much memory again is slow.
     fx, fy = np.empty((2, bins), dtype=np.complex128)
-    # One segment at a time stays in the cache, which a whole batch does not.
+    # One segment at a time stays in the cache, unlike a whole batch.
     for k in range(count):
         segment = slice(start := k * (segment_length - overlap), start + segment_length)
         np.fft.rfft(x[segment] * taper, nfft, out=fx)
@@ -440,10 +440,10 @@ def welch_response(
 def fft_response(
     input_: ArrayLike, output: ArrayLike, rate_hz: float, nfft: int | None = None
 ) -> FrequencyResponse:
-    """Ratio of the Fourier transforms of output and input, no window, no averaging.
+    """Return the ratio of the Fourier transforms of output and input, without window or averaging.
 
-    Nothing leaks if the system is at rest before the first sample and at rest again before the
-    last; then the estimate has no bias at all. It has no averaging against noise either.
+    There is no leakage if the system is at rest before the first sample and again before the last;
+    then the estimate has no bias. It has no averaging against noise either.
 
     Parameters
     ----------
@@ -504,7 +504,7 @@ def instrumental_response(
     overlap: int = PAPER_OVERLAP,
     nfft: int = PAPER_NFFT,
 ) -> FrequencyResponse:
-    """Frequency response ``Hiv = Sry / Srx`` from input to output.
+    """Return the frequency response ``Hiv = Sry / Srx`` from input to output.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Frequency response of a record that still grows, by Welch's method.
 
-Samples come in blocks of any length and are cut into segments, short gaps interpolated. Each
+Samples arrive in blocks of any length and are cut into segments, with short gaps interpolated. Each
 segment adds to the sums of `rigd.spectral._frf`; at any time these give the response, its
-coherence, and the bins that the reference has excited so far. Only the lowest bins of each padded
-transform are of interest, and Bluestein's algorithm [1]_ computes them without the rest.
+coherence, and the bins excited so far. Only the lowest bins of each padded transform are of
+interest, and Bluestein's algorithm [1]_ computes them without the others.
 
 References
 ----------
@@ -30,8 +30,8 @@ from rigd.spectral._frf import (
 
 Real = NDArray[np.float64]
 
-LEAST_SHARE: Final = 0.25
-"""Least share of a segment that is estimated from: shorter ones do not resolve what they show."""
+LEAST_FRACTION: Final = 0.25
+"""Least fraction of a segment for an estimate: shorter ones have too little resolution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +43,10 @@ class RunningEstimate:
     response : FrequencyResponse
         Response; its coherence is None until there are two whole segments.
     excited : ndarray of bool, shape (n,)
-        Bins of the response where the reference has been; what it shows elsewhere is noise and
-        what leaks.
+        Bins of the response that the reference has excited; elsewhere it shows noise and leakage.
+
     final : bool
-        Whether the record is at its end; then this is the estimate of `welch_response`.
+        Whether the record is complete; then this is the estimate of `welch_response`.
     """
 
     response: FrequencyResponse
@@ -55,11 +55,11 @@ class RunningEstimate:
 
 
 class RunningResponse:
-    """H1 of a record that grows; at its end it is that of `welch_response`, to rounding.
+    """H1 estimate of a growing record; at its end equal to `welch_response`, except for rounding.
 
-    Whole segments are averaged as Welch does, each under a Hamming window. Until the end the newest
-    samples, as many as make a segment or as there are, count as one more with its own window
-    length: so the response reaches as far as the record, not as the last whole segment.
+    Whole segments are averaged as in Welch's method, each with a Hamming window. Until the end the
+    newest samples, at most a segment of them, count as one more segment with its own window length:
+    the response then includes the newest part of the record.
 
     Parameters
     ----------
@@ -68,14 +68,14 @@ class RunningResponse:
     samples : int
         Length of the whole record.
     last_hz : float
-        The response is estimated up to here.
+        Highest frequency of the response.
     segmentation : Segmentation, optional
-        By default what `segmentation_of` makes of a record of that length.
+        By default from `segmentation_of` for that length.
 
     Raises
     ------
     SpectralError
-        If the lengths of the segmentation make no sense together.
+        If the lengths of the segmentation are inconsistent.
     """
 
     def __init__(
@@ -106,25 +106,25 @@ class RunningResponse:
     def feed(
         self, ticks: ArrayLike, reference: ArrayLike, input_: ArrayLike, output: ArrayLike
     ) -> None:
-        """Take samples; the result does not depend on how many come at a time.
+        """Add samples; the result does not depend on their number per call.
 
         Parameters
         ----------
         ticks : array_like of int, shape (n,)
             Increasing, 0 at the record's first sample. Gaps of up to `LONGEST_GAP_S` are
-            interpolated, segments with a longer one left out. Samples from before the record and
-            from after it may be given too: they close gaps at its ends, and one from after it tells
-            that it is over.
+            interpolated, segments with a longer one left out. Samples from before and after the
+            record are allowed too: they close gaps at its ends, and one from after it marks it as
+            complete.
         reference, input_, output : array_like, shape (n,)
             A tick with a value that is not finite counts as missing. No trend is removed: the input
-            should be counted from where it is at rest, or that leaks into the lowest bins.
+            should be relative to its value at rest, since an offset leaks into the lowest bins.
         """
         for first, segment in self._segments.feed(ticks, np.stack((reference, input_, output))):
             self._add(segment, self._sums, self._reference_power)
             self._summed_up_to = first + self._length
 
     def estimate(self) -> RunningEstimate | None:
-        """Estimate from what has come; None as long as that is too little."""
+        """Return the estimate from the samples so far; None while these are too few."""
         final = self._segments.over
         sums, reference_power = self._sums, self._reference_power
         newest = self._segments.newest(self._length)
@@ -146,10 +146,10 @@ class RunningResponse:
         )
 
     def _is_to_be_added(self, newest: int, final: bool) -> bool:
-        """Whether so many newest samples count beside the whole segments."""
+        """Return whether the newest samples count in addition to the whole segments."""
         if self._segments.end == self._summed_up_to or (final and self._sums.segments):
             return False
-        return newest >= LEAST_SHARE * self._length
+        return newest >= LEAST_FRACTION * self._length
 
     def _add(
         self,
@@ -157,10 +157,10 @@ class RunningResponse:
         sums: CrossSpectra,
         reference_power: NDArray[np.float64],
     ) -> None:
-        """Add a segment (3, n) of reference, input and output to the sums given."""
+        """Add a segment (3, n) of reference, input and output to the sums."""
         window = np.hamming(segment.shape[1])
         reference, input_, output = segment
-        # Where the motor stands excites nothing, but would outshine what does.
+        # The mean angle excites nothing, but its power would exceed that of the motion.
         moving = reference - np.average(reference, weights=window)
         reference_power += power(self._transform(moving * window))
         sums.add(self._transform(input_ * window), self._transform(output * window))
@@ -173,7 +173,7 @@ LONGEST_GAP_S: Final = 0.1
 
 
 class Segments:
-    """Segments of equal length, whatever blocks the samples come in.
+    """Segments of equal length from blocks of any length.
 
     Segment k begins at tick ``k * hop``.
 
@@ -184,17 +184,17 @@ class Segments:
     length, hop : int
         Length of a segment, and distance from its start to the next one's, in ticks.
     longest_gap : int
-        Most missing ticks in a row that are interpolated.
+        Longest run of missing ticks that is interpolated.
     end : int, optional
-        Tick before which the record ends. What lies outside the record, before tick 0 or from here
-        on, is used for nothing but to close a gap at its edge.
+        Tick before which the record ends. Samples outside the record, before tick 0 or from here
+        on, only close a gap at its edge.
 
     Attributes
     ----------
     end : int
         Tick after the newest sample of the record.
     over : bool
-        Whether a sample has come that is the record's last or later.
+        Whether a sample has arrived that is the record's last or later.
     """
 
     def __init__(
@@ -205,18 +205,18 @@ class Segments:
         self._length, self._hop = length, hop
         self._limit = end
         self._gaps = _GapFilling(longest_gap)
-        # The newest samples are the columns from `_used - stretch` to `_used`; when the room is
-        # used up, those that may still be needed move to the front.
+        # The newest samples are the columns from `_used - available` to `_used`; when the array is
+        # full, those that may still be needed move to the front.
         self._room = np.empty((channels, 3 * length))
         self._used = 0
-        self._stretch = 0
+        self._available = 0
         self._next = 0
 
     def feed(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
-        """Take samples and hand out, one by one, the segments they complete.
+        """Add samples and yield the segments that they complete, one by one.
 
-        A segment has to be used before the next is asked for, and the iteration has to be carried
-        to its end: it is what takes the samples.
+        Use a segment before the next one, which overwrites it, and consume the whole iteration,
+        which adds the samples.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Segments:
         Yields
         ------
         first : int
-            Tick the segment begins at.
+            First tick of the segment.
         segment : ndarray of float, shape (channels, length)
             A view.
         """
@@ -242,13 +242,13 @@ class Segments:
 
     def newest(self, most: int) -> Real:
         """Return the newest samples (channels, n) without a gap, at most so many; a view."""
-        return self._room[:, self._used - min(most, self._stretch) : self._used]
+        return self._room[:, self._used - min(most, self._available) : self._used]
 
     def _take(self, first: int, block: Real) -> Iterator[tuple[int, Real]]:
-        """Take a block without gaps."""
+        """Add a block without gaps."""
         if first != self.end:
             self.end = first
-            self._stretch = 0
+            self._available = 0
             self._next = -(-first // self._hop) * self._hop
         taken = 0
         while taken < block.shape[1]:
@@ -264,24 +264,24 @@ class Segments:
         """Add samples to the newest, at most a segment of them."""
         count = part.shape[1]
         if self._used + count > self._room.shape[1]:
-            kept = self.newest(self._length)
-            self._room[:, : kept.shape[1]] = kept
-            self._used = kept.shape[1]
+            newest = self.newest(self._length)
+            self._room[:, : newest.shape[1]] = newest
+            self._used = newest.shape[1]
         self._room[:, self._used : self._used + count] = part
         self._used += count
-        self._stretch = min(self._stretch + count, self._length)
+        self._available = min(self._available + count, self._length)
         self.end += count
 
 
 class _GapFilling:
-    """Interpolates across short gaps, and tells of long ones by a jump of the tick."""
+    """Interpolates short gaps, and shows long ones as a jump of the tick."""
 
     def __init__(self, longest_gap: int) -> None:
         self._longest = longest_gap
         self._last: tuple[NDArray[np.int64], Real] | None = None
 
     def fill(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
-        """Hand out blocks without gaps: their first tick, and the values (channels, n)."""
+        """Yield blocks without gaps: their first tick, and the values (channels, n)."""
         known_ticks = np.asarray(ticks, dtype=np.int64)
         known = np.asarray(values, dtype=np.float64)
         is_known = np.isfinite(known).all(axis=0)
@@ -291,7 +291,7 @@ class _GapFilling:
             return
         last = self._last
         if last is None and 0 < known_ticks[0] <= self._longest:
-            # There is nothing to interpolate from: the first values are held.
+            # There is nothing from which to interpolate: the first values are held.
             known_ticks = np.concatenate(([0], known_ticks))
             known = np.concatenate((known[:, :1], known), axis=1)
         elif last is not None:
@@ -301,14 +301,14 @@ class _GapFilling:
         breaks = 1 + np.flatnonzero(np.diff(known_ticks) > self._longest + 1)
         for start, stop in pairwise([0, *breaks, known_ticks.size]):
             first, block = _interpolated(known_ticks[start:stop], known[:, start:stop])
-            if start == 0 and last is not None:  # handed out when it came
+            if start == 0 and last is not None:  # yielded with the previous block
                 first, block = first + 1, block[:, 1:]
             if block.shape[1]:
                 yield first, block
 
 
 def _interpolated(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
-    """Return the first tick, and the values on every tick from the first to the last."""
+    """Return the first tick, and interpolated values on every tick up to the last."""
     first, last = int(ticks[0]), int(ticks[-1])
     if last - first + 1 == ticks.size:
         return first, values
@@ -321,23 +321,23 @@ def _interpolated(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
 LEAST_POWER: Final = 2e-3
 """Least power of an excited bin, relative to the largest.
 
-Above what a Hamming window lets leak (−43 dB in its side lobes, and its pedestal of 0.08 where the
-record breaks off in mid-chirp), below what a chirp leaves where two of the paper's segments join
+Above the leakage of a Hamming window (−43 dB in its side lobes, and its pedestal of 0.08 where the
+record ends in mid-chirp), below the power of a chirp where two of the paper's segments join
 (−15 dB).
 """
 
 
 def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
-    """Bins where the power is the reference's own and not leaked from its neighbours.
+    """Return the bins with power of the reference itself, not leaked from their neighbours.
 
     Parameters
     ----------
     power : ndarray of float, shape (n,)
         Power of the reference, on bins from frequency 0 on.
     resolution_bins : int
-        Bins per inverse length of the shortest window that made the power. A dip no wider than
-        twice that is a ripple of the window's and counts as excited; at either end of a band so
-        many bins are given up to what leaks.
+        Bins per inverse length of the shortest window of the power. A dip no wider than twice that
+        is a ripple of the window and counts as excited; at either end of a band so many bins are
+        excluded because of leakage.
 
     Returns
     -------
@@ -351,7 +351,7 @@ def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np
 
 
 def _any_near(marked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Whether any bin within the reach is marked; beyond the ends it goes on as at the ends."""
+    """Return whether any bin within the reach is marked, with constant continuation at the ends."""
     counts = np.cumsum(np.pad(marked, (reach + 1, reach), mode="edge"))
     near: NDArray[np.bool_] = counts[2 * reach + 1 :] > counts[: -2 * reach - 1]
     return near
@@ -361,23 +361,23 @@ def _any_near(marked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
 
 
 def bins_up_to(last_hz: float, nfft: int, rate_hz: float) -> int:
-    """Return how many bins a transform has from 0 to a frequency, included."""
-    # A rounding error in the caller's arithmetic must not cost the last one.
+    """Return the number of bins of a transform from 0 to a frequency, included."""
+    # Rounding errors of the caller must not lose the last bin.
     return 1 + min(nfft // 2, int(last_hz * nfft / rate_hz * (1 + 1e-9)))
 
 
 class LowBins:
     """Transform that equals ``np.fft.rfft(x, nfft)[:bins]`` to rounding.
 
-    With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, which two
-    short transforms carry out. Of 17 266 samples padded to 160 000 the bins up to 60 Hz take a
-    quarter of the time that all bins take. Padded so little that it would take longer, all bins are
+    With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, computed
+    by two short transforms. For 17 266 samples padded to 160 000 the bins up to 60 Hz take a
+    quarter of the time of all bins. With so little padding that it would take longer, all bins are
     computed.
 
     Parameters
     ----------
     length : int
-        Most samples that will be given.
+        Largest number of samples.
     nfft : int
         Length of the padded transform, at least `length`.
     bins : int
@@ -392,13 +392,13 @@ class LowBins:
         if self._all is not None:
             return
         n = np.arange(max(length, bins))
-        # The phase is reduced while it is a whole number, which is exact.
+        # The phase is reduced as a whole number, which is exact.
         self._chirp = np.exp(-1j * np.pi * (n * n % (2 * nfft)) / nfft)
         kernel = np.zeros(size, dtype=np.complex128)
         kernel[:bins] = self._chirp[:bins].conj()
         kernel[size - length + 1 :] = self._chirp[length - 1 : 0 : -1].conj()
         self._kernel = np.fft.fft(kernel)
-        # Kept, because allocating this much memory again is slow.
+        # Allocated once, because allocating this much memory again is slow.
         self._work = np.empty(size, dtype=np.complex128)
         self._transform = np.empty(size, dtype=np.complex128)
 
@@ -416,7 +416,7 @@ class LowBins:
 
 
 def _fast_length(least: int) -> int:
-    """Smallest length of at least `least` without a prime factor above 5."""
+    """Return the smallest length of at least `least` without a prime factor above 5."""
     best = 1 << (least - 1).bit_length()
     fives = 1
     while fives < best:

@@ -1,4 +1,4 @@
-"""Spectrogram of a signal that comes in blocks: the amplitude at every frequency, time by time."""
+"""Spectrogram of a signal that arrives in blocks: amplitude over frequency and time."""
 
 from typing import Final
 
@@ -8,25 +8,25 @@ from numpy.typing import ArrayLike, NDArray
 from rigd.spectral._running import LONGEST_GAP_S, Segments, bins_up_to
 
 LEAST_DB: Final = -200.0
-"""Shown for what is silent, which has no level."""
+"""Level of silence."""
 
 _PADDING: Final = 4
-"""Transforms are so many times as long as the window: then no sine falls between two bins by more
-than 0.1 dB."""
+"""Length of the transforms over that of the window: the level of a sine between two bins is then
+low by at most 0.1 dB."""
 
 
 class RunningSpectrogram:
     """Columns of levels, one every step, under a Hann window.
 
-    A sine of amplitude A shows 20 log10 A where its frequency is, in dB re 1 of the signal's unit;
-    a constant A does so at frequency 0.
+    A sine of amplitude A has the level 20 log10 A at its frequency, in dB re 1 of the signal's
+    unit; a constant A has it at frequency 0.
 
     Parameters
     ----------
     rate_hz : float
         Sampling rate.
     window_s, step_s : float
-        Length of the window, and time from a column to the next.
+        Length of the window, and time between two columns.
     last_hz : float
         Highest frequency shown.
 
@@ -50,7 +50,7 @@ class RunningSpectrogram:
         bins = bins_up_to(last_hz, self._nfft, rate_hz)
         self.frequency_hz = np.arange(bins) * rate_hz / self._nfft
         window = np.hanning(length)
-        # One-sided: the half of an amplitude that lies at the negative frequency is added.
+        # One-sided: the half of an amplitude at the negative frequency is added.
         self._window = window * (2.0 / window.sum())
         self._segments = Segments(
             1,
@@ -60,7 +60,7 @@ class RunningSpectrogram:
         )
 
     def feed(self, ticks: ArrayLike, values: ArrayLike) -> list[tuple[float, NDArray[np.float64]]]:
-        """Take samples and return the columns they complete.
+        """Add samples and return the columns that they complete.
 
         Parameters
         ----------

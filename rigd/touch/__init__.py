@@ -3,11 +3,11 @@
 Offers the innovations of the free beam (`observed_beam`, `InnovationFilter`), which the control
 loop computes tick by tick, and the sequential test on them (`watched_beam`, `TouchDetector`).
 
-`TouchEstimator` estimates one touch after another with one model of the beam (`TouchModel`, read
-from an analysis or taken from the profile) and tells point, instant, force and stiffness with
-intervals, and the kind of obstacle (`TouchEstimate`). What it needs is a `TouchRecord`: angle,
-torque and base shear from 0.3 s or more before the touch (`samples.touch_record`). A process beside
-the control loop and the analyser use it alike. It knows of no rig and no file but the analyser's
+`TouchEstimator` estimates one touch after another with one model of the beam (`TouchModel`, from an
+analysis or from the profile). It estimates point, instant, force and stiffness with intervals, and
+the kind of obstacle (`TouchEstimate`). Its input is a `TouchRecord`: angle, torque and base shear
+from 0.3 s or more before the touch (`samples.touch_record`). The touch estimator's process and the
+analyser use it in the same way. It depends on no rig and no file but the analyser's
 document.
 """
 

@@ -1,7 +1,7 @@
-"""What is told of a touch: what its likeliest explanations share, and its kind.
+"""Report of a touch: the common result of its likeliest explanations, and its kind.
 
-Values come with standard deviations and intervals that take in the noise, the model's uncertainty
-and every place that is about as likely.
+Standard deviations and intervals of the values include the noise, the model's uncertainty and all
+positions that are about as likely.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from rigd.touch._explanations import (
     Explainer,
     Explanation,
 )
-from rigd.touch._physical import SOFTEST, STIFFEST, Touching, Window
+from rigd.touch._physical import SOFTEST, STIFFEST, Touching, WhitenedWindow
 from rigd.touch._posterior import Posterior
 from rigd.touch._results import Estimated, TouchEstimate
 
@@ -24,28 +24,28 @@ Real = NDArray[np.float64]
 
 _TWO_SIDED_95 = 1.959964
 _LEAST_STD_M = (3e-4, 5e-4)
-"""What the bounces of hard contacts leave unknown that no linear uncertainty shows, and near the
-tip: in 130 simulated touches the errors agree with the intervals if this is added."""
+"""Uncertainty from the bounces of hard contacts beyond the linear one, and near the tip. With this
+addition the errors of 130 simulated touches agree with the intervals."""
 _LEAST_OF_TWO_M = 2e-3
-"""What bounces leave unknown of the first of two, which are marched in longer steps."""
+"""The same for the first of two contacts, which are integrated in longer steps."""
 _EARLY_S = (0.006, 0.01, 0.022)
-"""After the detection: what a touch that nothing explains is compared with as well. Later a second
+"""Additional time after the detection with which an unexplained touch is compared. Later a second
 point may be touched."""
 _WIDE = 8.0
-"""Fall of the log-likelihood at the ends of an interval for a touch that nothing explains."""
+"""Drop of the log-likelihood at the ends of an interval for an unexplained touch."""
 
 
 def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEstimate:
-    """Say what the likeliest explanation tells, and of what kind the touch is.
+    """Return the estimate of the likeliest explanation, and the kind of touch.
 
     Parameters
     ----------
     explainer
-        Knows the record.
+        Explainer of the record.
     explained
-        What may explain it.
+        Its explanations.
     scan
-        Whether the likelihood of all places is wanted; without it, it is empty.
+        Whether to return the likelihood of all positions; else it is empty.
     """
     explanations, window = explained.explanations, explained.window
     rest = explanations[0]
@@ -65,7 +65,7 @@ def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEs
         doubtful = explained.later_doubtful or explained.untried if best is rest else poor
         if clear and not doubtful:
             kind = best.kind
-        x_m, time_s = _place(explainer, rivals), _known(rivals, 1, offset)
+        x_m, time_s = _position(explainer, rivals), _known(rivals, 1, offset)
         if poor or explained.untried:
             x_m = _widened(explainer, x_m)
         history, instants, force_n = _forces(explainer, best, window)
@@ -96,10 +96,10 @@ def answer(explainer: Explainer, explained: Explained, *, scan: bool) -> TouchEs
 
 
 def _roughly(explainer: Explainer) -> Estimated:
-    """Point of a touch that nothing explains: where any force could do it, early and later.
+    """Return the point of an unexplained touch: where any force could cause it, early and later.
 
-    More than one point may be touched by then, so what the first samples tell alone counts
-    too, and all with wide intervals.
+    Later more than one point may be touched, so the result of the first samples alone counts too,
+    and all with wide intervals.
     """
     early = [explainer.tables.blind.scan(explainer.window(seconds)) for seconds in _EARLY_S]
     ends = np.array([scan.interval(_WIDE)[2:] for scan in (explainer.blind, *early)])
@@ -107,34 +107,34 @@ def _roughly(explainer: Explainer) -> Estimated:
     return Estimated(explainer.blind.interval(_WIDE)[0], (high - low) / 4, (low, high))
 
 
-def _widened(explainer: Explainer, told: Estimated) -> Estimated:
-    """Widen the interval of a point to all where any force could be."""
+def _widened(explainer: Explainer, estimate: Estimated) -> Estimated:
+    """Widen the interval of a point to all positions at which any force could act."""
     *_, low, high = explainer.blind.interval()
-    low, high = min(low, told.interval_95[0]), max(high, told.interval_95[1])
-    return Estimated(told.value, max(told.std, (high - low) / 4), (low, high))
+    low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
+    return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
 
 
-def _place(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
-    """Point of touch, with what bounces leave unknown of it."""
-    told = _known(rivals, 0)
-    tip = told.value > NEAR_TIP * explainer.tables.model.beam.length_m
+def _position(explainer: Explainer, rivals: list[Explanation]) -> Estimated:
+    """Return the point of touch, with the additional uncertainty from bounces."""
+    estimate = _known(rivals, 0)
+    tip = estimate.value > NEAR_TIP * explainer.tables.model.beam.length_m
     least = _LEAST_OF_TWO_M if rivals[0].kind == "two" else _LEAST_STD_M[int(tip)]
     low, high = (
-        told.value + np.copysign(np.hypot(end - told.value, _TWO_SIDED_95 * least), sign)
-        for end, sign in zip(told.interval_95, (-1.0, 1.0), strict=True)
+        estimate.value + np.copysign(np.hypot(end - estimate.value, _TWO_SIDED_95 * least), sign)
+        for end, sign in zip(estimate.interval_95, (-1.0, 1.0), strict=True)
     )
     length = explainer.tables.model.beam.length_m
     return Estimated(
-        told.value,
-        float(np.hypot(told.std, least)),
+        estimate.value,
+        float(np.hypot(estimate.std, least)),
         (max(float(low), 0.0), min(float(high), length)),
     )
 
 
 def _forces(
-    explainer: Explainer, best: Explanation, window: Window
+    explainer: Explainer, best: Explanation, window: WhitenedWindow
 ) -> tuple[Real, Real, Estimated]:
-    """Force in time and its peak, over what is likely."""
+    """Return the force in time and its peak, over all likely candidates."""
     rng = np.random.default_rng(2)
     posterior = best.posterior
     some = rng.choice(posterior.weights.size, 48, p=posterior.weights)
@@ -156,12 +156,12 @@ def _forces(
         force = np.abs(touching.predicted(rows, window, side)[1])
         peaks = force.max(axis=1)
     low, high = np.quantile(peaks[1:], (0.025, 0.975))
-    told = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
-    return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), told
+    estimate = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
+    return force[0], rows[0, 1] + step_s * np.arange(force.shape[1]), estimate
 
 
 def _rivals(best: Explanation, other: Explanation) -> bool:
-    """Whether another explanation is about as likely: a parameter more must be worth its while."""
+    """Return whether another explanation is about as likely, with a penalty per parameter."""
     if best.kind == "rigid" and other.kind in ("moving", "yielding"):
         return other.chi2 < best.chi2 - DOUBTFUL
     if best.kind == "rigid" and other.kind == "two":
@@ -170,7 +170,7 @@ def _rivals(best: Explanation, other: Explanation) -> bool:
 
 
 def _known(rivals: list[Explanation], column: int, shift: float = 0.0) -> Estimated:
-    """Tell a parameter that all likely explanations share, with room for each."""
+    """Return a parameter that all likely explanations have, with an interval over all of them."""
     ends = np.array([each.posterior.quantiles(column, (0.025, 0.975)) for each in rivals])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     mean, std = rivals[0].posterior.mean(column), rivals[0].posterior.std(column)
@@ -180,7 +180,7 @@ def _known(rivals: list[Explanation], column: int, shift: float = 0.0) -> Estima
 
 
 def _stiffness(posterior: Posterior) -> Estimated | None:
-    """Stiffness if the data bound it on both sides; the mean is that of its logarithm."""
+    """Return the stiffness if the data bound it on both sides; the mean is over its logarithm."""
     low, middle, high = posterior.quantiles(2, (0.025, 0.5, 0.975))
     if high > STIFFEST - 0.7 or low < SOFTEST + 0.3 or high - low > np.log(100):
         return None

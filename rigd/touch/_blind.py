@@ -1,8 +1,8 @@
-"""Any force at one point: the likelihood of the point whatever the obstacle does.
+"""Any force at one point: the likelihood of the point for any behaviour of the obstacle.
 
 The force is white of unknown size (hats of half a sample), so torque and shear are Gaussian with a
-covariance that depends on the point; what decides is how both fit together. Works for obstacles
-that move, yield or come from outside as well as for springs, and tells less of each.
+covariance that depends on the point; the agreement of the two decides. This works for obstacles
+that move, yield or come from outside as well as for springs, with a larger uncertainty.
 """
 
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import Window
+from rigd.touch._physical import WhitenedWindow
 
 Real = NDArray[np.float64]
 
 _SIZES_N = np.array([0.1, 0.4, 1.6, 6.4])
-"""Standard deviations of the force, one of which is likely."""
+"""Candidate standard deviations of the force."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlindScan:
-    """Likelihood over the places."""
+    """Likelihood over the positions."""
 
     x_m: Real
-    """Places, shape (m,)."""
+    """Positions, shape (m,)."""
     log_likelihood: Real
-    """Value at each, the force's size being the likeliest, shape (m,)."""
+    """Log-likelihood at each, for the likeliest size of the force, shape (m,)."""
     chi2: float
-    """Sum of squared residuals at the best place in units of what its model expects."""
+    """Sum of squared residuals at the best position in units of its model's expectation."""
     degrees: int
-    """What that would be on average."""
+    """Its expectation."""
     force_n: Real
-    """Force on the beam at the best place, shape (2 · samples,)."""
+    """Force on the beam at the best position, shape (2 · samples,)."""
     force_std_n: float
-    """Size of the force assumed there."""
+    """Size of the force at that position."""
 
     def interval(self, drop: float = 1.92) -> tuple[float, float, float, float]:
-        """Best place, its standard deviation and the ends of the places not much less likely.
+        """Return the best position, its standard deviation and the ends of the likely positions.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class Blind:
     kernels
         Contact kernels with two steps a sample.
     every
-        Every so many of their places is scanned.
+        One in so many of their positions is scanned.
     samples
         Most samples.
     """
@@ -82,10 +82,10 @@ class Blind:
         self._effects = [
             np.where(lag >= 0, table[::every][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
             for table in (kernels.torque, kernels.shear)
-        ]  # (places, samples, forces)
+        ]  # (positions, samples, forces)
 
-    def scan(self, window: Window) -> BlindScan:
-        """Likelihood over the places.
+    def scan(self, window: WhitenedWindow) -> BlindScan:
+        """Return the likelihood over the positions.
 
         Parameters
         ----------
@@ -117,14 +117,14 @@ class Blind:
             diagonal = np.diagonal(factor, axis1=1, axis2=2)
             quadratic[i] = large - diagonal[:, n] ** 2
             found[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
-        size, place = np.unravel_index(np.argmax(found), found.shape)
+        size, position = np.unravel_index(np.argmax(found), found.shape)
         variance = _SIZES_N[size] ** 2
-        whole = variance * square[place] + np.eye(n)
-        force = variance * effects[place].T @ np.linalg.solve(whole, data)
+        whole = variance * square[position] + np.eye(n)
+        force = variance * effects[position].T @ np.linalg.solve(whole, data)
         return BlindScan(
             x_m=self._x_m,
             log_likelihood=found.max(axis=0),
-            chi2=float(quadratic[size, place]),
+            chi2=float(quadratic[size, position]),
             degrees=n,
             force_n=force,
             force_std_n=float(_SIZES_N[size]),

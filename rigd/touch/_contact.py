@@ -1,8 +1,8 @@
-"""Contact with a springy obstacle, marched in time for many candidates at once.
+"""Contact with a springy obstacle, integrated in time for many candidates at once.
 
-The obstacle presses with ``N = max(0, k · penetration)``; the beam gives way by its displacement
-kernel. Steps begin at the instant of touch, so that what is predicted depends smoothly on it, and
-the force of a step is found implicitly: a stiff obstacle is as stable as a soft one.
+The obstacle presses with ``N = max(0, k · penetration)``; the beam yields by its displacement
+kernel. Steps begin at the instant of touch, so that the prediction depends smoothly on it. The
+force of a step is implicit: a stiff obstacle is as stable as a soft one.
 """
 
 from typing import TypeVar
@@ -14,11 +14,11 @@ Real = NDArray[np.float64]
 _Precision = TypeVar("_Precision", np.float32, np.float64)
 
 _BLOCK, _SHORT_BLOCK = 16, 6
-"""Steps whose earlier forces are summed at once; between them a step costs three operations, on as
-many steps as remain in the block: shorter blocks for many candidates."""
+"""Steps whose earlier forces are summed at once. Between them a step costs three operations on the
+remaining steps of the block: shorter blocks suit many candidates."""
 _MANY = 1000
 _SAMPLES = 16
-"""Samples convolved at once, all with as much of the past as the last of them."""
+"""Samples convolved at once, all with the history of the last of them."""
 
 
 def march(
@@ -29,14 +29,14 @@ def march(
     rate_m_per_s: Real | float = 0.0,
     mobility_m_per_n_s: Real | float = 0.0,
 ) -> NDArray[_Precision]:
-    """Force with which the beam presses, at each step since the touch.
+    """Return the force with which the beam presses, at each step since the touch.
 
     Parameters
     ----------
     kernel
         Displacement in the direction of the force per hat of force, shape (k, n).
     approach
-        How far the beam would be beyond the place of touch without the force, shape (k, n), or
+        How far the beam would be beyond the point of touch without the force, shape (k, n), or
         (k, g, n) for g candidates of each kernel; the first of the n is 0.
     stiffness_n_per_m
         Stiffness of the obstacle, shape (k,) or (k, g).
@@ -45,16 +45,16 @@ def march(
     rate_m_per_s
         Speed of the obstacle away from the beam, shape (k,) or a number.
     mobility_m_per_n_s
-        Speed at which the obstacle gives way per force, likewise.
+        Speed at which the obstacle yields per force, likewise.
 
     Returns
     -------
     ndarray, shape of `approach`
-        Magnitude in N, 0 where they are apart.
+        Magnitude in N, 0 without contact.
     """
     shape = approach.shape
     kernels, steps = kernel.shape
-    # An obstacle that flees is a shorter approach, one that gives way a softer beam.
+    # An obstacle that moves away is a shorter approach; one that yields is a softer beam.
     if np.any(rate_m_per_s):
         fled = np.multiply.outer(np.asarray(rate_m_per_s) * step_s, np.arange(steps))
         approach = approach - fled.astype(approach.dtype)
@@ -62,7 +62,7 @@ def march(
         given = np.asarray(mobility_m_per_n_s, kernel.dtype) * step_s
         kernel = kernel + given[..., None]
     stiffness = stiffness_n_per_m.reshape(kernels, -1)
-    # What the force of a step would be without earlier ones: (n, k, g).
+    # Force of a step without earlier ones: (n, k, g).
     gives = stiffness / (1 + stiffness * kernel[:, :1])
     wanted = approach.reshape(kernels, -1, steps).transpose(2, 0, 1) * gives
     group = stiffness.shape[1]
@@ -70,7 +70,7 @@ def march(
     # The latest lag comes first, so that a product of two rows is the convolution.
     reverse = np.ascontiguousarray(kernel[:, ::-1])
     row, column = reverse.strides
-    # Within a block each force is taken from the steps behind it. All views are made once.
+    # Within a block each force is subtracted from the later steps. All views are made once.
     width = _BLOCK if kernels * group < _MANY else _SHORT_BLOCK
     inside, bent = np.zeros((2, width, kernels * group), wanted.dtype)
     within = np.zeros((width - 1, kernels * group), wanted.dtype)
@@ -86,7 +86,7 @@ def march(
         end = min(begin + width, steps)
         part = wanted[begin:end]
         if touched < begin:
-            # Element (k, i, j): what force touched + j does at step begin + i.
+            # Element (k, i, j): effect of the force touched + j at step begin + i.
             effect = np.ndarray(
                 (kernels, end - begin, begin - touched),
                 reverse.dtype,
@@ -101,7 +101,7 @@ def march(
                 before = np.ascontiguousarray(effect) @ earlier
             part = part - before.transpose(1, 0, 2) * gives
         if not part.max() > 0:
-            continue  # nobody is in contact
+            continue  # no candidate is in contact
         touched = min(touched, begin)
         inside[: end - begin] = part.reshape(end - begin, -1)
         for now, lag, product, later in views:
@@ -124,11 +124,11 @@ def march_two(
     Parameters
     ----------
     own
-        Displacement at each place per hat of force there, shape (k, n).
+        Displacement at each position per hat of force there, shape (k, n).
     cross
-        Displacement at one place per hat of force at the other, in the directions of the forces.
+        Displacement at one position per hat of force at the other, in the directions of the forces.
     approach
-        How far the beam would be beyond each place without any force, shape (k, n); none at the
+        How far the beam would be beyond each position without any force, shape (k, n); none at the
         first step.
     stiffness_n_per_m
         Stiffness of each obstacle, shape (k,).
@@ -136,15 +136,15 @@ def march_two(
     Returns
     -------
     tuple of ndarray, shape (k, n)
-        Magnitude in N, 0 where they are apart.
+        Magnitude in N, 0 without contact.
     """
     count, steps = cross.shape
-    # What the force of a step would be without all others, (n, 2, k).
+    # Force of a step without all others, (n, 2, k).
     gives = np.stack(
         [k / (1 + k * kernel[:, 0]) for k, kernel in zip(stiffness_n_per_m, own, strict=True)]
     )
     wanted = np.stack([each.T for each in approach], axis=1) * gives
-    # Forces lessen each other's by so much, by the lag; axes: lag, lessened, lessening.
+    # Reduction of one force by another, by the lag; axes: lag, reduced, reducing.
     kernel = np.empty((steps, 2, 2, count))
     kernel[:, 0, 0], kernel[:, 1, 1] = own[0].T, own[1].T
     kernel[:, 0, 1] = kernel[:, 1, 0] = cross.T
@@ -162,7 +162,7 @@ def march_two(
         part = inside[: end - begin]
         part[:] = wanted[begin:end]
         if begin > 1:
-            # Element (k, a, b, i, j): what the force of step 1 + j at b does at a, step begin + i.
+            # Element (k, a, b, i, j): effect of the force of step 1 + j at b on a, step begin + i.
             effect = np.ndarray(
                 (count, 2, 2, end - begin, begin - 1),
                 buffer=reverse,
@@ -173,7 +173,7 @@ def march_two(
             part -= before.transpose(2, 1, 0)
         for i, now in enumerate(part):
             first, second = now
-            # The second's if both press; then the first's, which is right in any case.
+            # The second force if both press; then the first one, which is right in any case.
             pressing = np.maximum((second - by_first * first) * both, 0.0)
             np.maximum(first - by_second * pressing, 0.0, out=first)
             np.maximum(second - by_first * first, 0.0, out=second)
@@ -188,34 +188,34 @@ def march_two(
 
 
 def shifted(table: Real, begin: Real, count: int) -> Real:
-    """Values of each row from a place between its columns on (cubic, four points).
+    """Return each row from a position between its columns on (cubic, four points).
 
-    Before the first column they are 0, behind the last one they are held.
+    Before the first column the values are 0; after the last one they are constant.
 
     Parameters
     ----------
     table
         Shape (k, n).
     begin
-        Column at which the first value is taken, shape (k,).
+        Column of the first value, shape (k,).
     count
-        How many values, one column apart.
+        Number of values, one column apart.
     """
     whole = np.floor(begin).astype(np.intp)
     u = (begin - whole)[:, None]
     rows, columns = table.shape
-    whole = np.clip(whole, -count - 2, columns + 1)  # farther off it is the same
+    whole = np.clip(whole, -count - 2, columns + 1)  # farther off the result is the same
     before = max(0, 1 - int(whole.min()))
     behind = max(0, int(whole.max()) + count + 2 - columns)
     held = np.empty((rows, before + columns + behind))
     held[:, :before], held[:, before : before + columns] = 0.0, table
     held[:, before + columns :] = table[:, -1:]
-    # Row k of what is taken: held[k, begin : begin + count + 3], copied in one piece.
+    # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
     step, row = held.strides[1], held.strides[0]
-    pieces = np.ndarray(
+    blocks = np.ndarray(
         (rows, held.shape[1] - count - 2, count + 3), buffer=held, strides=(row, step, step)
     )
-    near = pieces[np.arange(rows), whole - 1 + before]
+    near = blocks[np.arange(rows), whole - 1 + before]
     value = near[:, :count] * (-u * (u - 1) * (u - 2) / 6)
     value += near[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
     value += near[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)
@@ -233,9 +233,9 @@ def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) 
     force
         Force at each step, shape (k, (samples - 1) · every + 1).
     every
-        Steps between two samples, the first of which is the first step.
+        Steps between two samples; the first sample is at the first step.
     samples
-        How many.
+        Number of samples.
     """
     candidates, steps = force.shape
     tables = np.stack(kernels, axis=1)
@@ -244,11 +244,11 @@ def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) 
         lag = every * np.arange(samples) - np.arange(steps)[:, None]
         table = np.where((lag >= 0) & (lag < length), tables[0][:, np.clip(lag, 0, length - 1)], 0)
         return (force @ table).transpose(1, 0, 2)
-    # The latest force first, and zeros before the first one: each sample's part in one piece.
+    # The latest force first, and zeros before the first one: each sample uses one block.
     reverse = np.zeros((candidates, steps + length))
     reverse[:, :steps] = force[:, ::-1]
     row, column = reverse.strides
-    told = np.empty((candidates, len(kernels), samples))
+    summed = np.empty((candidates, len(kernels), samples))
     for first in range(0, samples, _SAMPLES):
         end = min(first + _SAMPLES, samples)
         reach = min(length, (end - 1) * every + 1)
@@ -258,5 +258,5 @@ def responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) 
             offset=(steps - 1 - first * every) * column,
             strides=(row, 0, -every * column, column),
         )
-        told[:, :, first:end] = np.vecdot(tables[:, :, None, :reach], view)
-    return told
+        summed[:, :, first:end] = np.vecdot(tables[:, :, None, :reach], view)
+    return summed

@@ -2,10 +2,10 @@
 
 The innovations of the last ticks are compared with the signatures of touches. Each comparison is a
 product with a unit vector: a normal deviate of standard deviation 1 in white noise, and the largest
-that any linear test can make of a touch of that place, shape and age. The tail of the normal
-distribution sets the threshold for a stated rate of false alarms. The model's error is allowed for
-by a share of the torque and shear that it predicts, and by how large the comparisons of the last
-moments have been: where a chirp passes a mode that is not quite where the model has it, they grow.
+of any linear test for a touch of that position, shape and age. The tail of the normal distribution
+sets the threshold for a stated rate of false alarms. Two terms allow for the model's error: a
+fraction of the predicted torque and shear, and the recent size of the comparisons, which grow where
+a chirp passes a mode whose frequency is slightly wrong.
 
 References
 ----------
@@ -27,22 +27,22 @@ from rigd.touch._signatures import WatchedBeam
 Real = NDArray[np.float64]
 
 _INDEPENDENT: Final = 0.5
-"""Independent comparisons among the signatures, which overlap, as a share: measured at 4 to 5
-standard deviations."""
+"""Fraction of independent comparisons among the overlapping signatures, measured at 4 to 5 standard
+deviations."""
 _AGE_TICKS: Final = 8
-"""Ticks over which an error of the model is taken to add up."""
+"""Ticks over which an error of the model is assumed to add up."""
 _RECENT: Final = 1 / 600
-"""Share of a tick in the mean square of the last moments, as far back as a touch may have begun."""
+"""Weight of a tick in the recent mean square, which covers the longest time of a touch so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """How sure the detector has to be."""
+    """Sensitivity of the detector."""
 
     false_alarms_per_hour: float = 0.02
     """Expected number in white noise."""
     model_tolerance: float = 0.01
-    """Share of the predicted torque and shear that is taken to be the model's error."""
+    """Fraction of the predicted torque and shear that is assumed as the model's error."""
 
     def threshold(self, rate_hz: float, signatures: int) -> float:
         """Return the level, in standard deviations, that a comparison must exceed.
@@ -52,7 +52,7 @@ class DetectorSettings:
         rate_hz
             Ticks a second.
         signatures
-            How many comparisons there are in a tick.
+            Number of comparisons in a tick.
 
         Examples
         --------
@@ -67,8 +67,8 @@ class DetectorSettings:
 class TouchDetector:
     """Watches a record for touches.
 
-    Until `arm` is first called it measures the innovations of the beam at rest: by them, and not by
-    the noise that the model was designed with, it judges from then on.
+    Until the first `arm` it measures the innovations of the beam at rest. These, not the noise for
+    which the model was designed, are the reference afterwards.
 
     Parameters
     ----------
@@ -77,12 +77,12 @@ class TouchDetector:
     rate_hz
         Ticks a second.
     settings
-        How sure it has to be.
+        Sensitivity.
 
     Attributes
     ----------
     level
-        Largest comparison over what is allowed, at the last tick; above 1: touched.
+        Largest comparison over its limit, at the last tick; above 1: touched.
     noise
         Standard deviations of the whitened innovations of torque and shear at rest, once armed.
     """
@@ -95,8 +95,8 @@ class TouchDetector:
         "_last",
         "_mean_squares",
         "_measuring",
-        "_place",
         "_recent",
+        "_slot",
         "_squares",
         "_threshold",
         "_ticks",
@@ -115,21 +115,21 @@ class TouchDetector:
         self._measuring = True
         self._squares = [0.0, 0.0]
         self._ticks = 0
-        # Single precision: in each tick half as much memory has to come back into the cache.
+        # Single precision: half as much memory to load into the cache in each tick.
         self._compare = np.asfortranarray(signatures, np.float32).dot
         self._compared = np.empty(len(signatures), np.float32)
-        # The last innovations stand twice in a ring, so that they always lie in one piece.
+        # The last innovations are stored twice in a ring, so that they are always contiguous.
         width = signatures.shape[1]
         self._last = np.zeros(2 * width, np.float32)
         self._windows = [self._last[start : start + width] for start in range(2, width + 2, 2)]
-        self._place = 0
+        self._slot = 0
         self._mean_squares = [1.0] * len(self._windows)
         self._recent = 1.0
         self.noise = (1.0, 1.0)
         self.level = 0.0
 
     def arm(self) -> None:
-        """Judge from the next tick on, by what comes from then on."""
+        """Start the detection with the next tick."""
         if self._ticks:
             torque, shear = (sqrt(square / self._ticks) for square in self._squares)
             self.noise = torque or 1.0, shear or 1.0
@@ -142,12 +142,12 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Go on following the beam, but judge no more."""
+        """Continue to follow the beam without detection."""
         self._armed = False
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:
-        """Return the shear of the last tick less that of the free beam: about the contact force.
+        """Return the shear of the last tick minus that of the free beam: about the contact force.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class TouchDetector:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> bool:
-        """Take the readings of a tick, see `InnovationFilter.step`; say whether it is a touch.
+        """Process the readings of a tick; return whether there is a touch.
 
         Parameters
         ----------
@@ -190,23 +190,23 @@ class TouchDetector:
                 self._ticks += 1
             return False
         torque_noise, shear_noise = self.noise
-        last, place = self._last, self._place
+        last, slot = self._last, self._slot
         half = last.size >> 1
-        last[2 * place] = last[2 * place + half] = torque / torque_noise
-        last[2 * place + 1] = last[2 * place + 1 + half] = shear / shear_noise
+        last[2 * slot] = last[2 * slot + half] = torque / torque_noise
+        last[2 * slot + 1] = last[2 * slot + 1 + half] = shear / shear_noise
         compared, mean_squares = self._compared, self._mean_squares
-        self._compare(self._windows[place], compared)
-        # A touch must not raise the level against itself: those that reach back to it wait.
-        self._recent += _RECENT * (mean_squares[place] - self._recent)
-        mean_squares[place] = float(compared.dot(compared)) / compared.size
-        self._place = place + 1 if place + 1 < len(self._windows) else 0
+        self._compare(self._windows[slot], compared)
+        # A touch must not raise its own threshold: comparisons that may include it wait.
+        self._recent += _RECENT * (mean_squares[slot] - self._recent)
+        mean_squares[slot] = float(compared.dot(compared)) / compared.size
+        self._slot = slot + 1 if slot + 1 < len(self._windows) else 0
         u, v = filter_.predicted
         u /= torque_noise
         v /= shear_noise
-        # Their places are found in a third of the time of the values.
+        # Finding their indices takes a third of the time of finding the values.
         largest = max(compared[compared.argmax()], -compared[compared.argmin()])
         error2 = self._tolerance2 * (u * u + v * v)
-        # Not its root: an error that is growing is larger than it was in the moments before.
+        # Not its root: a growing error is larger than in the moments before.
         excess = max(1.0, self._recent) * sqrt(1.0 + error2)
         self.level = float(largest) / (self._threshold * excess)
         return self.level > 1.0

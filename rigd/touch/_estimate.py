@@ -1,7 +1,7 @@
-"""Where, when and how hard the antenna has touched something: from a record to the answer.
+"""Position, instant and force of a touch, from its record.
 
-The touch began some time before it was noticed. The shortest time that may hold it is tried first:
-the samples before it tell how the free beam moves.
+The touch began some time before its detection. The shortest possible time is tried first: the
+samples before it determine the motion of the free beam.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from rigd.touch._results import TouchEstimate
 from rigd.touch._tables import NOTICED_S, Tables
 
 _LEAST_QUIET = 100
-"""Samples before a touch without which nothing can be told."""
+"""Samples before a touch without which no estimate is possible."""
 _HOPELESS = 3.0
-"""Beyond so much per sample that an obstacle at rest leaves, the touch may have begun earlier."""
+"""Above this misfit per sample of an obstacle at rest, the touch may have begun earlier."""
 
 
 def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
@@ -33,7 +33,7 @@ def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
 
 
 class TouchEstimator:
-    """Estimates touches with one model; it takes a second to prepare.
+    """Estimates touches with one model; its preparation takes a second.
 
     Parameters
     ----------
@@ -50,32 +50,32 @@ class TouchEstimator:
         self._tables = Tables(model, rate_hz)
 
     def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
-        """Estimate one touch from what of the record is there.
+        """Estimate one touch from the samples so far.
 
         Parameters
         ----------
         record
-            Samples from 0.3 s or more before the touch; the more after the detection, the better
-            is the answer, up to 0.2 s.
+            Samples from 0.3 s or more before the touch; more samples after the detection improve
+            the answer, up to 0.2 s.
         scan
-            Whether the likelihood of all places is wanted; without it, it is empty.
+            Whether to return the likelihood of all positions; else it is empty.
         """
         return self.follow().told(record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return what estimates one touch while its record grows."""
+        """Return an estimate of one touch that is updated while its record grows."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Estimates of one touch, each of which goes on from the one before.
+    """Successive estimates of one touch, each of which continues from the previous one.
 
-    All records that it is given begin with the same sample.
+    All its records begin with the same sample.
 
     Parameters
     ----------
     tables
-        What depends on the model and the rate.
+        Tables of the model at this rate.
     """
 
     __slots__ = ("_earlier", "_explained_by", "_tables")
@@ -86,7 +86,7 @@ class GrowingEstimate:
         self._explained_by: float | None = None
 
     def look(self, record: TouchRecord) -> None:
-        """Look where the touch may be: that much of the first estimate is done then.
+        """Search the possible positions in advance, as part of the first estimate.
 
         Parameters
         ----------
@@ -100,53 +100,53 @@ class GrowingEstimate:
                 return
 
     def told(self, record: TouchRecord, *, scan: bool = True, first: bool = False) -> TouchEstimate:
-        """Estimate the touch from what of the record is there.
+        """Estimate the touch from the samples so far.
 
         Parameters
         ----------
         record
             Samples from 0.3 s or more before the touch.
         scan
-            Whether the likelihood of all places is wanted; without it, it is empty.
+            Whether to return the likelihood of all positions; else it is empty.
         first
-            Whether a first answer is wanted: what one or two obstacles at rest do not explain is of
-            unknown kind in it, since to try others takes a second.
+            Whether this is the first answer: it tries one and two obstacles at rest only, and
+            reports any other touch as of unknown kind, since other kinds take a second.
         """
-        told = None
+        result = None
         searched = record.angle_rad.size
-        # What has explained the beginning comes first.
+        # The start that explained the beginning comes first.
         for noticed_s in sorted(NOTICED_S, key=lambda each: each != self._explained_by):
             if not self._reaches(record, noticed_s):
                 continue
             here = self._explainer(record, noticed_s)
             if noticed_s != self._explained_by and (
-                # After one in which nothing explains the touch, only if it may have been before.
+                # After an unexplained one, only if the touch may have begun before.
                 here.seems_to_begin >= searched or self._began_earlier(record, noticed_s)
             ):
                 continue
             found = answer(here, here.explain(first=first), scan=scan)
-            if told is None or found.explained:
-                told = found
+            if result is None or found.explained:
+                result = found
             if found.explained:
                 self._explained_by = noticed_s
             if found.explained or first:
                 break
             searched = here.first
-        return told or self._untold(record)
+        return result or self._without_answer(record)
 
     def _reaches(self, record: TouchRecord, noticed_s: float) -> bool:
-        """Whether there are enough samples of the free beam."""
+        """Return whether there are enough samples of the free beam."""
         return record.detected - round(noticed_s * self._tables.rate_hz) >= _LEAST_QUIET
 
     def _explainer(self, record: TouchRecord, noticed_s: float) -> Explainer:
-        """Return the one for a record, which goes on from that for the record before."""
+        """Return the explainer of a record, which continues from that of the previous record."""
         earlier = self._earlier.get(noticed_s)
         if earlier is None or earlier.given is not record:
             self._earlier[noticed_s] = Explainer(self._tables, record, noticed_s, earlier)
         return self._earlier[noticed_s]
 
     def _began_earlier(self, record: TouchRecord, noticed_s: float) -> bool:
-        """Whether the touch seems to be before the samples that may hold it."""
+        """Return whether the touch seems to begin before the samples that may contain it."""
         if noticed_s == NOTICED_S[-1]:
             return False
         here = self._explainer(record, noticed_s)
@@ -158,8 +158,8 @@ class GrowingEstimate:
         longer = self._explainer(record, longer_s)
         return longer.seems_to_begin < here.first and longer.misfit < 0.5 * here.misfit
 
-    def _untold(self, record: TouchRecord) -> TouchEstimate:
-        """Too few samples before the touch."""
+    def _without_answer(self, record: TouchRecord) -> TouchEstimate:
+        """Return the empty estimate for too few samples before the touch."""
         nothing = np.zeros(0)
         channels = 1 if record.shear_n is None else 2
         return TouchEstimate(

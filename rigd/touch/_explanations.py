@@ -1,8 +1,8 @@
-"""What explains the record of one touch: candidates of each kind, and what they leave of it.
+"""Explanations of the record of one touch: candidates of each kind, and their residuals.
 
-Innovations of torque and base shear are explained by a springy obstacle at rest, marched through
-its bounces; beside it stand two obstacles, those that move or give way, a knock, and any force at
-all. What of them is told is decided elsewhere (`_answer`).
+A springy obstacle at rest, integrated in time through its bounces, explains the innovations of
+torque and base shear. Alternatives are two obstacles, those that move or yield, a knock, and any
+force at all. `_answer` decides which of them are reported.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from rigd.touch._physical import (
     Prediction,
     Space,
     Touching,
-    Window,
+    WhitenedWindow,
     chi2_of,
     descend,
 )
@@ -35,53 +35,53 @@ from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 Real = NDArray[np.float64]
 
 _STAGES_S = (FIRST_S, 0.1, FINAL_S)
-"""After the detection: what is explained, the longest only if an obstacle at rest explains the
-shorter ones and the point is not well known yet."""
+"""Times after the detection to be explained; the longest only if an obstacle at rest explains the
+shorter ones and the point is still uncertain."""
 _COVERED_S = 0.1
-"""After the detection: so far the effects of what is uncertain are taken along at once."""
+"""Time after the detection up to which the effects of all uncertainties are included at once."""
 _WORTH = 1.2
-"""So many times the samples are worth another stage."""
+"""A further stage requires this factor in the number of samples."""
 _WELL_KNOWN_M = 2e-3
 _CLOUD = 96
-"""Starts for a longer part of the record, from what a shorter one leaves likely."""
+"""Starts for a longer part of the record, from the posterior of a shorter one."""
 NEAR_TIP = 0.8
-"""Share of the length beyond which contacts are shorter, and steps finer."""
-_BESIDE_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+"""Fraction of the length beyond which contacts are shorter, and steps finer."""
+_NEARBY_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
 _AT_TIP = 0.95
-"""Beyond this share a longer record tells no more: its many short contacts fit anywhere."""
+"""Beyond this fraction a longer record adds nothing: its many short contacts fit anywhere."""
 
 _LEAST_SCALE = 1.2
-"""Variance of the residuals at least assumed: the noise itself is known from few samples."""
+"""Least assumed variance of the residuals: the noise itself is estimated from few samples."""
 _DOUBT_OF_TWO = 4.0
-"""The sum of squared residuals of two obstacles that clearly explain more than one counts so many
-times less: which of their several minima is the lowest, the errors of the model decide."""
+"""Where two obstacles clearly explain more than one, the sum of squared residuals is divided by
+this: the errors of the model decide which of the several minima is the lowest."""
 CLEAR = 16.0
 """Difference in the sum of squared residuals that decides between two kinds."""
 DOUBTFUL = 9.0
-"""By so much less, that of an obstacle that moves or gives way leaves open whether it is at rest:
-one that is at rest gains that much by chance in one of a hundred touches."""
+"""Reduction by a moving or yielding obstacle up to which one at rest stays possible: an obstacle at
+rest gains that much by chance in one of a hundred touches."""
 _POSSIBLE = 5.0
-"""By so much less, that of two obstacles leaves open where the point is."""
+"""Reduction by two obstacles up to which the point stays uncertain."""
 _HOPEFUL = 0.8
-"""By so much less, after a few iterations, two obstacles are worth more of them."""
+"""Reduction after a few iterations from which two obstacles get more of them."""
 _WORSE = 3.5
-"""By so many standard deviations may the sum of squared residuals exceed its expectation."""
+"""Standard deviations by which the sum of squared residuals may exceed its expectation."""
 POOR = 2.0
-"""Beyond so many the explanation may be the wrong one: other kinds are tried, and the point gets
-the interval that any force leaves it."""
+"""Standard deviations beyond which the explanation may be wrong: other kinds are tried, and the
+interval of the point is that for any force."""
 _WORSE_LATER = 2.5
-"""The same for what a longer record adds. Bounces make much of small errors of the model: where the
-later ones are explained less well, what the first told is nearer to the truth."""
+"""The same for the addition of a longer record. Bounces amplify small errors of the model: where
+the later ones are explained less well, the first result is closer to the truth."""
 
 _RATES_M_PER_S = np.array([-1.5, -0.7, -0.3, -0.1, 0.1, 0.25, 0.5])
 _MOBILITIES = np.array([0.01, 0.04, 0.15, 0.6])
 _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
-"""Starts of obstacles that move (m/s) or give way (m/s per N), and their stiffnesses."""
+"""Starts of obstacles that move (m/s) or yield (m/s per N), and their stiffnesses."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """The best that obstacles of one kind make of the record."""
+    """Best explanation of the record by obstacles of one kind."""
 
     kind: str
     posterior: Posterior
@@ -91,16 +91,16 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """What may explain a record, and how far."""
+    """Possible explanations of a record, and their range."""
 
     explanations: list[Explanation]
     """An obstacle at rest comes first."""
-    window: Window
-    """The part of the record that they explain."""
+    window: WhitenedWindow
+    """The explained part of the record."""
     later_doubtful: bool
-    """Later samples, which are left out, speak against an obstacle at rest."""
+    """Whether the later samples, which are left out, contradict an obstacle at rest."""
     untried: bool
-    """Another kind may be likelier, but none was tried."""
+    """Whether another kind may be likelier, but none was tried."""
 
 
 class Explainer:
@@ -109,13 +109,13 @@ class Explainer:
     Parameters
     ----------
     tables
-        What depends on the model and the rate.
+        Tables of the model at this rate.
     record
         Samples from 0.3 s or more before the touch.
     noticed_s
-        The touch was noticed at most so long after it.
+        Longest time from the touch to its detection.
     earlier
-        What explained the beginning of the same record: its results are gone on from.
+        Explainer of the beginning of the same record; its results are the starting point.
     """
 
     def __init__(
@@ -150,27 +150,27 @@ class Explainer:
 
     @property
     def first(self) -> int:
-        """The first sample of the record that may hold the touch."""
+        """First sample of the record that may contain the touch."""
         return self.begin + self.quiet
 
     @property
     def begins_too_late(self) -> bool:
-        """Whether the touch seems to be before the samples that may hold it."""
+        """Whether the touch seems to begin before the samples that may contain it."""
         return bool(self.starts[0, 1] < self.motion.t[self.quiet] + 2.5 / self.rate)
 
     @property
     def seems_to_begin(self) -> int:
-        """Sample of the record before which the likeliest touch of the first look begins."""
+        """Sample before which the likeliest touch of the first grid search begins."""
         after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
         return self.first + round(after_s * self.rate)
 
     @property
     def misfit(self) -> float:
-        """What an obstacle at rest leaves of the first samples, by what noise would leave."""
+        """Residual of an obstacle at rest in the first samples, relative to the noise's."""
         return float(self._descended.chi2.min() / self._first_samples.data.size)
 
     def explain(self, *, first: bool) -> Explained:
-        """Explain the record by obstacles at rest and, unless it is the `first` time, by others."""
+        """Explain the record by obstacles at rest and, except the `first` time, by other kinds."""
         rest, window, two, later_doubtful = self._over_stages()
         explanations = [rest]
         untried = False
@@ -186,28 +186,28 @@ class Explainer:
             explanations.append(two)
         return Explained(explanations, window, later_doubtful=later_doubtful, untried=untried)
 
-    def _over_stages(self) -> tuple[Explanation, Window, Explanation | None, bool]:
+    def _over_stages(self) -> tuple[Explanation, WhitenedWindow, Explanation | None, bool]:
         """Explain longer and longer parts of the record by an obstacle at rest.
 
-        Returns what the longest one tells that is explained, or else the first one that is not, and
-        that part; two obstacles, if they explain one that a single one does not; and whether what
-        follows speaks against it.
+        Returns the explanation of the longest explained part, or else the first failed one, and
+        that part; two obstacles, if they explain a part that a single one does not; and whether the
+        following samples contradict it.
         """
         available_s = self.available / self.rate
         stages = [seconds for seconds in _STAGES_S if _WORTH * seconds <= available_s]
         stages.append(available_s)
-        before: tuple[Explanation, Window] | None = None
+        before: tuple[Explanation, WhitenedWindow] | None = None
         if self._at_rest is None:
-            starts = self._beside(_distinct(self._descended))
+            starts = self._with_neighbours(_distinct(self._descended))
         else:
-            rest, told_s = self._at_rest
-            stages = [seconds for seconds in stages if seconds > told_s]
+            rest, explained_s = self._at_rest
+            stages = [seconds for seconds in stages if seconds > explained_s]
             starts = self._further(rest)
-            self._take_along(starts, max([told_s, *stages[:1]]))
-            window = self.window(told_s)
+            self._take_along(starts, max([explained_s, *stages[:1]]))
+            window = self.window(explained_s)
             [chi2] = chi2_of(self.predicting(starts[:1]), window, starts[:1])
             before = replace(rest, chi2=float(chi2)), window
-            if self._enough(*before, told_s):
+            if self._enough(*before, explained_s):
                 stages = []
         for seconds in stages:
             self._take_along(starts, seconds)
@@ -217,7 +217,7 @@ class Explainer:
                 two = self._two(rest, window)
                 if two is not None and self.fits(two, window, POOR):
                     return rest, window, two, False
-                # Of still later bounces the search may miss the minimum: they speak of no kind.
+                # In still later bounces the search may miss the minimum: they decide no kind.
                 doubtful = seconds <= _COVERED_S and self._changes(rest, window)
                 return *before, None, doubtful
             before = rest, window
@@ -225,20 +225,20 @@ class Explainer:
             if self._enough(rest, window, seconds):
                 break
             starts = self._further(rest)
-        assert before is not None  # there is one stage at least, or one of before
+        assert before is not None  # there is at least one stage, or an earlier one
         return *before, None, False
 
-    def _enough(self, rest: Explanation, window: Window, seconds: float) -> bool:
-        """Whether a longer part of the record would tell no more."""
-        place = rest.posterior.mean(0)
-        known = rest.posterior.std(0) < _WELL_KNOWN_M or place > _AT_TIP * self.edges[1]
+    def _enough(self, rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
+        """Return whether a longer part of the record would add nothing."""
+        x_m = rest.posterior.mean(0)
+        known = rest.posterior.std(0) < _WELL_KNOWN_M or x_m > _AT_TIP * self.edges[1]
         return seconds > FIRST_S and bool(known or not self.fits(rest, window))
 
     def _take_along(self, likeliest: Real, seconds: float) -> None:
-        """Know what is uncertain of so long a part of the record."""
+        """Include the uncertainties for this length of the record."""
         if self._covered_s < seconds:
             self._covered_s = min(max(seconds, _COVERED_S), self.available / self.rate)
-            whole = Window.of(self.motion, self.quiet, self.end(self._covered_s))
+            whole = WhitenedWindow.of(self.motion, self.quiet, self.end(self._covered_s))
             self.deviations = deviations(self.tables, self.record, likeliest[:1], whole)
 
     def _further(self, rest: Explanation) -> Real:
@@ -247,21 +247,21 @@ class Explainer:
 
     @cached_property
     def blind(self) -> BlindScan:
-        """Any force in the first samples: it takes as long as the rest of an estimate from them."""
+        """Likelihood of any force in the first samples; takes as long as the remaining estimate."""
         return self.tables.blind.scan(self.window(FIRST_S))
 
-    # What candidates are compared with
+    # Data for the comparison of candidates
 
-    def window(self, seconds: float) -> Window:
-        """Return the samples from before the touch to so long after the detection."""
-        return Window.of(self.motion, self.quiet, self.end(seconds), self.deviations)
+    def window(self, seconds: float) -> WhitenedWindow:
+        """Return the samples from before the touch to a time after the detection."""
+        return WhitenedWindow.of(self.motion, self.quiet, self.end(seconds), self.deviations)
 
     def end(self, seconds: float) -> int:
-        """Return the sample so long after the detection, or the end of the record."""
+        """Return the sample at a time after the detection, or the end of the record."""
         return self.detected + min(self.available, round(seconds * self.rate))
 
     def space(self, width: int) -> Space:
-        """Ranges of `PARAMETERS`."""
+        """Return the ranges of `PARAMETERS`."""
         t = self.motion.t
         return Space(
             low=np.array([self.edges[0], t[self.quiet + 1], SOFTEST, -3.0, 0.0])[:width],
@@ -273,9 +273,9 @@ class Explainer:
         )
 
     def predicting(self, rows: Real, *, first: bool = False) -> Prediction:
-        """March with short steps, near the tip with half as long ones: contacts are shorter there.
+        """Return the prediction in short steps, half as long near the tip: contacts are shorter.
 
-        `first`: elsewhere twice as long ones to begin with.
+        `first`: elsewhere twice as long steps for the beginning.
         """
         tables = self.tables
         tip = bool(np.median(rows[:, 0]) > NEAR_TIP * tables.model.beam.length_m)
@@ -286,7 +286,7 @@ class Explainer:
     # Springy obstacle at rest
 
     def _best_of_grid(self) -> Real:
-        """Return the likeliest candidates of the grid, some of each place."""
+        """Return the likeliest candidates of the grid, some of each position."""
         window = self.window(GRID_S)
         grid = self.tables.starts(window.end - window.first)
         starts, chi2 = grid.marched(self.motion, window, self.detected)
@@ -296,13 +296,13 @@ class Explainer:
         return best
 
     @cached_property
-    def _first_samples(self) -> Window:
-        """What candidates of the grid are compared with: nothing uncertain is known of by then."""
-        return Window.of(self.motion, self.quiet, self.end(FIRST_S))
+    def _first_samples(self) -> WhitenedWindow:
+        """Samples for the candidates of the grid: their uncertainties are not included yet."""
+        return WhitenedWindow.of(self.motion, self.quiet, self.end(FIRST_S))
 
     @cached_property
     def starts(self) -> Real:
-        """The likeliest candidates of the grid, after a second look."""
+        """The likeliest candidates of the grid, compared over more samples."""
         coarse = Touching(self.tables.coarse, self.tables.x_m, self.motion)
         again = chi2_of(
             lambda rows, window: coarse.predicted(rows, window)[0],
@@ -313,20 +313,20 @@ class Explainer:
 
     @cached_property
     def _descended(self) -> Descended:
-        """Where they lead, in longer steps."""
+        """Minima from these starts, in longer steps."""
         predict = self.predicting(self.starts, first=True)
         return descend(predict, self._first_samples, self.starts, self.space(3), rounds=7)
 
-    def _beside(self, starts: Real) -> Real:
-        """Add starts beside the best ones near the tip, where the minima stand close together."""
+    def _with_neighbours(self, starts: Real) -> Real:
+        """Add starts near the best ones close to the tip, where the minima are close together."""
         if np.median(starts[:, 0]) <= NEAR_TIP * self.tables.model.beam.length_m:
             return starts
-        beside = np.repeat(starts[None, :2], _BESIDE_M.size, axis=0)
-        beside[:, :, 0] = np.clip(beside[:, :, 0] + _BESIDE_M[:, None], *self.edges)
-        return np.vstack([starts, beside.reshape(-1, starts.shape[1])])
+        nearby = np.repeat(starts[None, :2], _NEARBY_M.size, axis=0)
+        nearby[:, :, 0] = np.clip(nearby[:, :, 0] + _NEARBY_M[:, None], *self.edges)
+        return np.vstack([starts, nearby.reshape(-1, starts.shape[1])])
 
     def _cloud(self, posterior: Posterior) -> Real:
-        """Candidates of a longer window, from what a shorter one leaves likely."""
+        """Return candidates for a longer window, from the posterior of a shorter one."""
         rng = np.random.default_rng(1)
         chosen = posterior.samples[rng.choice(posterior.weights.size, _CLOUD, p=posterior.weights)]
         width = chosen.shape[1]
@@ -337,9 +337,9 @@ class Explainer:
         )
 
     def explained(
-        self, kind: str, predict: Prediction, window: Window, starts: Real, space: Space
+        self, kind: str, predict: Prediction, window: WhitenedWindow, starts: Real, space: Space
     ) -> Explanation:
-        """Descend from starts, and sample around the minima."""
+        """Find the minima from the starts, and sample around them."""
         if starts.shape[0] > 12:
             starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
         found = descend(predict, window, starts, space, rounds=9)
@@ -349,12 +349,12 @@ class Explainer:
         self,
         kind: str,
         predict: Prediction,
-        window: Window,
+        window: WhitenedWindow,
         found: Descended,
         space: Space,
         doubt: float = 1.0,
     ) -> Explanation:
-        """Sample around minima; `doubt` is what differences of chi² are divided by."""
+        """Sample around minima; `doubt` divides differences of chi²."""
         width = found.parameters.shape[1]
         near = np.flatnonzero(found.chi2 < found.chi2.min() + 30)
         covariances = np.array(
@@ -381,25 +381,25 @@ class Explainer:
 
     # Other kinds
 
-    def fits(self, explanation: Explanation, window: Window, worse: float = _WORSE) -> bool:
-        """Whether no more is left than noise leaves, which is itself known from few samples."""
+    def fits(self, explanation: Explanation, window: WhitenedWindow, worse: float = _WORSE) -> bool:
+        """Return whether the residual is no larger than noise, estimated from few samples."""
         return bool(explanation.chi2 < self.most(window.data.size, worse))
 
     def most(self, degrees: int, worse: float = _WORSE) -> float:
-        """Greatest sum of squared residuals that noise explains."""
+        """Return the greatest sum of squared residuals that noise explains."""
         of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
         return float(degrees + worse * np.sqrt(2 * degrees + of_noise))
 
     def _later_is_worse(
-        self, longer: Explanation, over: Window, shorter: Explanation, until: Window
+        self, longer: Explanation, over: WhitenedWindow, shorter: Explanation, until: WhitenedWindow
     ) -> bool:
-        """Whether the shorter of two windows is explained, and not what the longer one adds."""
+        """Return whether the shorter of two windows is explained, but not the added part."""
         added = over.data.size - until.data.size
         more = longer.chi2 - shorter.chi2
         return self.fits(shorter, until) and more > self.most(added, _WORSE_LATER)
 
-    def _changes(self, rest: Explanation, window: Window) -> bool:
-        """Whether the obstacle at rest becomes likelier if it may move or give way."""
+    def _changes(self, rest: Explanation, window: WhitenedWindow) -> bool:
+        """Return whether the obstacle at rest becomes likelier if it may move or yield."""
         extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         starts = np.hstack([np.tile(rest.parameters, (len(extra), 1)), extra])
         free = np.hstack([np.ones((len(extra), rest.parameters.size), dtype=bool), extra != 0])
@@ -415,8 +415,8 @@ class Explainer:
         )
         return bool(found.chi2.min() < rest.chi2 - DOUBTFUL)
 
-    def _others(self, window: Window) -> list[Explanation]:
-        """Obstacles that move or give way, and a knock."""
+    def _others(self, window: WhitenedWindow) -> list[Explanation]:
+        """Explain the window by obstacles that move or yield, and by a knock."""
         blind, side = self.blind, self.side()
         likely = blind.x_m[np.argsort(-blind.log_likelihood)[:24]]
         instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
@@ -442,16 +442,16 @@ class Explainer:
         return found
 
     def pairing(self) -> Pairing:
-        """Return what marches two obstacles on this record."""
+        """Return the integration of two obstacles on this record."""
         tables = self.tables
         touching = Touching(tables.coarse, tables.x_m, self.motion)
         return Pairing(touching, tables.coarse, tables.crossing)
 
-    def _two(self, rest: Explanation, window: Window) -> Explanation | None:
-        """Two obstacles, if they may explain more than one at rest does."""
+    def _two(self, rest: Explanation, window: WhitenedWindow) -> Explanation | None:
+        """Explain the window by two obstacles, if they may explain more than one at rest does."""
         pairing = self.pairing()
         space = pairing.space(self.space(3))
-        # The first samples tell in less time whether more iterations are worth while.
+        # The first samples show in less time whether more iterations are worthwhile.
         early = self.window(_COVERED_S) if window.end > self.end(_COVERED_S) else window
         starts = pairing.starts(rest.parameters, early, space, 2)
         found = descend(pairing.channels, early, starts, space, rounds=4)
@@ -468,14 +468,14 @@ class Explainer:
         return self._sampled("two", pairing.channels, window, found, space, doubt)
 
     def side(self) -> float:
-        """Direction in which the beam presses: against the force, whatever that comes from."""
+        """Return the direction in which the beam presses: opposite to the force."""
         return -1.0 if self.blind.force_n.sum() > 0 else 1.0
 
     def _marching(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
-        """March obstacles whose fourth parameter is their rate or their mobility."""
+        """Return the prediction of obstacles whose fourth parameter is their rate or mobility."""
         touching = Touching(kernels, self.tables.x_m, self.motion)
 
-        def predicted(candidates: Real, window: Window) -> Real:
+        def predicted(candidates: Real, window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
             return touching.predicted(candidates, window, side)[0]
@@ -496,10 +496,10 @@ class Explainer:
 
 
 def _distinct(found: Descended) -> Real:
-    """Minima that are not worth the same as a better one beside them, the best first."""
+    """Return the minima without those close to a better one, the best first."""
     order = np.argsort(found.chi2)
-    kept: list[Real] = []
+    distinct: list[Real] = []
     for row in found.parameters[order[found.chi2[order] < 2 * found.chi2.min() + 60]]:
-        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in kept):
-            kept.append(row)
-    return np.array(kept)
+        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in distinct):
+            distinct.append(row)
+    return np.array(distinct)

@@ -1,8 +1,8 @@
-"""Motion of the beam without a touch, from the measured angle: what the innovations are against.
+"""Motion of the beam without a touch, from the measured angle: the reference for the innovations.
 
-The exact model is driven by the measured angle from the record's beginning on. What the beam did
-before (it may be vibrating from its slew) adds free vibrations of unknown amplitude, fitted along
-with an offset and a drift of each channel to the samples before the touch.
+The measured angle drives the exact model from the record's beginning on. Earlier motion (the beam
+may be vibrating from its slew) adds free vibrations of unknown amplitude. They are fitted to the
+samples before the touch, together with an offset and a drift of each channel.
 """
 
 from copy import copy
@@ -18,25 +18,25 @@ from rigd.beam import (
     poles,
     root_shear_ratio,
 )
-from rigd.touch._kernels import Line, chebyshev_nodes
+from rigd.touch._kernels import LaplaceLine, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 FINER = 4
-"""Values of the angle per sample, between them by a spline."""
+"""Values of the angle per sample, interpolated by a spline."""
 _BAND = 0.5
-"""Share of the frequencies so reached that the angle has: its own Nyquist frequency, twice."""
+"""Fraction of these frequencies that the angle contains: its own Nyquist frequency, twice."""
 _HIGHEST_HZ = 330.0
 _SETTLE_S = 0.03
-"""Beyond the record's end the angle comes to rest in this time: no jump to ring before it."""
+"""Time after the record's end in which the angle comes to rest: no jump that rings before it."""
 _SPEED_S = 0.02
-"""Over this time the speed at the record's beginning is measured."""
+"""Time over which the speed at the record's beginning is measured."""
 _NODES = 36
-"""Places from which the displacement at all others is interpolated."""
+"""Positions from which the displacement at all others is interpolated."""
 BEFORE = 24
-"""Samples over which what a spline makes of one sample fades."""
+"""Samples over which the effect of one sample in a spline fades."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +50,17 @@ class TouchRecord:
     torque_nm: Real
     """Measured coupling torque, shape (n,)."""
     shear_n: Real | None
-    """Measured base shear, shape (n,); None if the profile does not tell it."""
+    """Measured base shear, shape (n,); None if the profile does not define it."""
     detected: int
-    """Index of the sample at which the touch was noticed."""
+    """Index of the sample of the detection."""
 
     def until(self, samples: int) -> "TouchRecord":
-        """Return its first samples.
+        """Return the first samples as a record.
 
         Parameters
         ----------
         samples
-            How many.
+            Number of samples.
         """
         shear = None if self.shear_n is None else self.shear_n[:samples]
         return TouchRecord(
@@ -69,14 +69,14 @@ class TouchRecord:
 
 
 class FreeBeam:
-    """What of the free motion depends on the model and the record's length only.
+    """Part of the free motion that depends on the model and the record's length only.
 
     Parameters
     ----------
     model
         The beam.
     x_m
-        Places where the displacement is wanted, shape (m,).
+        Positions of the displacement, shape (m,).
     rate_hz
         Samples a second.
     samples
@@ -102,7 +102,7 @@ class FreeBeam:
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
         n = next_fast_len(FINER * round(1.6 * samples + 0.1 * rate_hz), real=True)
-        self.line = Line(n, 1 / (FINER * rate_hz), _BAND)
+        self.line = LaplaceLine(n, 1 / (FINER * rate_hz), _BAND)
         s = self.line.s
         self._grid = grid = PointForceGrid(s, model.beam, model.damping)
         late = model.sensor_filter.response(s)
@@ -110,26 +110,26 @@ class FreeBeam:
         inertia = model.tool_inertia_kg_m2 * s * s
         self._torque: Complex = late * (grid.torque_per_angle() + inertia)
         self._shear: Complex = late * grid.shear_per_angle()
-        self.modes = Ringing.of(model, np.empty(0))
-        self._place(x_m)
+        self.modes = FreeVibration.of(model, np.empty(0))
+        self._set_positions(x_m)
         unit = np.zeros(3 * BEFORE)
         unit[BEFORE] = 1.0
         self._sample = self.line.transformed(_finer(unit, rate_hz, self.line)[0])
 
     def at(self, x_m: Real) -> "FreeBeam":
-        """Return the same beam with other places.
+        """Return the same beam with other positions.
 
         Parameters
         ----------
         x_m
-            Places where the displacement is wanted, shape (m,).
+            Positions of the displacement, shape (m,).
         """
         other = copy(self)
-        other._place(x_m)
+        other._set_positions(x_m)
         return other
 
-    def _place(self, x_m: Real) -> None:
-        """Take places; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
+    def _set_positions(self, x_m: Real) -> None:
+        """Set the positions; many are interpolated from few: to 1e-7 for waves of 1 kHz."""
         self.x_m = x_m
         nodes_m, self._between = x_m, np.eye(x_m.size)
         if x_m.size > _NODES:
@@ -137,28 +137,28 @@ class FreeBeam:
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at(x_m / self.model.beam.length_m)
 
-    def per_sample(self, place: int, samples: int) -> Real:
-        """Displacement that one sample of the angle makes, in m/rad.
+    def per_sample(self, index: int, samples: int) -> Real:
+        """Return the displacement caused by one sample of the angle, in m/rad.
 
         Parameters
         ----------
-        place
-            Index of the place.
+        index
+            Index of the position.
         samples
-            How many samples after it are wanted.
+            Number of samples after it.
 
         Returns
         -------
         ndarray, shape (FINER · (BEFORE + samples),)
-            On the fine steps, from `BEFORE` samples before it on: the spline looks ahead.
+            On the fine steps, from `BEFORE` samples before it: the spline acts ahead of a sample.
         """
-        response = (self._between[place] @ self._displacement) * self._sample
+        response = (self._between[index] @ self._displacement) * self._sample
         return self.line.in_time(response, FINER * (BEFORE + samples))
 
     def motion(
         self, record: TouchRecord, quiet: int, first: int, turned: "Turned | None" = None
     ) -> "FreeMotion":
-        """Free motion of one record.
+        """Return the free motion of one record.
 
         Parameters
         ----------
@@ -167,9 +167,9 @@ class FreeBeam:
         quiet
             Number of samples that are certainly before the touch.
         first
-            Sample from which the displacement is wanted.
+            First sample of the displacement.
         turned
-            The record's angle as another beam has transformed it; None: it is transformed.
+            Transform of the record's angle from another beam; None: it is computed.
         """
         n = record.angle_rad.size
         rate = self.rate_hz
@@ -214,55 +214,55 @@ class FreeBeam:
 
 @dataclass(frozen=True, slots=True)
 class FreeMotion:
-    """Innovations of a record, and where the beam would be without a touch."""
+    """Innovations of a record, and the motion of the beam without a touch."""
 
     t: Real
-    """Instants that the samples of torque and shear show but for their filters, shape (n,)."""
+    """Instants of the samples of torque and shear, corrected for their delays, shape (n,)."""
     innovations: Real
     """Innovations of torque and, if measured, shear, shape (c, n)."""
     noise: Real
     """Standard deviation of each channel before the touch, shape (c,)."""
     design: Real
-    """Columns of what was fitted before the touch, shape (c, n, q)."""
+    """Columns fitted before the touch, shape (c, n, q)."""
     spread: Real
-    """Cholesky factor of the covariance of its q amplitudes."""
+    """Cholesky factor of the covariance of the q amplitudes."""
     turned: "Turned"
-    """The angle that drives it."""
-    ringing: "Ringing"
+    """The angle that drives the beam."""
+    ringing: "FreeVibration"
     """The free vibrations among them."""
     angle_noise_rad: float
     """Standard deviation of a sample of the angle."""
     displacement_m: Real
-    """At the places, on fine steps, shape (m, k)."""
+    """Displacement at the positions, on fine steps, shape (m, k)."""
     first_s: float
-    """Instant of the first of them."""
+    """Instant of the first step."""
     step_s: float
-    """Time between two of them."""
+    """Time between two steps."""
 
 
 def _angle_noise(angle: Real) -> float:
-    """Scatter of the samples, encoder steps included: fourth differences show no motion."""
+    """Return the scatter of the samples, with encoder steps: fourth differences remove motion."""
     return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """Angle of a record, transformed: the straight motion it begins with, and the rest."""
+    """Transform of a record's angle: initial straight motion, and spectrum of the remainder."""
 
     spectrum: Complex
-    """Rest, at the frequencies of a line."""
+    """Remainder, at the frequencies of a Laplace line."""
     start_rad: float
     speed_rad_s: float
 
     @classmethod
-    def of(cls, angle_rad: Real, rate_hz: float, line: Line) -> "Turned":
+    def of(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "Turned":
         """Transform the samples of an angle."""
         rest, start_rad, speed_rad_s = _finer(angle_rad, rate_hz, line)
         return cls(line.transformed(rest), start_rad, speed_rad_s)
 
 
-def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]:
-    """Angle on the steps of the line without the straight motion it begins with, and that."""
+def _finer(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
+    """Return the angle on the line's steps minus its initial straight motion, and that motion."""
     from scipy.interpolate import CubicSpline
 
     t = np.arange(angle.size) / rate_hz
@@ -281,7 +281,7 @@ def _finer(angle: Real, rate_hz: float, line: Line) -> tuple[Real, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Ringing:
+class FreeVibration:
     """Free vibrations of the first modes, as columns of cosines and sines that decay."""
 
     poles: Complex
@@ -291,10 +291,10 @@ class Ringing:
     scale: Real
     """Unit of the amplitudes, shape (modes,)."""
     shapes: Real
-    """Displacement at the places per amplitude, shape (modes, places)."""
+    """Displacement at the positions per amplitude, shape (modes, positions)."""
 
     @classmethod
-    def of(cls, model: TouchModel, x_m: Real) -> "Ringing":
+    def of(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
         beam, damping = model.beam, model.damping
         most = 12
         found = poles(beam, damping, most)[:, 0]
@@ -306,24 +306,24 @@ class Ringing:
         ratio = root_shear_ratio(count)
         root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
         root *= model.sensor_filter.response(found)
-        # Amplitudes in units that give about the same torque in each mode.
+        # Units of the amplitudes that give about the same torque in each mode.
         scale = 1 / np.abs(root[0])
         whole = cls(found.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
         return whole.at(x_m / beam.length_m)
 
-    def at(self, shares: Real) -> "Ringing":
-        """Return the same vibrations at other places.
+    def at(self, fractions: Real) -> "FreeVibration":
+        """Return the same vibrations at other positions.
 
         Parameters
         ----------
-        shares
-            Places as shares of the length, shape (places,).
+        fractions
+            Positions as fractions of the length, shape (positions,).
         """
-        shapes = np.stack([mode_shape(i + 1, shares) for i in range(self.poles.size)])
+        shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
         return replace(self, shapes=shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
-        """Torque and shear, shape (2, t, 2 · modes).
+        """Return torque and shear, shape (2, t, 2 · modes).
 
         Parameters
         ----------
@@ -335,7 +335,7 @@ class Ringing:
         return np.array([np.hstack([part.real, -part.imag]) for part in parts])
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
-        """At the places, shape (places, t, r) or, for r = 1 without its axis, (places, t).
+        """Return displacements (positions, t, r) or, for r = 1 without its axis, (positions, t).
 
         Parameters
         ----------
@@ -362,19 +362,19 @@ class _Fitted:
 
     @classmethod
     def to(cls, innovations: list[Real], designs: list[Real], quiet: int) -> "_Fitted":
-        """Weighted least squares on the quiet samples, weights by the scatter of two rounds."""
+        """Fit the quiet samples by weighted least squares; two rounds estimate the weights."""
         noise = [1.0] * len(innovations)
         for _ in range(3):
             a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
             b = np.concatenate([e[:quiet] / s for e, s in zip(innovations, noise, strict=True)])
             normal = a.T @ a
-            ridge = 1e-9 * np.trace(normal) / normal.shape[0]
-            covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+            regularisation = 1e-9 * np.trace(normal) / normal.shape[0]
+            covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
             values = covariance @ (a.T @ b)
             left = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
             free = max(quiet - values.size / len(left), quiet / 2)
             noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / free)) for e in left]
         a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
         normal = a.T @ a
-        covariance = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+        covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
         return cls(values, covariance, noise, left)

@@ -1,11 +1,11 @@
-"""Innovations: what the sensor shows of a beam that is touched, tick by tick.
+"""Innovations: the unpredicted part of a sensor's readings, tick by tick.
 
-The exact model of the free beam tells from the angle what torque and base shear there should be.
-What is measured beyond that is noise, the ringing of the beam from before, the model's own error,
-or a touch. Ringing and error come slowly and at the beam's own frequencies: an observer follows
-them (a stationary Kalman filter of the first modes and of the zeros of both channels). What it
-cannot foresee from one tick to the next are the innovations, white noise unless something else
-begins.
+The exact model of the free beam predicts torque and base shear from the angle. The difference from
+the measurement is noise, earlier vibration of the beam, the model's own error, or a touch.
+Vibration and error are slow and at the beam's own frequencies: an observer (a stationary Kalman
+filter of the first modes and of the zeros of both channels) follows them. The innovations are the
+part that it cannot predict from one tick to the next: white noise without a touch.
+
 
 Filter and observer are linear, so that a tick is the product of one matrix with one vector:
 [state, angle, torque, shear] → [next state, whitened innovations, whitened prediction].
@@ -32,24 +32,23 @@ Complex = NDArray[np.complexfloating]
 
 _MOST_MODES = 40
 _FASTEST = 0.42
-"""Fastest mode that the filter follows, as a share of the rate; the taps stand for the others."""
-_LEAST_SHARE = 0.5
-"""Imaginary part of a pole over its size: below, the ladder stands for it."""
+"""Fastest mode of the filter, as a fraction of the rate; the taps approximate the others."""
+_LEAST_FRACTION = 0.5
+"""Least imaginary part of a pole over its magnitude; real poles approximate the others."""
 _LADDER = 10
 """Real poles for the branch cut of the fractional orders."""
 _SLOWEST_RAD_S = 0.03
 _TAPS = 4
 _FIT_FROM_HZ, _FIT_TO = 0.02, 0.45
 _WEIGHTED_FROM_HZ, _KNEE_HZ = 0.3, 50.0
-"""Band in which the relative error counts fully. No motor moves much above, where a close fit
-would only make more of the encoder's steps."""
+"""Band in which the relative error has full weight. Motors hardly move above it, where a close fit
+would only amplify the encoder's steps."""
 _OBSERVED_MODES = 4
 _OBSERVER_RAD_S = 6.0
-"""How fast the observer takes up ringing that it did not foresee: slow against a touch (at 15 rad/s
-it takes up a tenth of one within 10 ms), fast against the drift in phase of a model whose
-frequencies are 1 % wrong."""
+"""Bandwidth of the observer for vibration: slow against a touch (at 15 rad/s it absorbs a tenth of
+one within 10 ms), fast against the phase drift of a model with a 1 % frequency error."""
 _ZERO_RAD_S = 0.5
-"""The same of the zero of a channel."""
+"""The same for the zero of a channel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,9 +66,9 @@ class ObservedBeam:
     """
 
     matrix: Real
-    """(n + 4, n + 3) as above; without shear its row and column are zero."""
+    """(n + 4, n + 3), see above; without shear its row and column are zero."""
     gain: Real
-    """(n, 2): what each whitened innovation has added to the next state."""
+    """(n, 2): effect of each whitened innovation on the next state."""
     whitening: Real
     """(2, 2): from innovations to whitened ones."""
     states: int
@@ -87,7 +86,7 @@ class Noise:
     shear_n: float | None
     """Standard deviation of the base shear; None: it is not measured."""
     angle_rad: float = 0.0
-    """Standard deviation of the angle; a resolution of 7e-5 rad makes 2e-5 rad."""
+    """Standard deviation of the angle; a resolution of 7e-5 rad gives 2e-5 rad."""
 
 
 def observed_beam(
@@ -113,7 +112,7 @@ def observed_beam(
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     torque_after_angle_s
-        By how much older the wrench of a tick is than its angle, its filters left aside.
+        Delay of a tick's wrench relative to its angle, without the filters.
     sensor_filter
         Filters of the wrench.
 
@@ -146,7 +145,7 @@ def observed_beam(
 
 
 class InnovationFilter:
-    """Runs a `ObservedBeam`; starts at rest at the first angle.
+    """Runs an `ObservedBeam`; starts at rest at the first angle.
 
     Parameters
     ----------
@@ -158,7 +157,7 @@ class InnovationFilter:
     whitened
         Innovations of torque and shear, in their standard deviations and uncorrelated.
     predicted
-        Torque and shear that the angle alone explains, in the same unit.
+        Torque and shear predicted from the angle alone, in the same unit.
     """
 
     __slots__ = (
@@ -199,7 +198,7 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Take the readings of a tick.
+        """Process the readings of a tick.
 
         Parameters
         ----------
@@ -208,9 +207,9 @@ class InnovationFilter:
         missed
             Ticks that were missed before this one: their angle is interpolated.
         angle_stale
-            The angle is an old one: it is extrapolated, and says nothing new.
+            Whether the angle is an old one: it is extrapolated instead.
         wrench_stale
-            Torque and shear are old: they are passed over.
+            Whether torque and shear are old: they are ignored.
         """
         if self._rest_rad is None:
             self._rest_rad = angle_rad
@@ -220,8 +219,8 @@ class InnovationFilter:
         if missed:
             start_rad = self._angle_rad
             for tick in range(1, missed + 1):
-                share = tick / (missed + 1)
-                self._pass(start_rad + share * (turned_rad - start_rad), torque_nm, shear_n)
+                fraction = tick / (missed + 1)
+                self._pass(start_rad + fraction * (turned_rad - start_rad), torque_nm, shear_n)
         if wrench_stale:
             self._pass(turned_rad, torque_nm, shear_n)
         else:
@@ -229,7 +228,7 @@ class InnovationFilter:
 
     @property
     def predicted_shear_n(self) -> float:
-        """Base shear that the angle alone explains; 0 where the model has none."""
+        """Base shear predicted from the angle alone; 0 where the model has none."""
         of_torque, of_shear = self._unwhitening
         torque, shear = self.predicted
         return of_torque * torque + of_shear * shear
@@ -248,7 +247,7 @@ class InnovationFilter:
         self._angle_before_rad, self._angle_rad = self._angle_rad, turned_rad
 
     def _pass(self, turned_rad: float, torque_nm: float, shear_n: float) -> None:
-        """Go on without a wrench: take back what an old one has done to the state."""
+        """Step without a wrench: undo the effect of the old one on the state."""
         self._run(turned_rad, torque_nm, shear_n)
         self._vectors[0][: self._n] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0
@@ -277,7 +276,7 @@ def _fit(
     later_s: float,
     sensor_filter: SensorFilter,
 ) -> _Filter:
-    """Fit discrete poles, where the exact ones are, and some taps to the exact response."""
+    """Fit discrete poles, at the exact ones, and some taps to the exact response."""
     pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_MOST_MODES), beam, damping)
     upper = pairs[_ringing(pairs[:, 0], rate_hz), 0]
     turning: Complex = np.exp(upper / rate_hz)
@@ -302,7 +301,7 @@ def _fit(
     for row, target in zip(coefficients, response, strict=True):
         scale = weight / np.abs(target)
         weighted = columns * scale[:, None]
-        # An angle at rest has to give no torque at all, not one that is small beside the others'.
+        # An angle at rest must give exactly no torque, not only a small one.
         matrix = np.concatenate([weighted.real, weighted.imag, 1e4 * at_rest])
         aim = np.concatenate([(target * scale).real, (target * scale).imag, [0.0]])
         size = np.linalg.norm(matrix, axis=0)
@@ -314,13 +313,13 @@ def _fit(
 
 
 def _ringing(upper: Complex, rate_hz: float) -> NDArray[np.bool_]:
-    """Tell which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
-    ringing: NDArray[np.bool_] = upper.imag > _LEAST_SHARE * np.abs(upper)
+    """Return which modes ring, and slowly enough; a mode without a pole (NaN) does not."""
+    ringing: NDArray[np.bool_] = upper.imag > _LEAST_FRACTION * np.abs(upper)
     return ringing & (upper.imag < 2 * pi * _FASTEST * rate_hz)
 
 
 def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
-    """Responses whose combination is fitted: real and imaginary part of each pole, and taps."""
+    """Return the responses to combine: real and imaginary part of each pole, and taps."""
     delay = np.exp(-s_ticks)[:, None]
     up, down = 1 / (1 - turning * delay), 1 / (1 - turning.conj() * delay)
     cut = 1 / (1 - decaying * delay)
@@ -328,7 +327,7 @@ def _columns(s_ticks: Complex, turning: Complex, decaying: Real) -> Complex:
 
 
 def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gain: Real) -> _Filter:
-    """State space of the fit; the states are those before the angle of the tick is taken in."""
+    """Return the state space of the fit; the states exclude the angle of the tick."""
     m, k = turning.size, decaying.size
     n = 2 * m + k + _TAPS - 1
     a, b = np.zeros((n, n)), np.zeros(n)
@@ -341,7 +340,7 @@ def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gai
     taps = np.arange(2 * m + k, n)
     b[taps[0]] = 1.0
     a[taps[1:], taps[:-1]] = 1.0
-    # A state holds the sum up to the tick before, moved on by one tick: with θ it is up to date.
+    # A state is the sum up to the previous tick, moved on by one tick: adding θ completes it.
     c = np.zeros((2, n))
     c[:, even] = 2 * coefficients[:, :m]
     c[:, even + 1] = -2 * coefficients[:, m : 2 * m]
@@ -355,7 +354,7 @@ def _state_space(turning: Complex, decaying: Real, coefficients: Real, noise_gai
     return _Filter(a, b, c, d, noise_gain)
 
 
-# Observer of what the angle does not explain
+# Observer of the motion that the angle does not explain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,7 +370,7 @@ class _Observer:
 def _observer(
     beam: Beam, damping: Damping, rate_hz: float, noise: Noise, noise_gain: Real
 ) -> _Observer:
-    """Stationary Kalman filter of ringing modes and drifting zeros."""
+    """Return the stationary Kalman filter of ringing modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are
 
     z = clamped_free_eigenvalues(_OBSERVED_MODES)
@@ -393,7 +392,7 @@ def _observer(
     sizes = np.array([noise.torque_nm, noise.shear_n or 0.0])
     variance = sizes**2 + (noise_gain * noise.angle_rad) ** 2
     q = np.zeros(n)
-    # A random walk of this size makes the observer as fast as it is to be.
+    # A random walk of this size gives the observer its bandwidth.
     q[even] = q[even + 1] = variance[0] * (_OBSERVER_RAD_S / rate_hz) ** 2
     q[zeros] = variance[:channels] * (_ZERO_RAD_S / rate_hz) ** 2
     if both:

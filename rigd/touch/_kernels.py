@@ -1,11 +1,11 @@
-"""What a force on the beam does in time: displacement, torque and base shear, over the length.
+"""Effect of a force on the beam in time: displacement, torque and base shear, over the length.
 
-A force is a sum of triangles of unit height, one a step ("hats": it is linear between two steps),
-so that every force history that begins at zero is one; the response to one hat at each of the
-following steps is a kernel. Kernels are inverse Laplace transforms of the exact model, by an FFT
-along a line to the right of the origin: what wraps around is smaller by ``exp(-sigma T)``. By
-reciprocity, torque and shear per force at x are minus the displacement there per angle and per
-displacement of the root.
+A force is a sum of triangles of unit height, one per step ("hats": linear between two steps). Every
+force history that begins at zero is such a sum. The response to one hat at each of the following
+steps is a kernel. Kernels are inverse Laplace transforms of the exact model, by an FFT along a line
+to the right of the origin: the wrap-around is smaller by ``exp(-sigma T)``. By reciprocity, torque
+and shear per force at x are minus the displacement there per angle and per displacement of the
+root.
 """
 
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 WRAPPED = 14.0
-"""``sigma T``: the end of the period wraps around to 1e-6 of itself."""
+"""``sigma T``: the wrap-around is 1e-6 of the end of the period."""
 
 _OVERSAMPLED = 2
-"""Steps of the inversion in a step of the kernels: above half the step's rate a hat is small."""
+"""Steps of the inversion per step of the kernels: a hat is small above half the step's rate."""
 
 _MODES = 20
-"""Modes that pass a force on to another place."""
+"""Modes that transmit a force to another position."""
 
 _EDGE_M = 0.003
-"""The places begin at this distance from the root; they end at the tip."""
+"""Distance of the first position from the root; the last one is the tip."""
 
 
-class Line:
-    """Line in the Laplace plane that carries functions of time on ``n`` steps.
+class LaplaceLine:
+    """Line in the Laplace plane that represents functions of time on ``n`` steps.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Line:
     step_s
         Time between two of them.
     band
-        Share of the frequencies below the Nyquist frequency that are used, the rest being zero.
+        Fraction of the frequencies below the Nyquist frequency in use; the others are zero.
     """
 
     __slots__ = ("_grown", "n", "s", "step_s")
@@ -50,8 +50,8 @@ class Line:
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
         shift = WRAPPED / (n * step_s)
-        kept = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(kept) / (n * step_s)
+        used = round(band * (n // 2)) + 1
+        self.s = shift + 2j * np.pi * np.arange(used) / (n * step_s)
         self._grown = np.exp(shift * step_s * np.arange(n))
 
     def transformed(self, samples: Real) -> Complex:
@@ -69,14 +69,14 @@ class Line:
         return spectrum
 
     def in_time(self, transform: Complex, steps: int) -> Real:
-        """Return the first `steps` samples of what `transformed` would give, along the last axis.
+        """Return the first `steps` samples of the inverse of `transformed`, along the last axis.
 
         Parameters
         ----------
         transform
             At the frequencies of the line, last axis.
         steps
-            How many samples.
+            Number of samples.
         """
         from scipy.fft import irfft
 
@@ -88,7 +88,7 @@ class Line:
 
 
 class Hat:
-    """From transforms of responses to those to a hat of force, in time.
+    """Conversion of transforms of responses to responses in time to a hat of force.
 
     Parameters
     ----------
@@ -105,10 +105,10 @@ class Hat:
 
         self._steps = steps
         fine = step_s / _OVERSAMPLED
-        self.line = Line(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
+        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLED * steps, real=True), fine)
         s = self.line.s
         hat = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine
-        # Two steps later than it acts, so that the hat begins within the period.
+        # Two steps later than the force, so that the hat begins within the period.
         self._late = hat * np.exp(-s * step_s)
 
     def kernels(self, response: Complex) -> Real:
@@ -117,7 +117,7 @@ class Hat:
         Parameters
         ----------
         response
-            To a force, at the frequencies of the line, shape (k, frequencies).
+            Response to a force, at the frequencies of the line, shape (k, frequencies).
         """
         values = self.line.in_time(self._late * response, _OVERSAMPLED * (self._steps + 1))
         return values[:, _OVERSAMPLED::_OVERSAMPLED][:, : self._steps]
@@ -125,14 +125,14 @@ class Hat:
 
 @dataclass(frozen=True, slots=True)
 class ContactKernels:
-    """Responses to a hat of contact force at places along the beam, on equal steps."""
+    """Responses to a hat of contact force at positions along the beam, on equal steps."""
 
     x_m: Real
-    """Places, shape (m,)."""
+    """Positions, shape (m,)."""
     step_s: float
     """Half the width of a hat, and the step of the kernels."""
     displacement: Real
-    """At the place itself, per N, shape (m, n); the first column is the instant of the peak."""
+    """At the position itself, per N, shape (m, n); the first column is the instant of the peak."""
     torque: Real
     """Motor's torque in m, likewise."""
     shear: Real
@@ -144,14 +144,14 @@ class ContactKernels:
         return int(self.displacement.shape[1])
 
     def at(self, x_m: Real, steps: int) -> "ContactKernels":
-        """Interpolate at other places (cubic, four points).
+        """Interpolate at other positions (cubic, four points).
 
         Parameters
         ----------
         x_m
-            Within the range of the places, shape (k,).
+            Within the range of the positions, shape (k,).
         steps
-            Length of what is returned.
+            Length of the result.
         """
         first, weights = lagrange(x_m, self.x_m)
         tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
@@ -163,15 +163,15 @@ class ContactKernels:
         Parameters
         ----------
         factor
-            Steps of these in one of the wider ones.
+            Steps of these kernels per wider one.
         steps
-            Length of what is returned.
+            Length of the result.
         """
         hat = 1 - np.abs(np.arange(1 - factor, factor)) / factor
         tables = []
         for table in (self.displacement, self.torque, self.shear):
             padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
-            # A wide hat that peaks at 0 is narrow ones from 1 - factor to factor - 1.
+            # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
             wide = sum(
                 weight
                 * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
@@ -189,20 +189,20 @@ def contact_kernels(
     steps: int,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
-    """Kernels of the exact model at the places `x_m`.
+    """Return the kernels of the exact model at the positions `x_m`.
 
     Parameters
     ----------
     beam, damping
         Parameters of the exact model.
     x_m
-        Places along the beam, shape (m,).
+        Positions along the beam, shape (m,).
     step_s
         Time between two values of a kernel.
     steps
         Number of values.
     sensor_filter
-        Filters through which torque and shear are seen.
+        Filters of torque and shear.
     """
     hat = Hat(step_s, steps)
     s = hat.line.s
@@ -224,24 +224,24 @@ def contact_kernels(
 
 @dataclass(frozen=True, slots=True)
 class CrossKernels:
-    """Displacement at one place per hat of contact force at another, summed over the modes."""
+    """Displacement at one position per hat of contact force at another, summed over the modes."""
 
     x_m: Real
-    """Places of the shapes, shape (m,)."""
+    """Positions of the shapes, shape (m,)."""
     shapes: Real
     """Shape (m, modes)."""
     kernels: Real
     """Response of each mode to a hat of force, by the square of its shape, (modes, n)."""
 
     def between(self, x_m: Real, other_m: Real, steps: int) -> Real:
-        """Interpolate the kernels of pairs of places.
+        """Interpolate the kernels of pairs of positions.
 
         Parameters
         ----------
         x_m, other_m
-            Places, shape (k,).
+            Positions, shape (k,).
         steps
-            Length of what is returned.
+            Length of the result.
         """
         one, other = (mixed(self.shapes, *lagrange(x, self.x_m)) for x in (x_m, other_m))
         crossing: Real = (one * other) @ self.kernels[:, :steps]
@@ -251,7 +251,7 @@ class CrossKernels:
 def cross_kernels(
     beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
 ) -> CrossKernels:
-    """Kernels between places; the arguments are those of `contact_kernels`."""
+    """Return the kernels between positions; the arguments are those of `contact_kernels`."""
     hat = Hat(step_s, steps)
     s = hat.line.s
     inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
@@ -264,55 +264,55 @@ def cross_kernels(
 
 
 _AT_ONCE = 8
-"""Places evaluated at once: temporaries stay in cache."""
+"""Positions evaluated at once: temporaries stay in cache."""
 
 
-def places(length_m: float, spacing_m: float) -> Real:
-    """Places along the beam up to its tip, equally spaced.
+def positions(length_m: float, spacing_m: float) -> Real:
+    """Return positions along the beam up to its tip, equally spaced.
 
     Parameters
     ----------
     length_m
         Length of the beam.
     spacing_m
-        Greatest distance between two.
+        Greatest distance between two of them.
     """
     n = int(np.ceil((length_m - _EDGE_M) / spacing_m)) + 1
     return np.linspace(_EDGE_M, length_m, n)
 
 
 def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
-    """Nodes that tell a smooth function between the first and the last of the places.
+    """Return nodes from which a smooth function is interpolated at the positions.
 
     Parameters
     ----------
     x_m
-        Increasing places, shape (m,).
+        Increasing positions, shape (m,).
     count
-        How many nodes.
+        Number of nodes.
 
     Returns
     -------
     nodes_m : ndarray, shape (count,)
     between : ndarray, shape (m, count)
-        Takes values at the nodes to those at the places.
+        Maps values at the nodes to those at the positions.
     """
     from numpy.polynomial import chebyshev
 
     nodes = chebyshev.chebpts1(count)
-    share = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
-    at_nodes, at_places = (chebyshev.chebvander(each, count - 1) for each in (nodes, share))
-    between: Real = at_places @ np.linalg.inv(at_nodes)
+    scaled = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
+    at_nodes, at_positions = (chebyshev.chebvander(each, count - 1) for each in (nodes, scaled))
+    between: Real = at_positions @ np.linalg.inv(at_nodes)
     return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
 
 
 def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
-    """Cubic interpolation on an equally spaced grid: first of four points, and their weights.
+    """Return first of four points and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
     at
-        Where, shape (k,).
+        Points of interpolation, shape (k,).
     grid
         At least four increasing points.
 
@@ -337,7 +337,7 @@ def lagrange(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
 
 
 def mixed(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
-    """Rows of a table (m, n), interpolated with what `lagrange` gives; shape (k, n)."""
+    """Interpolate the rows of a table (m, n) with the result of `lagrange`; shape (k, n)."""
     total = weights[:, 0, None] * table[first]
     for i in range(1, 4):
         total += weights[:, i, None] * table[first + i]

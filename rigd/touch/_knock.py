@@ -1,10 +1,10 @@
-"""A knock from outside: one pulse of force, whatever the antenna does."""
+"""A knock from outside: one pulse of force, independent of the antenna's motion."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.touch._kernels import ContactKernels
-from rigd.touch._physical import Space, Touching, Window
+from rigd.touch._physical import Space, Touching, WhitenedWindow
 
 Real = NDArray[np.float64]
 
@@ -12,16 +12,16 @@ _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 
 
 class Knocking:
-    """Half-sine pulses of force: place, instant, logarithm of the duration, and peak.
+    """Half-sine pulses of force: position, instant, logarithm of the duration, and peak.
 
     Parameters
     ----------
     touching
-        Knows the record's steps.
+        Integration on the record's steps.
     kernels
         Contact kernels of those steps.
     every
-        Every so many of their places is a start.
+        One in so many of their positions is a start.
     """
 
     __slots__ = ("_every", "_kernels", "_touching")
@@ -29,15 +29,15 @@ class Knocking:
     def __init__(self, touching: Touching, kernels: ContactKernels, every: int) -> None:
         self._touching, self._kernels, self._every = touching, kernels, every
 
-    def predicted(self, parameters: Real, window: Window) -> Real:
-        """Effect on the channels, shape (k, c, samples).
+    def predicted(self, parameters: Real, window: WhitenedWindow) -> Real:
+        """Return the effect on the channels, shape (k, c, samples).
 
         Parameters
         ----------
         parameters
-            Rows of place, instant, ln of the duration and peak, shape (k, 4).
+            Rows of position, instant, ln of the duration and peak, shape (k, 4).
         window
-            Which samples.
+            The samples.
         """
         motion = window.motion
         last = motion.t[window.end - 1]
@@ -49,8 +49,8 @@ class Knocking:
         tables = (local.torque, local.shear)[: motion.noise.size]
         return self._touching.effects(tables, force, parameters[:, 1], window)
 
-    def starts(self, window: Window, latest: int, count: int) -> Real:
-        """Likeliest candidates of a grid, the peak of each being the best, shape (count, 4).
+    def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
+        """Return the likeliest candidates of a grid, each with its best peak, shape (count, 4).
 
         Parameters
         ----------
@@ -59,13 +59,13 @@ class Knocking:
         latest
             Last sample at which the knock may begin.
         count
-            How many.
+            Number of candidates.
         """
-        places = self._kernels.x_m[:: self._every]
+        positions = self._kernels.x_m[:: self._every]
         grid = np.stack(
             [
                 each.ravel()
-                for each in np.meshgrid(places, np.log(_DURATIONS_S), [1.0], indexing="ij")
+                for each in np.meshgrid(positions, np.log(_DURATIONS_S), [1.0], indexing="ij")
             ],
             axis=1,
         )
@@ -97,12 +97,12 @@ class Knocking:
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> Space:
-        """Ranges of the parameters.
+        """Return the ranges of the parameters.
 
         Parameters
         ----------
         x_m, instants
-            Ends of the ranges of place and instant.
+            Ends of the ranges of position and instant.
         """
         return Space(
             low=np.array([x_m[0], instants[0], np.log(3e-4), -100.0]),

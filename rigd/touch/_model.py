@@ -1,4 +1,4 @@
-"""The beam that touches are estimated with, and how well it is known."""
+"""Model of the beam for the estimation of touches, with its uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -27,12 +27,12 @@ _ASSUMED: Final = {
     "zeta": 0.2,
     "gamma": 0.2,
 }
-"""Relative standard deviations of a beam that nobody has identified."""
+"""Relative standard deviations of a beam without an identification."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchModel:
-    """Exact model of the antenna as identified, or as its profile states it."""
+    """Exact model of the antenna, from an identification or the profile."""
 
     beam: Beam
     """Length, density and stiffness."""
@@ -43,23 +43,23 @@ class TouchModel:
     angle_delay_s: float = 0.0
     """Age of the angle at the time of its sample."""
     torque_delay_s: float = 0.0
-    """Age of torque and shear at the time of their sample, that of the averaged records on the
-    whole included, that of the low-pass filter not."""
+    """Age of torque and shear at the time of their sample, including that of the averaged records
+    as a whole, without that of the low-pass filter."""
     sensor_filter: SensorFilter = NO_FILTER
     """Filters of torque and shear."""
     source: str = "profile"
-    """Where it came from, for people."""
+    """Source of the model, for the operator."""
     std: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of those of `UNCERTAIN` that are uncertain, in their units. The density
-    goes with both others: its mass per length is their product."""
+    """Standard deviations of the uncertain ones of `UNCERTAIN`, in their units. The density depends
+    on both others: the mass per length is their product."""
 
     @property
     def wrench_delay_s(self) -> float:
-        """Age of torque and shear behind the response of the filters."""
+        """Age of torque and shear after the response of the filters."""
         return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
     def changed(self, name: str, by: float) -> "TouchModel":
-        """Return it with one parameter of `UNCERTAIN` changed, the others as they are.
+        """Return the model with one parameter of `UNCERTAIN` changed.
 
         Parameters
         ----------
@@ -71,15 +71,15 @@ class TouchModel:
         beam, damping = self.beam, self.damping
         match name:
             case "bending_stiffness_n_m2":
-                share = 1 + by / beam.bending_stiffness_n_m2
+                factor = 1 + by / beam.bending_stiffness_n_m2
                 beam = replace(
                     beam,
-                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * share,
-                    density_kg_per_m=beam.density_kg_per_m * share,
+                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * factor,
+                    density_kg_per_m=beam.density_kg_per_m * factor,
                 )
             case "density_over_stiffness":
-                share = 1 + by / beam.density_over_stiffness
-                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * share)
+                factor = 1 + by / beam.density_over_stiffness
+                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * factor)
             case "zeta" | "gamma":
                 damping = replace(damping, **{name: max(getattr(damping, name) + by, 0.0)})
             case "alpha" | "lambda":
@@ -105,7 +105,7 @@ class TouchModel:
         torque_delay_s: float = 0.0,
         sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
-        """Return the model that a profile states: 1 % of stiffness and density, 20 % of damping.
+        """Return the model of a profile: 1 % uncertainty of stiffness and density, 20 % of damping.
 
         Parameters
         ----------
@@ -131,7 +131,7 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: share * values[name] for name, share in _ASSUMED.items()},
+            std={name: factor * values[name] for name, factor in _ASSUMED.items()},
         )
 
     @classmethod
@@ -145,24 +145,24 @@ class TouchModel:
         tool_inertia_kg_m2: float = 0.0,
         sensor_filter: SensorFilter = NO_FILTER,
     ) -> "TouchModel":
-        """Read what ``analyze … --json FILE`` has identified.
+        """Read the model from a document of ``analyze … --json FILE``.
 
-        Tool inertia and delay that it has not identified are as given here.
+        The arguments give the tool inertia and the delay if the document does not.
 
         Parameters
         ----------
         path
             The JSON document.
         length_m
-            Length of the beam: no session shows it.
+            Length of the beam, which no session shows.
         angle_delay_s, torque_delay_s, tool_inertia_kg_m2, sensor_filter
-            As the profile states them.
+            Values of the profile.
 
         Raises
         ------
         IdentifiedBeamError
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
-            uniform beam on a rigid clamp has not, or flags a number that is needed.
+            uniform beam on a rigid clamp does not have, or flags a required number.
         """
         found = read_identified_beam(path, length_m, TOUCH)
         tool = found.tool_inertia_kg_m2

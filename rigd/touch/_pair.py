@@ -1,8 +1,8 @@
-"""Two obstacles at rest, the second met with or after the first.
+"""Two obstacles at rest, the second touched with or after the first.
 
-Each force bends the beam also at the other place, so both contacts are marched together. Two soft
-obstacles that are met at about the same time are much like one between them: what the second adds
-to one that explains the record is asked of every such touch.
+Each force bends the beam also at the other position, so both contacts are integrated together. Two
+soft obstacles that are touched at about the same time are similar to one between them: every touch
+that one obstacle explains is therefore tested for a second one.
 """
 
 import numpy as np
@@ -10,35 +10,35 @@ from numpy.typing import NDArray
 
 from rigd.touch._contact import march_two
 from rigd.touch._kernels import ContactKernels, CrossKernels
-from rigd.touch._physical import SOFTEST, Space, Touching, Window
+from rigd.touch._physical import SOFTEST, Space, Touching, WhitenedWindow
 
 Real = NDArray[np.float64]
 
 _AFTER_S = np.array([0.0, 0.008, 0.025, 0.06])
-"""The second would be met so long after the first by a free beam, in starts."""
-_PLACES = 12
+"""Times in starts after which a free beam would touch the second obstacle."""
+_POSITIONS = 12
 _TRIED_N_PER_M = 100.0
-"""Stiffness whose effect tells that of others in starts: of soft ones it grows in proportion."""
+"""Stiffness from whose effect others follow in starts: that of soft ones is proportional to it."""
 _SHARED = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
-"""Two that are like one: their places by that of the one, each with half of the moment."""
+"""Two obstacles equivalent to one: their positions relative to it, each with half of the moment."""
 _FARTHEST_M = 0.3
 
 
 class Pairing:
-    """March two obstacles.
+    """Integrates the contact with two obstacles.
 
-    Candidates have six columns: place, instant and logarithm of the stiffness of the first, then
-    the place of the second, how far the free beam still is from it at that instant in m, and the
+    Candidates have six columns: position, instant and logarithm of the stiffness of the first, then
+    the position of the second, the free beam's distance from it at that instant in m, and the
     logarithm of its stiffness.
 
     Parameters
     ----------
     touching
-        Knows the record's steps.
+        Integration on the record's steps.
     kernels
         Contact kernels of those steps.
     crossing
-        Kernels between the places, likewise.
+        Kernels between the positions, likewise.
     """
 
     __slots__ = ("_crossing", "_kernels", "_touching")
@@ -46,15 +46,15 @@ class Pairing:
     def __init__(self, touching: Touching, kernels: ContactKernels, crossing: CrossKernels) -> None:
         self._touching, self._kernels, self._crossing = touching, kernels, crossing
 
-    def predicted(self, parameters: Real, window: Window) -> tuple[Real, Real]:
-        """Effect on the channels in the window, and the force of the first obstacle.
+    def predicted(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
+        """Return the effect on the channels in the window, and the force of the first obstacle.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
         window
-            Which samples.
+            The samples.
 
         Returns
         -------
@@ -64,12 +64,12 @@ class Pairing:
         """
         touching, instant = self._touching, parameters[:, 1]
         steps = touching.steps(instant, window)
-        places = parameters[:, 0], parameters[:, 3]
-        kernels = [self._kernels.at(x, steps) for x in places]
+        positions = parameters[:, 0], parameters[:, 3]
+        kernels = [self._kernels.at(x, steps) for x in positions]
         (beyond, side), (beyond_other, side_other) = (
-            touching.approach(x, instant, steps) for x in places
+            touching.approach(x, instant, steps) for x in positions
         )
-        cross = self._crossing.between(*places, steps) * (side * side_other)[:, None]
+        cross = self._crossing.between(*positions, steps) * (side * side_other)[:, None]
         pressing = march_two(
             (kernels[0].displacement, kernels[1].displacement),
             cross,
@@ -84,64 +84,64 @@ class Pairing:
         )
         return first + second, forces[0]
 
-    def channels(self, parameters: Real, window: Window) -> Real:
-        """Effect on the channels alone; the arguments are those of `predicted`."""
+    def channels(self, parameters: Real, window: WhitenedWindow) -> Real:
+        """Return the effect on the channels alone; the arguments are those of `predicted`."""
         return self.predicted(parameters, window)[0]
 
-    def starts(self, one: Real, window: Window, space: Space, count: int) -> Real:
-        """Candidates that are like one obstacle, or have another beside it, shape (k, 6).
+    def starts(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
+        """Return candidates that are like one obstacle, or have a second one, shape (k, 6).
 
         Parameters
         ----------
         one
-            Place, instant and logarithm of the stiffness of the one that explains the record.
+            Position, instant and logarithm of the stiffness of the one that explains the record.
         window
             The samples.
         space
             Ranges of the candidates.
         count
-            How many places of another, the likeliest by its effect to first order.
+            Number of positions of a second one, the likeliest by its first-order effect.
         """
         shared = np.tile(np.concatenate([one, one]), (len(_SHARED), 1))
         shared[:, [0, 3]] *= _SHARED
         shared[:, [2, 5]] -= np.log(2 * _SHARED**2)
         shared[:, 4] = 0.0
-        return np.vstack([shared, self._beside(one, window, space, count)])
+        return np.vstack([shared, self._with_another(one, window, space, count)])
 
-    def _beside(self, one: Real, window: Window, space: Space, count: int) -> Real:
-        """Return the likeliest of another obstacle beside the one, by its effect to first order."""
-        x_m = np.linspace(space.low[3], space.high[3], _PLACES)
-        instants = np.full(_PLACES, one[1])
+    def _with_another(self, one: Real, window: WhitenedWindow, space: Space, count: int) -> Real:
+        """Return the likeliest second obstacles by their first-order effect."""
+        x_m = np.linspace(space.low[3], space.high[3], _POSITIONS)
+        instants = np.full(_POSITIONS, one[1])
         steps = self._touching.steps(instants, window)
         after = np.round(_AFTER_S / self._kernels.step_s).astype(np.intp)
         beyond, _ = self._touching.approach(x_m, instants, steps)
         away_m = np.maximum(beyond[:, np.minimum(after, steps - 1)], 0.0)
-        beside = np.concatenate([one, [0.0, 0.0, np.log(_TRIED_N_PER_M)]])
-        second = np.tile(beside, (_PLACES * after.size, 1))
+        pair = np.concatenate([one, [0.0, 0.0, np.log(_TRIED_N_PER_M)]])
+        second = np.tile(pair, (_POSITIONS * after.size, 1))
         second[:, 3], second[:, 4] = np.repeat(x_m, after.size), away_m.ravel()
         alone = np.concatenate([one, [x_m[-1], space.high[4], SOFTEST]])
         changed = alone + np.diag(space.difference)[:3]
         rows = np.vstack([alone, changed, second])
         residual = window.residuals(self.channels(rows, window))
         now, effect = residual[0], residual[4:] - residual[0]
-        # What changes of the first could do is left out of both, and follows from the second.
+        # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(((residual[1:4] - now) / space.difference[:3, None]).T)
         own = effect - (effect @ q) @ q.T
         power = np.einsum("kn,kn->k", own, own) + 1e-300
-        share = np.maximum(-(own @ now) / power, 0.0)
-        gain = (share**2 * power).reshape(_PLACES, -1)
+        factor = np.maximum(-(own @ now) / power, 0.0)
+        gain = (factor**2 * power).reshape(_POSITIONS, -1)
         likely = np.argsort(-gain.max(axis=1))[:count]
         chosen = likely * after.size + gain[likely].argmax(axis=1)
         starts: Real = second[chosen]
-        starts[:, 5] += np.log(np.clip(share[chosen], 0.1, 100.0))
-        follows = (now + share[chosen, None] * effect[chosen]) @ q
+        starts[:, 5] += np.log(np.clip(factor[chosen], 0.1, 100.0))
+        follows = (now + factor[chosen, None] * effect[chosen]) @ q
         moves = -np.linalg.solve(triangle, follows.T).T
         starts[:, :3] += np.clip(moves, -4 * space.scale[:3], 4 * space.scale[:3])
         return starts
 
     @staticmethod
     def exchanged(parameters: Real) -> Real:
-        """Return candidates in which the second is met first and the first at once after it.
+        """Return candidates in which the second is touched first and the first right after it.
 
         Parameters
         ----------
@@ -154,12 +154,12 @@ class Pairing:
 
     @staticmethod
     def space(one: Space) -> Space:
-        """Ranges of the candidates.
+        """Return the ranges of the candidates.
 
         Parameters
         ----------
         one
-            Those of one obstacle at rest.
+            Ranges of one obstacle at rest.
         """
         return Space(
             low=np.concatenate([one.low, [one.low[0], 0.0, one.low[2]]]),

@@ -1,9 +1,9 @@
-"""Springy obstacle at rest: point, instant and stiffness from the march of the contact.
+"""Springy obstacle at rest: point, instant and stiffness from the integration of the contact.
 
-A grid of starts over all three is marched for the first samples, the best of each place for some
-more, and the best of those descend by least squares (Levenberg and Marquardt, derivatives by
-differences, all candidates in one batch). A bouncing contact has many local minima: the starts
-are there for that.
+A grid of starts over all three is integrated for the first samples, the best of each position for
+some more, and the best of those are refined by least squares (Levenberg and Marquardt, derivatives
+by differences, all candidates in one batch). A bouncing contact has many local minima, hence the
+many starts.
 """
 
 from collections.abc import Callable
@@ -21,12 +21,12 @@ from rigd.touch._kernels import ContactKernels, lagrange, mixed
 Real = NDArray[np.float64]
 
 PARAMETERS = ("x_m", "time_s", "ln_stiffness", "rate_m_per_s", "mobility_m_per_n_s")
-"""Columns of candidates: the last two are left out for an obstacle at rest."""
+"""Columns of candidates: the last two are omitted for an obstacle at rest."""
 
 STIFFEST = log(1e6)
 SOFTEST = log(10.0)
 
-Prediction = Callable[[Real, "Window"], Real]
+Prediction = Callable[[Real, "WhitenedWindow"], Real]
 """Effect of candidates (k, p) on the channels in a window, shape (k, c, samples)."""
 
 
@@ -39,18 +39,18 @@ class Space:
     high: Real
     """Greatest value."""
     difference: Real
-    """By how much each is changed for a derivative."""
+    """Change of each for a derivative."""
     scale: Real
-    """A change that matters: the most an iteration changes is eight times it."""
+    """Significant change: an iteration changes a parameter by at most eight times it."""
     smallest: Real
-    """Least standard deviation that samples are drawn with."""
+    """Least standard deviation for drawing samples."""
     loose: Real
-    """Greatest one."""
+    """Greatest standard deviation for drawing samples."""
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
-    """The innovations that candidates are compared with, whitened."""
+class WhitenedWindow:
+    """Whitened innovations of some samples, to compare candidates with."""
 
     motion: FreeMotion
     """Free motion of the record."""
@@ -59,14 +59,14 @@ class Window:
     end: int
     """Sample after the last."""
     whitening: Real
-    """Inverse Cholesky factor of the covariance, noise and what is unknown of the free motion."""
+    """Inverse Cholesky factor of the covariance of noise and uncertainties of the free motion."""
     data: Real
     """Whitened innovations, shape (n,)."""
 
     @classmethod
     def of(
         cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
-    ) -> "Window":
+    ) -> "WhitenedWindow":
         """Whiten the samples from `first` on.
 
         Parameters
@@ -76,9 +76,9 @@ class Window:
         first, end
             Its samples.
         deviations
-            Effects on the channels of all that is uncertain, one standard deviation each, shape
-            (c, n, r) from sample `first` on; None: what is unknown of the free motion, as far as no
-            touch passes it on.
+            Effects of all uncertainties on the channels, one standard deviation each, shape
+            (c, n, r) from sample `first`; None: those of the free motion, without their
+            transmission by a touch.
         """
         if deviations is None:
             deviations = motion.design[:, first:end] @ motion.spread
@@ -90,7 +90,7 @@ class Window:
         return cls(motion, first, end, whitening, whitening @ raw)
 
     def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-        """Whitened residuals, in the precision of what is predicted.
+        """Return the whitened residuals, in the precision of the prediction.
 
         Parameters
         ----------
@@ -106,14 +106,14 @@ class Window:
 
 
 class Touching:
-    """Marches candidates of one record.
+    """Integrates the contact of candidates for one record.
 
     Parameters
     ----------
     kernels
-        Contact kernels on the steps wanted, at places.
+        Contact kernels on the steps of the integration, at positions.
     x_m
-        Places of the free motion's displacement.
+        Positions of the free motion's displacement.
     motion
         Free motion of the record.
     """
@@ -126,22 +126,22 @@ class Touching:
     def predicted(
         self,
         parameters: Real,
-        window: Window,
+        window: WhitenedWindow,
         side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
-        """Effect on the channels in the window, and the force.
+        """Return the effect on the channels in the window, and the force.
 
         Parameters
         ----------
         parameters
             Rows of `PARAMETERS`, at least the first three, shape (k, p).
         window
-            Which samples.
+            The samples.
         side
-            Direction in which the beam presses, 1 or -1; None: the one in which it goes.
+            Direction in which the beam presses, 1 or -1; None: that of its motion.
         kernels
-            Kernels at the only place there is, one row; interpolated if None.
+            Kernels at the only position, one row; None: they are interpolated.
 
         Returns
         -------
@@ -168,18 +168,18 @@ class Touching:
         tables = (local.torque, local.shear)[: motion.innovations.shape[0]]
         return self.effects(tables, force, instant, window), force
 
-    def passed_on(self, parameters: Real, window: Window, moved_m: Real) -> Real:
-        """Effect on the channels of other free motions by way of the contact, (r, c, samples).
+    def passed_on(self, parameters: Real, window: WhitenedWindow, moved_m: Real) -> Real:
+        """Return the effect of other free motions through the contact, (r, c, samples).
 
         Parameters
         ----------
         parameters
-            Place, instant and logarithm of the stiffness of an obstacle at rest.
+            Position, instant and logarithm of the stiffness of an obstacle at rest.
         window
-            Which samples.
+            The samples.
         moved_m
-            What is added to the displacement at its place, on the free motion's steps from its
-            first on, shape (r, columns).
+            Change of the displacement at its position, on the free motion's steps from its first
+            on, shape (r, columns).
         """
         x, instant = parameters[:1], parameters[1:2]
         steps = self.steps(instant, window)
@@ -193,22 +193,22 @@ class Touching:
         tables = (local.torque, local.shear)[: self._motion.innovations.shape[0]]
         return self.effects(tables, -side * (pressing[1:] - pressing[0]), instants, window)
 
-    def steps(self, instant: Real, window: Window) -> int:
-        """How many steps lead from the earliest instant to the end of the window.
+    def steps(self, instant: Real, window: WhitenedWindow) -> int:
+        """Return the number of steps from the earliest instant to the end of the window.
 
         Parameters
         ----------
         instant
             Instants of touch, shape (k,).
         window
-            Which samples.
+            The samples.
         """
         step_s = self._kernels.step_s
         steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
         return min(max(steps, 4), self._kernels.steps)
 
     def side(self, parameters: Real) -> float:
-        """Direction in which the beam goes at a touch, 1 or -1.
+        """Return the direction of the beam's motion at a touch, 1 or -1.
 
         Parameters
         ----------
@@ -217,8 +217,10 @@ class Touching:
         """
         return float(self.approach(parameters[:1], parameters[1:2], 1)[1][0])
 
-    def effects(self, tables: tuple[Real, ...], force: Real, instant: Real, window: Window) -> Real:
-        """Effect of forces on the channels in the window, shape (k, c, samples).
+    def effects(
+        self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow
+    ) -> Real:
+        """Return the effect of forces on the channels in the window, shape (k, c, samples).
 
         Parameters
         ----------
@@ -229,30 +231,30 @@ class Touching:
         instant
             Instant of the first step of each, shape (k,).
         window
-            Which samples.
+            The samples.
         """
         motion = self._motion
         step_s = self._kernels.step_s
         every = round((motion.t[1] - motion.t[0]) / step_s)
         samples = window.end - window.first
         begin = (motion.t[window.first] - instant) / step_s
-        # Convolutions may be shifted before or after: so all have their steps at the samples.
+        # Convolution and shift commute: shifting first puts the steps of all at the samples.
         aligned = shifted(force, begin, (samples - 1) * every + 1)
         return responses(tables, aligned, every, samples)
 
     def approach(
         self, x: Real, instant: Real, steps: int, given: float | None = None
     ) -> tuple[Real, Real]:
-        """How far the free beam is beyond where it was at an instant, and to which side it goes.
+        """Return the motion of the free beam beyond its position at an instant, and its side.
 
         Parameters
         ----------
         x, instant
-            Places and instants, shape (k,).
+            Positions and instants, shape (k,).
         steps
-            How many steps from the instants on.
+            Number of steps from the instants on.
         given
-            The side, 1 or -1; None: the one to which it goes at the instant.
+            The side, 1 or -1; None: that of the motion at the instant.
 
         Returns
         -------
@@ -272,7 +274,7 @@ class Touching:
         return side[:, None] * (free - free[:, :1]), side
 
     def _on_steps(self, moved: Real, instant: Real, steps: int) -> Real:
-        """Return rows of displacements on the kernels' steps from an instant on each."""
+        """Return rows of displacements on the kernels' steps, each from its instant on."""
         motion = self._motion
         begin = (instant - motion.first_s) / motion.step_s
         between = max(1, round(motion.step_s / self._kernels.step_s))
@@ -285,7 +287,7 @@ class Touching:
 
 @dataclass(frozen=True, slots=True)
 class Descended:
-    """Where candidates have come to."""
+    """Minima of the candidates."""
 
     parameters: Real
     """Rows of `PARAMETERS`, shape (k, p)."""
@@ -296,12 +298,12 @@ class Descended:
 
 
 _SETTLED = 0.1
-"""A step that saves less, or fails although it promises no more, is the last one."""
+"""The iteration ends with a step that reduces the cost by less, or is predicted to and fails."""
 
 
 def descend(
     predict: Prediction,
-    window: Window,
+    window: WhitenedWindow,
     starts: Real,
     space: Space,
     rounds: int = 12,
@@ -312,7 +314,7 @@ def descend(
     Parameters
     ----------
     predict
-        Effect of candidates.
+        Function that predicts the effect of candidates.
     window
         The samples.
     starts
@@ -321,7 +323,7 @@ def descend(
         Ranges of their parameters.
     rounds
         Most iterations.
-    free
+        Which parameters of each start are free, shape (k, p); None: all.
         Which parameters of each start are to be changed, shape (k, p); None: all.
     """
     at = np.clip(starts, space.low, space.high)
@@ -343,7 +345,7 @@ def descend(
         move = np.clip(move, -8 * space.scale, 8 * space.scale)
         trial = np.clip(at[rows] + move, space.low, space.high)
         linear = r + np.einsum("knp,kp->kn", j, trial - at[rows])
-        promised = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
+        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", linear, linear)
         new_residual, new_jacobian = _linearised(predict, window, trial, space)
         new = np.einsum("kn,kn->k", new_residual, new_residual)
         gain = chi2[rows] - new
@@ -352,15 +354,17 @@ def descend(
         at[taken], chi2[taken] = trial[better], new[better]
         residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
         damping[rows] = np.where(better, damping[rows] / 6, damping[rows] * 8)
-        # Where contacts begin and end the residuals have bends: short steps may promise and fail.
-        active[rows[np.where(better, gain, promised) < _SETTLED]] = False
+        # Residuals have kinks where contacts begin and end: short steps may fail to reduce them.
+        active[rows[np.where(better, gain, predicted_gain) < _SETTLED]] = False
         if not active.any():
             break
     return Descended(at, chi2, jacobian)
 
 
-def _linearised(predict: Prediction, window: Window, at: Real, space: Space) -> tuple[Real, Real]:
-    """Residuals (k, n) and their derivatives (k, n, p)."""
+def _linearised(
+    predict: Prediction, window: WhitenedWindow, at: Real, space: Space
+) -> tuple[Real, Real]:
+    """Return residuals (k, n) and their derivatives (k, n, p)."""
     width = at.shape[1]
     shifts = np.where(at + space.difference > space.high, -space.difference, space.difference)
     rows = np.concatenate([at, *(at + np.eye(width)[i] * shifts for i in range(width))])
@@ -370,18 +374,18 @@ def _linearised(predict: Prediction, window: Window, at: Real, space: Space) -> 
 
 
 class Starts:
-    """Grid of starts over place, instant and stiffness, marched together in coarse steps.
+    """Grid of starts over position, instant and stiffness, integrated together in coarse steps.
 
     Parameters
     ----------
     kernels
         Contact kernels whose step divides the sampling period.
     every
-        Every so many of their places is a start.
+        One in so many of their positions is a start.
     rate_hz
         Samples a second.
     samples
-        How many samples are compared.
+        Number of samples to compare.
     """
 
     __slots__ = ("_channels", "_every", "_kernel", "_ratio", "_samples", "_step_s", "_x_m")
@@ -391,7 +395,7 @@ class Starts:
         self._samples, self._every, self._step_s = samples, every, kernels.step_s
         steps = self._ratio * samples
         self._x_m = kernels.x_m[::every]
-        # Single precision is enough to choose starts by, and twice as fast.
+        # Single precision suffices for choosing starts, and is twice as fast.
         self._kernel = kernels.displacement[::every, :steps].astype(np.float32)
         lag = self._ratio * np.arange(samples)[:, None] - np.arange(steps)
         self._channels = [
@@ -399,10 +403,10 @@ class Starts:
             .transpose(0, 2, 1)
             .astype(np.float32)
             for table in (kernels.torque, kernels.shear)
-        ]  # (places, steps, samples)
+        ]  # (positions, steps, samples)
 
-    def marched(self, motion: FreeMotion, window: Window, latest: int) -> tuple[Real, Real]:
-        """March all starts, and return them with their sums of squared residuals.
+    def marched(self, motion: FreeMotion, window: WhitenedWindow, latest: int) -> tuple[Real, Real]:
+        """Integrate all starts, and return them with their sums of squared residuals.
 
         Parameters
         ----------
@@ -411,7 +415,7 @@ class Starts:
         window
             The samples.
         latest
-            Last sample at which the touch may be; the window's first is the earliest.
+            Last sample at which the touch may begin; the window's first is the earliest.
         """
         samples = np.arange(window.first + 1, latest + 1)
         batches = np.array_split(samples, -(-samples.size // _INSTANTS))
@@ -419,53 +423,53 @@ class Starts:
         starts = np.meshgrid(self._x_m, motion.t[samples], np.log(STIFFNESSES), indexing="ij")
         return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
-    def _chi2(self, motion: FreeMotion, window: Window, samples: NDArray[np.intp]) -> Real:
-        """Return the sums of squared residuals, shape (places, instants, kinds)."""
-        places, kinds = self._x_m.size, STIFFNESSES.size
+    def _chi2(self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]) -> Real:
+        """Return the sums of squared residuals, shape (positions, instants, kinds)."""
+        positions, kinds = self._x_m.size, STIFFNESSES.size
         length = window.end - int(samples[0])
         steps = self._ratio * length
         begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
         columns = begins[:, None] + np.arange(-1, steps)
         last = motion.displacement_m.shape[1] - 1
         moved = motion.displacement_m[:: self._every][:, np.minimum(columns, last)]
-        # Axes: place, instant, step.
+        # Axes: position, instant, step.
         side = np.where(moved[:, :, 1] >= moved[:, :, 0], 1, -1)[:, :, None].astype(np.float32)
         approach = (side * (moved[:, :, 1:] - moved[:, :, 1:2])).astype(np.float32)
         pressing = march(
             self._kernel[:, :steps],
             np.repeat(approach, kinds, axis=1),
-            np.tile(STIFFNESSES.astype(np.float32), (places, samples.size)),
+            np.tile(STIFFNESSES.astype(np.float32), (positions, samples.size)),
             self._step_s,
         )
         force = -np.repeat(side, kinds, axis=1) * pressing
         predicted = np.zeros(
-            (places, samples.size, kinds, motion.noise.size, window.end - window.first),
+            (positions, samples.size, kinds, motion.noise.size, window.end - window.first),
             dtype=np.float32,
         )
         for channel in range(motion.noise.size):
             effect = force @ self._channels[channel][:, :steps, :length]
-            effect = effect.reshape(places, samples.size, kinds, length)
+            effect = effect.reshape(positions, samples.size, kinds, length)
             for i, sample in enumerate(samples):
                 count = window.end - sample
                 predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
         residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
         chi2: Real = np.einsum("kn,kn->k", residual, residual)
-        return chi2.reshape(places, samples.size, kinds)
+        return chi2.reshape(positions, samples.size, kinds)
 
 
 _INSTANTS = 16
-"""Instants of the starts that are marched at once."""
+"""Instants of the starts that are integrated at once."""
 STIFFNESSES = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 100000.0])
 """Stiffnesses of the starts, in N/m."""
 
 
-def chi2_of(predict: Prediction, window: Window, candidates: Real) -> Real:
-    """Sum of squared residuals of candidates, shape (k,).
+def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
+    """Return the sum of squared residuals of candidates, shape (k,).
 
     Parameters
     ----------
     predict
-        Their effect.
+        Function that predicts their effect.
     window
         The samples.
     candidates

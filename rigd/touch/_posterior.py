@@ -1,6 +1,6 @@
-"""What candidates are worth together: population Monte Carlo over place, instant and stiffness.
+"""Posterior of candidates: population Monte Carlo over position, instant and stiffness.
 
-The likelihood of a bouncing contact is rough, so curvatures at its minima tell too little of it.
+The likelihood of a bouncing contact is rough, so the curvatures at its minima do not describe it.
 Samples are drawn around the minima, weighted by their likelihood, and drawn again around the best
 of them (adaptive importance sampling with the weights of the deterministic mixture).
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 
 _FREEDOM = 4.0
-"""Degrees of freedom of the Student distributions that samples are drawn from: heavy tails."""
+"""Degrees of freedom of the Student distributions for drawing samples: heavy tails."""
 _CENTRES = 16
 
 
@@ -30,22 +30,22 @@ class Posterior:
     samples: Real
     """Rows of parameters, shape (n, p)."""
     weights: Real
-    """Adding up to 1, shape (n,)."""
+    """Weights with the sum 1, shape (n,)."""
     chi2: Real
     """Sum of squared residuals of each."""
 
     @property
     def effective(self) -> float:
-        """Number of samples of equal weight that would say as much."""
+        """Number of samples of equal weight with the same precision."""
         return float(1 / np.sum(self.weights**2))
 
     def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
-        """Weighted quantiles of a parameter.
+        """Return weighted quantiles of a parameter.
 
         Parameters
         ----------
         column
-            Which one.
+            Column of the parameter.
         levels
             Between 0 and 1.
         """
@@ -55,22 +55,22 @@ class Posterior:
         return np.interp(levels, cumulated, values[order])
 
     def mean(self, column: int) -> float:
-        """Weighted mean of a parameter.
+        """Return the weighted mean of a parameter.
 
         Parameters
         ----------
         column
-            Which one.
+            Column of the parameter.
         """
         return float(self.weights @ self.samples[:, column])
 
     def std(self, column: int) -> float:
-        """Weighted standard deviation of a parameter.
+        """Return the weighted standard deviation of a parameter.
 
         Parameters
         ----------
         column
-            Which one.
+            Column of the parameter.
         """
         deviation = self.samples[:, column] - self.mean(column)
         return float(np.sqrt(self.weights @ deviation**2))
@@ -88,12 +88,12 @@ def sampled(
     enough: float,
     smallest: Real,
 ) -> Posterior:
-    """Draw weighted samples of the posterior, the prior being uniform within the bounds.
+    """Draw weighted samples of the posterior, with a uniform prior within the bounds.
 
     Parameters
     ----------
     chi2_of
-        Sum of squared residuals of rows of parameters.
+        Function that returns the sum of squared residuals of rows of parameters.
     centres
         Minima, shape (k, p).
     covariances
@@ -107,21 +107,21 @@ def sampled(
     rounds
         Most rounds.
     enough
-        Effective number of samples after which no further round is drawn.
+        Effective number of samples that ends the rounds.
     smallest
-        Least standard deviation that samples are drawn with, shape (p,).
+        Least standard deviation for drawing samples, shape (p,).
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer
     width = centres.shape[1]
     low, high = bounds
-    share = np.full(len(centres), 1 / len(centres))
+    mixture = np.full(len(centres), 1 / len(centres))
     samples = np.empty((0, width))
     chi2 = np.empty(0)
     density = np.empty(0)
     proposals: list[tuple[Real, Real, Real]] = []
     posterior = None
     for _ in range(rounds):
-        chosen = rng.choice(len(centres), count, p=share)
+        chosen = rng.choice(len(centres), count, p=mixture)
         factors = np.linalg.cholesky(covariances)
         normal = rng.standard_normal((count, width))
         spread = np.sqrt(_FREEDOM / rng.chisquare(_FREEDOM, count))
@@ -130,7 +130,7 @@ def sampled(
         found = np.full(count, np.inf)
         if inside.any():
             found[inside] = chi2_of(drawn[inside])
-        proposals.append((centres, covariances, share))
+        proposals.append((centres, covariances, mixture))
         density = density + _density(samples, *proposals[-1]) if samples.size else density
         own = sum(_density(drawn, *each) for each in proposals)
         samples = np.concatenate([samples, drawn])
@@ -142,11 +142,11 @@ def sampled(
         posterior = Posterior(samples, weights, chi2)
         if posterior.effective > enough and len(proposals) > 1:
             break
-        # Tempered weights place the next round, so that one lucky sample does not take it all.
+        # Tempered weights choose the next centres, so that one lucky sample does not dominate.
         tempered = weights**0.5
         tempered /= tempered.sum()
         best = np.argsort(-tempered)[:_CENTRES]
-        centres, share = samples[best], tempered[best] / tempered[best].sum()
+        centres, mixture = samples[best], tempered[best] / tempered[best].sum()
         mean = tempered @ samples
         deviation = samples - mean
         local = np.minimum(
@@ -161,11 +161,11 @@ def sampled(
     return posterior
 
 
-def _density(samples: Real, centres: Real, covariances: Real, share: Real) -> Real:
-    """Density of a mixture of Student distributions, but for a constant factor."""
+def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> Real:
+    """Return the density of a mixture of Student distributions, except for a constant factor."""
     width = samples.shape[1]
     total = np.zeros(samples.shape[0])
-    for centre, covariance, weight in zip(centres, covariances, share, strict=True):
+    for centre, covariance, weight in zip(centres, covariances, mixture, strict=True):
         factor = np.linalg.cholesky(covariance)
         scaled = np.linalg.solve(factor, (samples - centre).T)
         distance = np.sum(scaled**2, axis=0)

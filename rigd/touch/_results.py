@@ -1,4 +1,4 @@
-"""What is told of a touch."""
+"""Results of the estimation of a touch."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,23 +11,23 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """A number and how well it is known."""
+    """An estimated number with its uncertainty."""
 
     value: float
-    """Its mean."""
+    """Mean."""
     std: float
     """Standard deviation."""
     interval_95: tuple[float, float]
-    """Where it lies in 95 of 100 records."""
+    """Interval that contains the true value in 95 of 100 records."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the estimate as a document of JSON types."""
         return {"value": self.value, "std": self.std, "interval_95": list(self.interval_95)}
 
 
 @dataclass(frozen=True, slots=True)
 class TouchEstimate:
-    """What one touch was."""
+    """Estimate of one touch."""
 
     x_m: Estimated | None
     """Distance of the point from the motor's axis."""
@@ -40,17 +40,17 @@ class TouchEstimate:
     kind: str
     """rigid (at rest, springy or not) | yielding | moving | knock | unknown."""
     model: str
-    """Where the model of the beam came from."""
+    """Source of the beam's model."""
     channels: int
     """1: torque alone; 2: with base shear."""
     samples: int
-    """How many samples after the detection it rests on."""
+    """Number of samples used after the detection."""
     chi2_per_degree: float
-    """Sum of squared residuals by what noise would leave: about 1 if explained."""
+    """Sum of squared residuals over that of noise: about 1 if explained."""
     places_m: Real
-    """Places of the likelihood, shape (m,); none if it was not asked for."""
+    """Positions of the likelihood, shape (m,); empty if not requested."""
     log_likelihood: Real
-    """Value at each place whatever the force, shape (m,)."""
+    """Log-likelihood at each position for any force, shape (m,)."""
     innovations: Real
     """Innovations of torque and shear in standard deviations, shape (channels, n)."""
     innovation_times_s: Real
@@ -62,11 +62,11 @@ class TouchEstimate:
 
     @property
     def explained(self) -> bool:
-        """Whether some obstacle or knock leaves nothing but noise."""
+        """Whether some obstacle or knock explains the record except for noise."""
         return self.time_s is not None
 
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
-        """Return it as a document of JSON types.
+        """Return the estimate as a document of JSON types.
 
         Parameters
         ----------
@@ -79,13 +79,13 @@ class TouchEstimate:
             time = replace(
                 time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
             )
-        told = {
+        named = {
             "x_m": self.x_m,
             "time_s": time,
             "force_n": self.force_n,
             "stiffness_n_per_m": self.stiffness_n_per_m,
         }
-        return {name: each and each.as_dict() for name, each in told.items()} | {
+        return {name: each and each.as_dict() for name, each in named.items()} | {
             "kind": self.kind,
             "model": self.model,
         }

@@ -1,4 +1,4 @@
-"""Filters between the beam and the samples of its torque and shear: what they do to a touch."""
+"""Filters between the beam and the samples of its torque and shear, and their effect on a touch."""
 
 from dataclasses import dataclass
 from math import pi, sqrt
@@ -29,7 +29,7 @@ class SensorFilter:
     order: int = 1
     """Order of that filter: 1, or 2 (Butterworth)."""
     weights: tuple[float, ...] = (1.0,)
-    """What of each of its records is in a sample, oldest first, adding up to 1."""
+    """Weight of each of the sensor's records in a sample, oldest first, with the sum 1."""
     spacing_s: float = 0.0
     """Time between two records."""
 
@@ -37,14 +37,14 @@ class SensorFilter:
     def of_records(
         cls, corner_hz: float, order: int, kind: str, records: int, spacing_s: float
     ) -> "SensorFilter":
-        """Return the filter of a sensor that makes several records a tick.
+        """Return the filter of a sensor that makes several records per tick.
 
         Parameters
         ----------
         corner_hz, order
             Its low-pass filter.
         kind
-            What makes a sample of the records: their "mean" over a tick, or a "triangle" over two.
+            How the records form a sample: their "mean" over a tick, or a "triangle" over two.
         records
             Records a tick.
         spacing_s
@@ -61,7 +61,7 @@ class SensorFilter:
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
     def response(self, s: ArrayLike) -> Complex:
-        """Return its response, delays included.
+        """Return the frequency response, delays included.
 
         Parameters
         ----------
@@ -70,12 +70,12 @@ class SensorFilter:
         """
         points = np.asarray(s, dtype=np.complex128)
         ages = self.spacing_s * np.arange(len(self.weights))[::-1]
-        told: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
+        values: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
         if self.corner_hz > 0:
             u = points / (2 * pi * self.corner_hz)
-            told /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
-        return told
+            values /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
+        return values
 
 
 NO_FILTER: Final = SensorFilter()
-"""A sensor that shows what there is."""
+"""Sensor without filters."""

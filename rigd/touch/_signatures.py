@@ -1,10 +1,10 @@
-"""Signatures of touches: what the innovations look like in the first ticks after a contact.
+"""Signatures of touches: the innovations in the first ticks after a contact.
 
-A touch far from the root shows late and with many signs, one of a soft obstacle rises slowly, and a
-hard one lets go of the beam at once. The contact is linear but for the letting go, so that its
-shape does not depend on the speed: with the motor held, the beam is marched against obstacles of a
-grid of places and stiffnesses, and the filter of the innovations makes of torque and base shear
-what the detector has to look for. Of those that look alike one is enough.
+A touch far from the root appears late and with many sign changes, one of a soft obstacle rises
+slowly, and a hard one releases the beam at once. The contact is linear except for the release, so
+that its shape does not depend on the speed. With the motor held, the contact is computed for
+obstacles of a grid of positions and stiffnesses; the filter of the innovations turns torque and
+base shear into the signatures for the detector. One of several similar signatures suffices.
 """
 
 from dataclasses import dataclass
@@ -19,32 +19,32 @@ from rigd.touch._innovations import InnovationFilter, Noise, ObservedBeam, obser
 from rigd.touch._kernels import contact_kernels
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-if TYPE_CHECKING:  # a loop that watches does not read models
+if TYPE_CHECKING:  # the control loop does not import models
     from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
 
-_PLACES = np.linspace(0.04, 1.0, 33)
-"""As shares of the length."""
+_POSITIONS = np.linspace(0.04, 1.0, 33)
+"""As fractions of the length."""
 _STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
 _AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
-"""Time from the contact to the tick that is judged."""
+"""Time from the contact to the tested tick."""
 _PHASES = 2
 """Instants of the contact within a tick: bending waves change their sign from tick to tick."""
 _FINER = 16
 """Steps of the calculation in a tick."""
 _ALIKE = 0.9
-"""Correlation with a signature above which no other is needed: of 6864 remain 500."""
+"""Correlation with a signature above which another one is redundant: of 6864 remain 500."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedBeam:
-    """What a `TouchDetector` knows of a beam."""
+    """Model and signatures of a beam for a `TouchDetector`."""
 
     observed: ObservedBeam
-    """The beam as it moves freely, with its noise."""
+    """Model of the free beam, with its noise."""
     signatures: Real
-    """What a touch looks like, from `signatures`."""
+    """Signatures of touches, from `signatures`."""
 
 
 def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBeam:
@@ -68,8 +68,8 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise: Noise) -> WatchedBe
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,
     )
-    looks = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
-    return WatchedBeam(observed, looks)
+    vectors = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
+    return WatchedBeam(observed, vectors)
 
 
 def signatures(
@@ -79,7 +79,7 @@ def signatures(
     model: ObservedBeam,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> Real:
-    """Return unit vectors of the last innovations after contacts at any place, of any age.
+    """Return unit vectors of the last innovations after contacts at any position, of any age.
 
     Parameters
     ----------
@@ -100,14 +100,14 @@ def signatures(
     ages = np.maximum(1, np.round(_AGES_S * rate_hz)).astype(int)
     ticks = int(ages.max())
     step_s = 1 / (_FINER * rate_hz)
-    places = beam.length_m * _PLACES
-    kernels = contact_kernels(beam, damping, places, step_s, _FINER * ticks + 1, sensor_filter)
-    approach = places[:, None] * step_s * np.arange(kernels.steps)
+    positions = beam.length_m * _POSITIONS
+    kernels = contact_kernels(beam, damping, positions, step_s, _FINER * ticks + 1, sensor_filter)
+    approach = positions[:, None] * step_s * np.arange(kernels.steps)
     per_tick = _impulse_responses(model, ticks)
 
     found = []
     for stiffness in _STIFFNESSES_N_PER_M:
-        force = march(kernels.displacement, approach, np.full(places.size, stiffness), step_s)
+        force = march(kernels.displacement, approach, np.full(positions.size, stiffness), step_s)
         readings = responses(
             (kernels.torque, kernels.shear), force, _FINER // _PHASES, _PHASES * ticks + 1
         )
@@ -124,7 +124,7 @@ def signatures(
 
 
 def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
-    """Return (2 · ticks, 2 · ticks): [torque, shear] of each tick times it are the innovations."""
+    """Return the matrix (2 · ticks, 2 · ticks) from [torque, shear] of each tick to innovations."""
     table = np.zeros((2 * ticks, 2 * ticks))
     for channel, impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
         filter_ = InnovationFilter(model)
@@ -137,9 +137,9 @@ def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
 
 
 def _distinct(rows: Real) -> Real:
-    """Return so many of the unit vectors that each of the others is like one of them.
+    """Return unit vectors such that each of the others is similar to one of them.
 
-    The next one is always that which is least like those before.
+    The next one is always the least similar to those before.
     """
     chosen = [0]
     likeness = np.abs(rows @ rows[0])

@@ -1,4 +1,4 @@
-"""What estimates of touches need of the beam and the rate only, prepared once."""
+"""Quantities for touches that depend on the beam and the rate only, computed once."""
 
 from typing import Final
 
@@ -6,24 +6,24 @@ import numpy as np
 
 from rigd.touch._blind import Blind
 from rigd.touch._free_motion import FreeBeam
-from rigd.touch._kernels import contact_kernels, cross_kernels, places
+from rigd.touch._kernels import contact_kernels, cross_kernels, positions
 from rigd.touch._model import TouchModel
 from rigd.touch._physical import Starts
 from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
 
 NOTICED_S: Final = (0.013, 0.04, 0.12)
-"""A touch is noticed at most so long after it: the longer ones are tried if the shorter fail."""
+"""Longest times from a touch to its detection: longer ones are tried if the shorter fail."""
 GRID_S: Final = 0.022
-"""After the detection: what the grid of starts is compared with."""
+"""Time after the detection for the comparison with the grid of starts."""
 _SPACING_M = 0.007
 
 
 class Tables:
-    """What depends on the model and the rate only."""
+    """Quantities that depend on the model and the rate only."""
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
-        self.x_m = places(model.beam.length_m, _SPACING_M)
+        self.x_m = positions(model.beam.length_m, _SPACING_M)
         finer = 4 * max(1, round(4000 / rate_hz))
         steps = round((FINAL_S + NOTICED_S[-1] + 0.01) * rate_hz * finer)
         self.finest = contact_kernels(
@@ -51,10 +51,10 @@ class Tables:
             for name, std in model.std.items()
             if std > 0
         ]
-        """The beam with each uncertain parameter one standard deviation off."""
+        """Beams with one uncertain parameter changed by one standard deviation each."""
 
     def starts(self, samples: int) -> Starts:
-        """Grid of starts for so many samples."""
+        """Return the grid of starts for a number of samples."""
         if samples not in self._starts:
             self._starts[samples] = Starts(self.coarse, 2, self.rate_hz, samples)
         return self._starts[samples]

@@ -1,7 +1,7 @@
-"""What is uncertain, and what it does to the innovations of a touch.
+"""Uncertainties, and their effects on the innovations of a touch.
 
-The model's parameters, the steps of the march, what is unknown of the free motion and the steps of
-the encoder, also by where each lets the beam touch.
+Includes the model's parameters, the steps of the integration, the free motion and the encoder's
+steps, with their effects on the instant of touch.
 """
 
 import numpy as np
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from rigd.touch._free_motion import BEFORE, FINER, TouchRecord
 from rigd.touch._kernels import contact_kernels
-from rigd.touch._physical import Touching, Window
+from rigd.touch._physical import Touching, WhitenedWindow
 from rigd.touch._tables import Tables
 
 Real = NDArray[np.float64]
 
 
-def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -> Real:
-    """Effects on the innovations of what is uncertain, one standard deviation each, (c, n, r).
+def deviations(tables: Tables, record: TouchRecord, best: Real, whole: WhitenedWindow) -> Real:
+    """Return the effects of uncertainties on the innovations, (c, n, r), for 1 standard deviation.
 
     Parameters
     ----------
@@ -25,9 +25,9 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -
     record
         The samples.
     best
-        Place, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
+        Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
     whole
-        The samples wanted, whose first is certainly before the touch.
+        The samples, whose first is certainly before the touch.
     """
     motion, quiet = whole.motion, whole.first
     fine = Touching(tables.finest, tables.x_m, motion).predicted(best, whole)[0][0]
@@ -57,26 +57,26 @@ def deviations(tables: Tables, record: TouchRecord, best: Real, whole: Window) -
     return np.stack(columns, axis=-1)
 
 
-def _ringing(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
-    """Effects of what is unknown of the free motion, also by where it lets the beam touch."""
+def _ringing(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
+    """Return the effects of the free motion's uncertainty, with that on the instant of touch."""
     motion = whole.motion
     spread = motion.spread
     count = motion.ringing.poles.size * 2
     there = best[:1] / tables.model.beam.length_m
     columns = motion.displacement_m.shape[1]
-    # Times from the record's beginning, as the amplitudes are meant.
+    # Times from the record's beginning, as for the amplitudes.
     t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(columns)
     moved = motion.ringing.at(there).displacement(t, spread[:count])[0]
     direct = motion.design[:, whole.first : whole.end] @ spread
     return direct.transpose(2, 0, 1) + touching.passed_on(best, whole, moved.T)
 
 
-def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: Window) -> Real:
-    """Effects of the encoder's steps, by where they let the beam touch."""
+def _angle_noise(tables: Tables, touching: Touching, best: Real, whole: WhitenedWindow) -> Real:
+    """Return the effects of the encoder's steps on the instant of touch."""
     motion = whole.motion
     samples = np.arange(whole.first, whole.end)
-    place = int(np.argmin(np.abs(tables.x_m - best[0])))
-    one = tables.free.per_sample(place, samples.size + 8)
+    nearest = int(np.argmin(np.abs(tables.x_m - best[0])))
+    one = tables.free.per_sample(nearest, samples.size + 8)
     # Columns begin four samples before the window.
     late = np.arange(motion.displacement_m.shape[1]) - 4 * FINER
     index = late[None, :] - FINER * (samples - whole.first - BEFORE)[:, None]

@@ -1,4 +1,4 @@
-"""From the samples of a session to the record of one touch, as the estimator takes it."""
+"""Conversion of a session's samples to the record of one touch for the estimator."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,21 +10,21 @@ from rigd.session.layout import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
 HISTORY_S: Final = 1.5
-"""Record before a detection that an estimate rests on."""
+"""Time before a detection that an estimate uses."""
 CONTACT_S: Final = 0.8
-"""For so long after a detection the beam of a search may still touch what it has met."""
+"""Time after a detection for which the beam of a search may still touch the obstacle."""
 LOOK_S: Final = 0.025
-"""Record after a detection that tells where to look."""
+"""Time after a detection for the advance search of the position."""
 FIRST_S: Final = 0.05
-"""Record after a detection that the first estimate rests on."""
+"""Time after a detection that the first estimate uses."""
 FINAL_S: Final = 0.2
-"""Record after a detection that the last estimate rests on."""
+"""Time after a detection that the last estimate uses."""
 
 
 def around_touch(
     samples: NDArray[np.void], tick: int, rate_hz: float, free_from: int = 0
 ) -> NDArray[np.void]:
-    """Return the samples that an estimate rests on: 1.5 s before the detection, 0.2 s after it.
+    """Return the samples of an estimate: 1.5 s before the detection, 0.2 s after it.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def around_touch(
     rate_hz
         Ticks a second.
     free_from
-        Tick before which the beam was in contact with something: nothing earlier is taken.
+        Tick before which the beam was in contact: nothing earlier is used.
     """
     ticks = samples["tick"].astype(np.int64)
     first = max(tick - round(HISTORY_S * rate_hz), free_from)
@@ -49,7 +49,7 @@ def touch_record(
     rate_hz: float,
     shear_projection: Sequence[float] | None,
 ) -> TouchRecord:
-    """Return samples around a detection as the estimator takes them; missed ticks interpolated.
+    """Return the record around a detection for the estimator, with missed ticks interpolated.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def test_direct_terms_dissipate_or_store():
 
 def test_refusal_names_the_error_achieved():
     achieved = realise(PAPER_BEAM, SETS["VI-omega"]).relative_error
-    with pytest.raises(RealisationError, match=rf"{achieved:.1e}.*1\.0e-07 was asked"):
+    with pytest.raises(RealisationError, match=rf"{achieved:.1e}.*1\.0e-07 was requested"):
         realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1e-7)
     assert realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1.01 * achieved)
 

@@ -157,7 +157,7 @@ def test_what_is_not_reached_in_its_time_is_said(rigd, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), ("No precision is asked for", "--damping 1%")),
+        ((), ("No precision is requested", "--damping 1%")),
         (("--damping", "much"), ("--damping much", "1% or 2:0.5%")),
         (("--damping", "-1%"), ("more than 0",)),
         (("--zeta", "2:1%"), ("no quantity of a mode",)),

@@ -14,7 +14,7 @@ from rigd.excitation.targets import parse_target
 
 RATE_HZ = 1000.0
 LINK = ESTIMATE.beam
-SHARE_OF_LIMITS = 0.9
+LIMIT_FRACTION = 0.9
 DAMPING = [parse_target("damping", "1%")]
 
 
@@ -40,7 +40,7 @@ def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
         return path, speed, np.diff(speed) * RATE_HZ
 
     largest = [np.abs(values).max() for values in derivatives(design.reference_rad)]
-    for piece in design.pieces:
+    for piece in design.segments:
         path = np.concatenate([np.zeros(3), piece.reference_rad, np.zeros(3)])
         for values, most, share in zip(derivatives(path), largest, (1e-5, 1e-4, 2e-3), strict=True):
             assert np.abs(values[:5]).max() < share * most
@@ -56,7 +56,7 @@ def test_the_loop_with_an_estimate_is_computed_once(rig):
 
 def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
     assert all(each.reached for each in design.expected)
-    assert not all(each.reached for each in design.pieces[0].now)
+    assert not all(each.reached for each in design.segments[0].now)
     assert design.reference_rad.size < 15.0 * RATE_HZ
     assert design.reference_rad.size == design.angle_rad.size
     assert [each.target.mode for each in design.expected] == [1, 2, 3]
@@ -68,7 +68,7 @@ def test_the_whole_session_keeps_the_limits_and_the_small_slopes(rig):
     alone = design_excitation(ESTIMATE, rig, DAMPING, 6.0)
     response = plant.respond(alone.reference_rad)
     torque = np.abs(response.torque_nm).max() + plant.friction_nm
-    assert torque < 1.05 * SHARE_OF_LIMITS * (plant.peak_torque_nm + plant.friction_nm)
+    assert torque < 1.05 * LIMIT_FRACTION * (plant.peak_torque_nm + plant.friction_nm)
     slope = tip_motion(LINK, ESTIMATE.damping, response.angle_rad, RATE_HZ).slope_rad
     # Ringing moves the motor a little, which no piece knows: the share left over is for that.
     assert 0.8 * 0.9 * 0.14 < slope < 0.14
@@ -136,7 +136,7 @@ def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned):
 
 def test_the_forecast_is_about_what_a_design_takes(design):
     taken_s = design.reference_rad.size / RATE_HZ
-    assert 0.4 < design.pieces[0].forecast.seconds / taken_s < 2.5
+    assert 0.4 < design.segments[0].forecast.seconds / taken_s < 2.5
 
 
 def test_one_mode_asked_for_is_the_one_that_is_driven(rig):
@@ -159,7 +159,7 @@ def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, sc
 
 
 def test_nothing_asked_and_nothing_to_drive_are_refused(rig, scanned):
-    with pytest.raises(ExcitationError, match="No precision is asked for"):
+    with pytest.raises(ExcitationError, match="No precision is requested"):
         next_piece(ESTIMATE, scanned, [], rig, 10.0)
     stiff = replace(ESTIMATE, beam=Beam(0.1, 4.7e-3, 0.090275))
     with pytest.raises(ExcitationError, match="no mode below 50 Hz"):

@@ -10,7 +10,7 @@ from rigd import excitation
 from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
-from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
+from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, time_fractions
 from rigd.runner import with_tip_slope
 from rigd.runner.planning import LoopPreview, excitation_for, plan_session
 
@@ -135,7 +135,7 @@ def test_the_split_is_the_best_there_is(rig):
         FoundMode(44.8, 0.0099, 0.0),
     ]
     bands = [Band.of_mode(mode, 1.0) for mode in modes]
-    shares = shares_of_time(bands, [0.025] * 3, rig)
+    shares = time_fractions(bands, [0.025] * 3, rig)
     assert shares.sum() == pytest.approx(1.0)
     damping = damping_of(modes, LINK)
     rates = []

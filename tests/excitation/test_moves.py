@@ -89,18 +89,18 @@ def test_the_shortest_move_leaves_no_vibration_and_keeps_the_limits(
     )
     assert np.abs(response.torque_nm).max() < 0.93 * profile.rig.motor.peak_torque_nm
     assert np.abs(response.velocity_rad_s).max() < 0.93 * profile.limits.velocity_rad_s
-    assert move.share < 0.93
+    assert move.limit_fraction < 0.93
     assert response.angle_rad[-1] == pytest.approx(distance_rad, abs=2e-3)
 
 
 def test_the_shortest_move_is_not_much_slower_than_the_bound(plant):
     """A move of the same reach in 5 % less time has no solution within the limits."""
-    from rigd.excitation._shortest_move import _Search
+    from rigd.excitation._shortest_move import _MoveSearch
 
     move = shortest_move(plant, 0.5)
     assert move.duration_s < 0.55 * 2 * np.pi / abs(plant.poles_rad_s[0])
-    search = _Search(plant, 0.5, 0.0, 1, None)
-    assert search._least_share(round(0.95 * move.reference_rad.size))[0] > 1.0
+    search = _MoveSearch(plant, 0.5, 0.0, 1, None)
+    assert search._least_limit_fraction(round(0.95 * move.reference_rad.size))[0] > 1.0
 
 
 def test_a_robust_move_bears_frequencies_that_are_wrong(plant, profile, ring_down_nm):
@@ -143,7 +143,7 @@ def test_moves_slow_down_for_the_limits(plant):
     ):
         slow = shortest_move(replace(plant, **{name: limit}), 1.0)
         assert slow.duration_s > 1.1 * fast.duration_s
-        assert slow.share < 0.95
+        assert slow.limit_fraction < 0.95
 
 
 def test_a_move_stays_within_the_angle(plant):

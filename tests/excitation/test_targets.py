@@ -37,7 +37,7 @@ def test_an_option_is_read(quantity, text, target, told):
         ("damping", "0%", "more than 0"),
         ("damping", "-1%", "more than 0"),
         ("alpha", "nan", "finite"),
-        ("damping", "1", "for a share of the value write 1%"),
+        ("damping", "1", "for a percentage of the value write 1%"),
         ("damping", "2:0.5", "write 2:0.5%"),
         ("lambda", "5", "no precision of lambda"),
         ("zeta", "2:5%", "no quantity of a mode"),

@@ -332,7 +332,7 @@ def test_use_in_the_wrong_order_or_with_broken_blocks_is_a_programming_error(kit
     writer.begin(kit.START_UTC_NS, kit.METADATA, {}, {})
     with pytest.raises(RuntimeError, match="twice"):
         writer.begin(kit.START_UTC_NS, kit.METADATA, {}, {})
-    with pytest.raises(RuntimeError, match="kept"):
+    with pytest.raises(RuntimeError, match="not discarded"):
         writer.discard()
     with pytest.raises(ValueError, match="119-byte"):
         writer.write_samples(bytes(118))

@@ -10,12 +10,12 @@ from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_sh
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
     Hat,
-    Line,
+    LaplaceLine,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
     lagrange,
-    places,
+    positions,
 )
 
 STEP_S = 1 / 8000
@@ -23,7 +23,7 @@ STEP_S = 1 / 8000
 
 @pytest.fixture(scope="module")
 def kernels():
-    return contact_kernels(LINK, DAMPED, places(LINK.length_m, 0.007), STEP_S, 400)
+    return contact_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), STEP_S, 400)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
 
 def test_kernels_between_places_are_those_of_the_exact_model():
     x, other = np.array([0.1, 0.3, 0.8]), np.array([0.25, 0.62, 0.7])
-    crossing = cross_kernels(LINK, DAMPED, places(LINK.length_m, 0.007), 2 * STEP_S, 400)
+    crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
     told = crossing.between(x, other, 300)
     hat = Hat(2 * STEP_S, 400)
     exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
@@ -93,7 +93,7 @@ def test_wider_hats_are_sums_of_narrow_ones(at_point):
 
 
 def test_a_line_gives_back_what_it_was_given():
-    line = Line(4096, 1e-3)
+    line = LaplaceLine(4096, 1e-3)
     t = np.arange(1000) * 1e-3
     wave = np.exp(-((t - 0.5) ** 2) / 2e-3)
     assert line.in_time(line.transformed(wave), 1000) == pytest.approx(wave, abs=1e-6)
@@ -109,10 +109,10 @@ def test_cubic_interpolation_is_exact_for_cubics():
 
 def test_few_nodes_tell_a_wave_at_all_places():
     """The shortest wave of 1 kHz on this beam is six to its length."""
-    x_m = places(LINK.length_m, 0.007)
+    x_m = positions(LINK.length_m, 0.007)
     nodes, between = chebyshev_nodes(x_m, 36)
-    at_places, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
-    assert np.abs(between @ at_nodes - at_places).max() < 1e-7
+    at_positions, at_nodes = (np.exp(12j * np.pi * x / LINK.length_m) for x in (x_m, nodes))
+    assert np.abs(between @ at_nodes - at_positions).max() < 1e-7
     assert x_m[0] < nodes.min() < nodes.max() < x_m[-1]
 
 
