@@ -23,7 +23,7 @@ from rigd.cli.options import (
     Force,
     Hardware,
     Meta,
-    NoLook,
+    NoQuickLook,
     Note,
     Obstacles,
     Operator,
@@ -130,7 +130,7 @@ def run_sessions(
     tip_slope_rad: TipSlope = None,
     hardware: Hardware = False,
     obstacle: Obstacles = None,
-    no_look: NoLook = False,
+    no_quick_look: NoQuickLook = False,
     watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
@@ -159,7 +159,7 @@ def run_sessions(
             tip_slope_rad=tip_slope_rad,
             quiet_stdout=as_json,
             hardware=hardware,
-            look=not no_look,
+            quick_look=not no_quick_look,
             obstacles=obstacle or (),
             from_angle=kind in ("move", "touch"),
             watch_fit=watch_fit,
@@ -431,13 +431,13 @@ def until(
 
     Example: rigd run until --damping 1% --at-most 60
     """
-    asked = [
+    precisions = [
         *(("damping", text) for text in damping or ()),
         *(("frequency", text) for text in frequency or ()),
         *(("zeta", zeta), ("alpha", alpha), ("gamma", gamma), ("lambda", lambda_)),
     ]
     return {
-        "targets": "; ".join(f"{name} {text}" for name, text in asked if text is not None),
+        "targets": "; ".join(f"{name} {text}" for name, text in precisions if text is not None),
         "at_most_s": at_most_s,
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,

@@ -25,14 +25,14 @@ from rigd.runner.request import load_rig, what_is_kept
 from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
 from rigd.runtime import RigLock, StopRequest
 
-_LOOK_PATIENCE_S: Final = 10.0
+_QUICK_LOOK_PATIENCE_S: Final = 10.0
 """Longest wait for the last quick look at the end, without the time for which it waits for a
 processor that other programs use."""
-_LOOK_LONGEST_S: Final = 120.0
+_LONGEST_QUICK_LOOK_S: Final = 120.0
 """Longest wait for it in all."""
 _POLL_S: Final = 0.05
 
-_Tell = Callable[[str], None]
+_Print = Callable[[str], None]
 
 
 class SeriesFailedError(FailureError):
@@ -72,7 +72,7 @@ def run_in_foreground(
     accept: Sequence[str] = (),
     quiet_stdout: bool,
     hardware: bool = False,
-    look: bool = False,
+    quick_look: bool = False,
     from_angle: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
@@ -122,15 +122,15 @@ def run_in_foreground(
     SeriesFailedError
         If one cannot be run, or failed.
     """
-    tell: _Tell = partial(_tell, err=quiet_stdout)
+    write: _Print = partial(_print, err=quiet_stdout)
     results: list[SessionResult] = []
 
-    def told(look: QuickLook) -> None:
-        look.note(results)
-        for line in look.lines:
-            tell(line)
+    def report(quick_look: QuickLook) -> None:
+        quick_look.note(results)
+        for line in quick_look.lines:
+            write(line)
 
-    looks = QuickLooks(told) if look else None
+    quick_looks = QuickLooks(report) if quick_look else None
     try:
         # The rig is given up last, when no process uses the devices any more.
         with contextlib.ExitStack() as reserved, group:
@@ -143,9 +143,9 @@ def run_in_foreground(
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
             mounted = with_specimen(profile, specimen)
-            _tell(what_moves(profile.rig, moving), err=True)
+            _print(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
-                tell(f"Warning: the simulated rig has {difference}.")
+                write(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
@@ -166,15 +166,15 @@ def run_in_foreground(
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
-                tell(line)
+                write(line)
             if not (stop.requested or rig.connected):
                 rig.connect(moving)
-            with _Operator(series.ticks, repeat, tell) as operator:
-                series.run(rig, stop, operator, live=live, looks=looks)
+            with _Operator(series.ticks, repeat, write) as operator:
+                series.run(rig, stop, operator, live=live, looks=quick_looks)
         if stop.requested:
-            _tell_stop(results, repeat)
-        if looks is not None:
-            _await_looks(looks, stop)
+            _print_stop(results, repeat)
+        if quick_looks is not None:
+            _await_quick_looks(quick_looks, stop)
     except SessionFailedError as error:
         # Its processes have ended, so that what they have left can be told.
         results.append(error.result())
@@ -184,18 +184,18 @@ def run_in_foreground(
             raise
         raise SeriesFailedError(str(error), results) from error
     finally:
-        if looks is not None:
-            looks.close()
+        if quick_looks is not None:
+            quick_looks.close()
     return results
 
 
 class _Operator:
     """Tells the operator of a series; leaving its context takes the progress away."""
 
-    def __init__(self, ticks: int, repeat: int, tell: _Tell) -> None:
+    def __init__(self, ticks: int, repeat: int, write: _Print) -> None:
         self._ticks = ticks
         self._repeat = repeat
-        self._tell = tell
+        self._print = write
         self._line: ProgressLine | None = None
         self._number = ""
         self._where = ""
@@ -211,11 +211,11 @@ class _Operator:
         self._line = ProgressLine()
 
     def says(self, level: str, text: str) -> None:
-        self._tell(f"Warning: {text}" if level == "warning" else text)
+        self._print(f"Warning: {text}" if level == "warning" else text)
 
     def shown(self, where: str) -> None:
         if where != self._where:
-            self._tell(where)
+            self._print(where)
             self._where = where
 
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
@@ -236,11 +236,11 @@ class _Operator:
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
-        self._tell(result_line(result.as_dict()))
+        self._print(result_line(result.as_dict()))
         if result.path is not None:
             if result.live_dropped:
-                self._tell(f"The viewer dropped {result.live_dropped} samples; the file has them.")
-            self._tell(str(result.path))
+                self._print(f"The viewer dropped {result.live_dropped} samples; the file has them.")
+            self._print(str(result.path))
 
     def _close(self) -> None:
         if self._line is not None:
@@ -248,12 +248,12 @@ class _Operator:
             self._line = None
 
 
-def _tell(text: str, *, err: bool) -> None:
+def _print(text: str, *, err: bool) -> None:
     with contextlib.suppress(OSError):  # the terminal is gone; the session is not
         typer.echo(text, err=err)
 
 
-def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
+def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     """Give the last quick looks their time; another Ctrl-C skips them."""
     stop.sessions_are_over()
     before, skipped = stop.requested, False
@@ -263,30 +263,36 @@ def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
         skipped = True
 
     stop.on_request = skip
-    looks.attend()
-    if looks.busy:
-        _tell("Quick look at the session; Ctrl-C skips it.", err=True)
-    deadline_s = time.monotonic() + _LOOK_LONGEST_S
+    quick_looks.attend()
+    if quick_looks.busy:
+        _print("Quick look at the session; Ctrl-C skips it.", err=True)
+    deadline_s = time.monotonic() + _LONGEST_QUICK_LOOK_S
     while (
-        looks.busy
+        quick_looks.busy
         and not skipped
-        and looks.spent_s < _LOOK_PATIENCE_S
+        and quick_looks.spent_s < _QUICK_LOOK_PATIENCE_S
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_S)
-        looks.attend()
-    if looks.busy and not skipped:
-        why = "took too long" if looks.spent_s >= _LOOK_PATIENCE_S else "got no processor time"
-        _tell(
+        quick_looks.attend()
+    if quick_looks.busy and not skipped:
+        why = (
+            "took too long"
+            if quick_looks.spent_s >= _QUICK_LOOK_PATIENCE_S
+            else "got no processor time"
+        )
+        _print(
             f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
             err=True,
         )
     stop.requested = before  # what was skipped is not a session
 
 
-def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
+def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
     """Tell of a stop between two sessions or before the first; within one, the session tells."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
-    _tell(f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True)
+    _print(
+        f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True
+    )

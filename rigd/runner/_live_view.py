@@ -58,7 +58,7 @@ class LiveView:
         self._group = group
         self._job = LiveJob(rig, group.channels.specs)
         self._session: LiveSession | None = None
-        self._untold: list[Event] = []
+        self._unreported: list[Event] = []
         self._restarts = 0
         self._lost = ""
         self._shown = False
@@ -82,7 +82,7 @@ class LiveView:
         self._restarts = 0
         if self._lost:  # perhaps not any more
             self._start()
-        self._await(lambda: self._heard, _PATIENCE_S, stop)
+        self._await(lambda: self._answered, _PATIENCE_S, stop)
         begins = tuple(ring.written for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast), str(uuid.uuid4()), begins, order.path.parent
@@ -104,11 +104,11 @@ class LiveView:
         if not self._lost:
             self._feel_pulse()
 
-    def attend(self) -> list[Event]:
+    def poll(self) -> list[Event]:
         """Look, and return what the operator is to be told."""
         self.look()
-        told, self._untold = self._untold, []
-        return told
+        events, self._unreported = self._unreported, []
+        return events
 
     def touched(self, touches: Sequence[Mapping[str, Any]]) -> None:
         """Show touches of the session, as in JSON documents."""
@@ -135,7 +135,7 @@ class LiveView:
 
     def _start(self) -> None:
         """Start a new process."""
-        self._heard = False
+        self._answered = False
         self._lost = ""
         self._pulse = Pulse()
         try:
@@ -170,7 +170,7 @@ class LiveView:
                 self._shown = True
             case LiveAddress():
                 before, self.address = self.address, answer
-                self._heard = True
+                self._answered = True
                 if before is not None and before.viewer_url != answer.viewer_url:
                     self._note("info", f"Live view: {answer.viewer_url}")
             case _:
@@ -181,7 +181,7 @@ class LiveView:
 
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
-        patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
+        patience_s = LIVE.hung_after_s if self._answered else _START_PATIENCE_S
         beat = self._group.channels.board[Word.LIVE_BEAT]
         if self._pulse.look(beat, time.monotonic()) > patience_s:
             self._restart(f"The live process was killed: no response for {patience_s:g} s.")
@@ -197,7 +197,7 @@ class LiveView:
         self._start()
 
     def _note(self, level: Level, message: str) -> None:
-        self._untold.append(Event(0, level, message))
+        self._unreported.append(Event(0, level, message))
 
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:

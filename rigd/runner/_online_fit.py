@@ -16,7 +16,7 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import FIT, ChildError, Pulse
 from rigd.engine.shared_state import Event, Stop, Word
-from rigd.runner._precision_search import Stated, in_words, stated, targets_json
+from rigd.runner._precision_search import TargetEstimate, in_words, target_estimates, targets_json
 from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
@@ -29,14 +29,14 @@ _LAST_PATIENCE_S: Final = 60.0
 """Time for the fit of the whole record, when the torque is off; a stop skips it."""
 _STOP_PATIENCE_S: Final = 5.0
 _POLL_S: Final = 0.05
-_KEPT: Final = (
+_STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
 )  # fmt: skip
 """What of the last estimate goes into the file; the rest is what pieces are designed from."""
 
 
-class OnlineFit:
+class FitSupervisor:
     """What the fit process tells of one session.
 
     A session that goes on until a precision is reached ends with its last piece: when the process
@@ -73,12 +73,12 @@ class OnlineFit:
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
         self._group = group
-        self._board = group.channels.board
+        self._shared_state = group.channels.board
         self._search = search
         self._events: list[Event] = []
         self._news: list[Mapping[str, Any]] = []
-        self._pieces: list[Mapping[str, Any]] = []
-        self._told: FitTold | None = None
+        self._planned: list[Mapping[str, Any]] = []
+        self._last_report: FitTold | None = None
         self._ended: SearchEnded | None = None
         self._ready = self._begun = False
         self._lost = ""
@@ -111,7 +111,7 @@ class OnlineFit:
         self._begun = True
         self._send(header)
 
-    def attend(self) -> list[Event]:
+    def poll(self) -> list[Event]:
         """Take what has come, and return what the operator is to be told."""
         self._listen(0.0)
         if self._ready and not self._lost:
@@ -122,7 +122,7 @@ class OnlineFit:
     def _feel_pulse(self) -> None:
         """End a process that hangs."""
         assert FIT.hung_after_s is not None
-        still_s = self._pulse.look(self._board[Word.FIT_BEAT], time.monotonic())
+        still_s = self._pulse.look(self._shared_state[Word.FIT_BEAT], time.monotonic())
         if still_s > FIT.hung_after_s:
             self._group[FIT].kill()
             self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
@@ -144,26 +144,31 @@ class OnlineFit:
         """
         self._send(RecordEnded(ticks))
         begun_s = time.monotonic()
-        while self._begun and not (self._lost or (self._told is not None and self._told.final)):
+        while self._begun and not (
+            self._lost or (self._last_report is not None and self._last_report.final)
+        ):
             self._listen(_POLL_S)
             meanwhile()
-            if self._board[Word.STOP] != Stop.NO and time.monotonic() > begun_s + _STOP_PATIENCE_S:
+            if (
+                self._shared_state[Word.STOP] != Stop.NO
+                and time.monotonic() > begun_s + _STOP_PATIENCE_S
+            ):
                 self._skipped = "A stop skipped the fit of the whole record."
                 break
             if time.monotonic() > begun_s + _LAST_PATIENCE_S:
                 self._lose("The fit of the whole record took too long.")
-        told = {} if self._told is None else self._told.document
-        document = {key: told[key] for key in _KEPT if key in told}
+        estimate = {} if self._last_report is None else self._last_report.document
+        document = {key: estimate[key] for key in _STORED_KEYS if key in estimate}
         if self._search is not None:
             targets = self._search.targets
-            found = stated(document, targets) if "modes" in document else []
-            reached, self.shortcoming = self._judge(found)
+            found = target_estimates(document, targets) if "modes" in document else []
+            reached, self.shortcoming = self._assess(found)
             document["search"] = {
                 "asked": [str(target) for target in targets],
                 "targets": targets_json(found),
                 "reached": reached,
                 "reason": self.shortcoming or self._success,
-                "pieces": self._pieces,
+                "pieces": self._planned,
             }
         return document
 
@@ -179,15 +184,15 @@ class OnlineFit:
             return self._ended.reason
         return "Reached by the fit of the whole record."
 
-    def _judge(self, found: Sequence[Stated]) -> tuple[bool | None, str]:
+    def _assess(self, found: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
         """Return whether the whole record has what was asked for, and what is missing of it.
 
         Without a fit of the whole record that is not known, whatever was found on the way.
         """
-        told, ended = self._told, self._ended
+        report, ended = self._last_report, self._ended
         on_the_way = ended is not None and ended.reached
-        unknown = "" if told is None else str(told.document.get("problem") or "")
-        if told is None or not told.final:
+        unknown = "" if report is None else str(report.document.get("problem") or "")
+        if report is None or not report.final:
             unknown = self._lost or self._skipped or "The whole record was not fitted."
         elif not unknown and not found:
             unknown = "Its fit has no modes."
@@ -232,15 +237,15 @@ class OnlineFit:
             case FitReady():
                 self._ready = True
             case FitTold(document):
-                self._told = message
+                self._last_report = message
                 self._news.append(document)
                 self._events += [Event(0, "info", line, notable=True) for line in document["text"]]
             case PieceTold(name, document):
-                self._pieces.append({"name": name, **document})
+                self._planned.append({"name": name, **document})
                 self._events.append(Event(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
                 self._ended, self.segments = message, segments
-                self._board[Word.LAST_PIECE] = 1
+                self._shared_state[Word.LAST_PIECE] = 1
                 self._events.append(Event(0, "info", reason, notable=True))
             case Failed(reason):
                 self._lose(reason)
@@ -250,6 +255,6 @@ class OnlineFit:
         self._lost = why
         follows = "The session continues without fits."
         if self._search is not None and self._ended is None:
-            self._board[Word.LAST_PIECE] = 1
+            self._shared_state[Word.LAST_PIECE] = 1
             follows = "The session ends with what is planned."
         self._events.append(Event(0, "warning", f"{why} {follows}"))

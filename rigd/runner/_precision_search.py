@@ -33,10 +33,10 @@ _FORECAST_FROM: Final = 4
 """Estimates from which on the time left is forecast."""
 _HOPELESS: Final = 2.0
 """Forecast over the time that is left from which on a search is out of reach."""
-_SAID: Final = 3
+_HOPELESS_IN_A_ROW: Final = 3
 """Decisions in a row that have to find so before the search is given up."""
 _NOT_SEEN: Final = "not visible yet"
-_DOUBTED: Final = 4
+_DOUBTFUL_IN_A_ROW: Final = 4
 """Fits of all structures in a row of which no number is to be believed, before it is given up."""
 _WIDTH: Final = 22
 _SCANS: Final = 2
@@ -52,7 +52,7 @@ _OF_MODES: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 
 
 @dataclass(frozen=True, slots=True)
-class Stated:
+class TargetEstimate:
     """One quantity that is asked for, as a fit states it."""
 
     quantity: str
@@ -81,7 +81,9 @@ class Stated:
         return self.std / self.asked_std if self.asked_std > 0.0 else inf
 
 
-def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[Stated]:
+def target_estimates(
+    document: Mapping[str, Any], targets: Sequence[Target]
+) -> list[TargetEstimate]:
     """Return what an estimate states of everything that is asked for.
 
     Parameters
@@ -91,10 +93,10 @@ def stated(document: Mapping[str, Any], targets: Sequence[Target]) -> list[State
     targets
         What is asked for; of modes without a number, it is asked of each one in the band.
     """
-    return [each for target in targets for each in _stated(document, target)]
+    return [each for target in targets for each in _estimates_of(document, target)]
 
 
-def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
+def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[TargetEstimate]:
     key = _OF_MODES.get(target.quantity)
     if key is None:
         yield _read(target, document.get("parameters", {}).get(target.quantity))
@@ -107,19 +109,19 @@ def _stated(document: Mapping[str, Any], target: Target) -> Iterator[Stated]:
         yield found if mode["shown"] else replace(found, std=inf, doubt=_NOT_SEEN)
     if not modes:
         why = "no such mode was found in the band"
-        yield Stated(target.quantity, target.mode, None, inf, target.std, why)
+        yield TargetEstimate(target.quantity, target.mode, None, inf, target.std, why)
 
 
-def _read(target: Target, found: Mapping[str, Any] | None) -> Stated:
+def _read(target: Target, found: Mapping[str, Any] | None) -> TargetEstimate:
     of = target.quantity, target.mode
     if found is None or found["value"] is None:
-        return Stated(*of, None, inf, target.std, "it is not part of what was found")
+        return TargetEstimate(*of, None, inf, target.std, "it is not part of what was found")
     value, std, doubt = float(found["value"]), found["std"], found["flag"] or ""
     asked_std = target.std * (abs(value) if target.relative else 1.0)
-    return Stated(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
+    return TargetEstimate(*of, value, inf if doubt or std is None else float(std), asked_std, doubt)
 
 
-def beam_found(
+def beam_estimate(
     document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
 ) -> BeamEstimate:
     """Return the beam of an answer of the fit program, for the design of excitation.
@@ -150,22 +152,22 @@ def beam_found(
 
 
 @dataclass(slots=True)
-class _Stretch:
-    """Stretch of the reference, and of the record."""
+class _Interval:
+    """Interval of the reference and of the record."""
 
     name: str
     reference_rad: Real
-    place: int
-    """Its first tick in the reference."""
-    begins: int
-    """Its first tick in the record."""
+    reference_tick: int
+    """First tick in the reference."""
+    record_tick: int
+    """First tick in the record."""
 
     @property
     def size(self) -> int:
         return int(self.reference_rad.size)
 
 
-class Search:
+class ExcitationPlanner:
     """Decides on the pieces of one session.
 
     Parameters
@@ -203,23 +205,21 @@ class Search:
         self._rate_hz = profile.rig.rate_hz
         self._most_ticks = writer.ticks + writer.room
         first, scan_rad = search.scan
-        self._stretches = [_Stretch("scan", scan_rad, first, first)]
-        self._pieces = self._scans = 0
+        self._intervals = [_Interval("scan", scan_rad, first, first)]
+        self._segment_count = self._scans = 0
         self._shows_modes = self._judged = False
         self._hopeless = self._doubtful = 0
-        self._share = 1.0
+        self._tightening = 1.0
         self._course = _Course()
         self._factors: dict[str, float] = {}
         percent = search.uniformity_percent
-        stated = profile.uncertainty.uniformity_percent
-        self._uniformity = (stated if percent is None else percent) / 100.0
+        of_profile = profile.uncertainty.uniformity_percent
+        self._uniformity = (of_profile if percent is None else percent) / 100.0
         self._columns: list[str] = []
         self.due: int | None = first + scan_rad.size
         self.may_be_last = False
 
-    def answered(
-        self, document: Mapping[str, Any], held: int, held_before: int
-    ) -> Iterator[object]:
+    def decide(self, document: Mapping[str, Any], held: int, held_before: int) -> Iterator[object]:
         """Decide by an estimate; yields what the supervisor is to be told.
 
         Parameters
@@ -231,8 +231,8 @@ class Search:
         held_before
             Those of them before the piece that was begun last.
         """
-        last = self._stretches[-1]
-        last.begins = last.place + held_before
+        last = self._intervals[-1]
+        last.record_tick = last.reference_tick + held_before
         self._judged |= self.may_be_last
         if document["problem"] or "plant" not in document:
             problem = document["problem"] or "Nothing could be fitted."
@@ -242,12 +242,12 @@ class Search:
             else:
                 yield from self._scan_again(problem, held)
             return
-        found = stated(document, self._targets)
+        found = target_estimates(document, self._targets)
         time_s = document["tick"] / self._rate_hz
         self._course.note(time_s, max(each.ratio for each in found))
         doubt = document["doubt"] or ""
         # Doubts of the freest structure alone are looked into first.
-        yield self._told(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
+        yield self._report(document, found, time_s, quietly=bool(doubt) and not self.may_be_last)
         if self.may_be_last and all(each.ratio <= 1.0 for each in found):
             yield self._end(f"Reached: {in_words(found)}.", reached=True)
             return
@@ -256,27 +256,27 @@ class Search:
             if flagged and last.name == "pause" and not doubt:
                 # Precise enough by what was planned, and yet no property of the antenna.
                 doubt = f"{flagged[0].name}: {flagged[0].doubt}"
-                self._share *= _TIGHTER
+                self._tightening *= _TIGHTER
             self._doubtful = self._doubtful + 1 if doubt else 0
-        if self._doubtful >= _DOUBTED:
+        if self._doubtful >= _DOUBTFUL_IN_A_ROW:
             findings = " ".join(document["findings"])
             reason = f"The record is doubtful: {doubt}. {findings} Take a chirp."
             yield self._end(reason.replace("  ", " "), reached=False)
             return
         try:
-            estimate = beam_found(document, self._targets, self._uniformity)
+            estimate = beam_estimate(document, self._targets, self._uniformity)
             yield from self._go_on(estimate, document["tick"], found, held, doubt)
         except (RigdError, ArithmeticError, ValueError) as error:
             # An estimate so far off that nothing can be planned with it.
             yield from self._scan_again(str(error), held)
 
     @property
-    def looks_ahead(self) -> bool:
+    def needs_early_fit(self) -> bool:
         """Whether all structures are to be fitted to what there is, while the rest is played.
 
         Before a pause, after which the first judgement would otherwise start from nothing.
         """
-        return self._stretches[-1].name == "pause" and not self._judged and self.due is not None
+        return self._intervals[-1].name == "pause" and not self._judged and self.due is not None
 
     def is_begun(self, begun: int) -> bool:
         """Whether what was planned last is being played: only then is it known from which tick on.
@@ -286,7 +286,7 @@ class Search:
         begun
             Ticks of the reference up to the end of the piece that was begun last.
         """
-        return len(self._stretches) == 1 or begun > self._stretches[-1].place
+        return len(self._intervals) == 1 or begun > self._intervals[-1].reference_tick
 
     def ended(self, ticks: int, held_before: int, begun: int) -> SearchEnded:
         """Return what there is of a search whose record has ended after so many ticks.
@@ -296,15 +296,15 @@ class Search:
         ticks
             Ticks of the record.
         held_before
-            As for `answered`.
+            As for `decide`.
         begun
             As for `is_begun`.
         """
         if self.is_begun(begun):
-            last = self._stretches[-1]
-            last.begins = last.place + held_before
+            last = self._intervals[-1]
+            last.record_tick = last.reference_tick + held_before
         else:
-            self._stretches.pop()
+            self._intervals.pop()
         return self._end(self._too_long if ticks >= self._most_ticks else "", reached=False)
 
     @property
@@ -312,7 +312,12 @@ class Search:
         return f"Not reached within {self._most_ticks / self._rate_hz:g} s (--at-most)."
 
     def _go_on(
-        self, estimate: BeamEstimate, tick: int, found: Sequence[Stated], held: int, doubt: str
+        self,
+        estimate: BeamEstimate,
+        tick: int,
+        found: Sequence[TargetEstimate],
+        held: int,
+        doubt: str,
     ) -> Iterator[object]:
         """Append a piece, or a pause where what is planned is expected to suffice."""
         reference_rad = self._reference_rad(held)
@@ -327,7 +332,7 @@ class Search:
             return
         plant = self._rig.plant_with(estimate.loaded_beam)
         angle_rad = plant.respond(reference_rad).angle_rad
-        piece = next_piece(
+        segment = next_piece(
             estimate,
             angle_rad,
             self._aims(estimate, angle_rad[:tick], found),
@@ -336,26 +341,26 @@ class Search:
             tip_slope_rad=self._tip_slope_rad,
             through=self._through(found),
         )
-        if not self.may_be_last and all(each.ratio <= _ENOUGH for each in piece.now):
+        if not self.may_be_last and all(each.ratio <= _ENOUGH for each in segment.now):
             self._pause(PAUSE_S)
             return
-        never = [f"{each.impossible}." for each in piece.now if each.impossible]
+        never = [f"{each.impossible}." for each in segment.now if each.impossible]
         # Two ways to look ahead: from what pieces can tell, and from what they did tell.
-        slow = piece.forecast.seconds > _HOPELESS * left_s
+        slow = segment.forecast.seconds > _HOPELESS * left_s
         hopeless = never[0] if never else slow and self._course.hopeless(left_s)
         self._hopeless = self._hopeless + 1 if hopeless else 0
-        if self._hopeless >= _SAID:
+        if self._hopeless >= _HOPELESS_IN_A_ROW:
             yield self._end(f"Out of reach: {hopeless}", reached=False)
             return
-        self._pieces += 1
-        self._append(f"piece_{self._pieces}", piece.reference_rad)
-        self.due = self._stretches[-1].place
+        self._segment_count += 1
+        self._append(f"piece_{self._segment_count}", segment.reference_rad)
+        self.due = self._intervals[-1].reference_tick
         # What a uniform beam does not explain, another structure may: a clamp that gives way.
         self.may_be_last = bool(doubt) and not self.may_be_last
-        yield PieceTold(piece.name, self._document(piece, found))
+        yield PieceTold(segment.name, self._document(segment, found))
 
     def _aims(
-        self, estimate: BeamEstimate, angle_rad: Real, found: Sequence[Stated]
+        self, estimate: BeamEstimate, angle_rad: Real, found: Sequence[TargetEstimate]
     ) -> list[Target]:
         """Return the precisions to design for, in terms of what the design expects.
 
@@ -368,17 +373,17 @@ class Search:
             factor = by_name.get(each.target.name, inf) / max(each.std, 1e-300)
             factor = float(np.clip(factor, *_FACTORS)) if isfinite(factor) else 1.0
             self._factors[each.target.name] = factor
-            aims.append(replace(each.target, std=self._share * each.target.std / factor))
+            aims.append(replace(each.target, std=self._tightening * each.target.std / factor))
         return aims
 
-    def _through(self, found: Sequence[Stated]) -> list[int]:
+    def _through(self, found: Sequence[TargetEstimate]) -> list[int]:
         """Return modes that the next piece has to drive, because the record does not show them.
 
         A model may tell of such a mode by the others, as the design expects; the judgement of the
         record does not accept that. Every other piece is left to the design.
         """
         unseen = [each.mode for each in found if each.doubt == _NOT_SEEN and each.mode]
-        self._shows_modes = bool(unseen) and self._pieces > 0 and not self._shows_modes
+        self._shows_modes = bool(unseen) and self._segment_count > 0 and not self._shows_modes
         return unseen if self._shows_modes else []
 
     def _scan_again(self, why: str, held: int) -> Iterator[object]:
@@ -392,7 +397,7 @@ class Search:
 
     def _scan(self, name: str, held: int) -> bool:
         """Append the scan, as a stretch of another name; say whether there was time for it."""
-        scan_rad = self._stretches[0].reference_rad
+        scan_rad = self._intervals[0].reference_rad
         if self._most_ticks - self._writer.ticks - held < scan_rad.size:
             return False
         self._append(name, scan_rad)
@@ -405,21 +410,21 @@ class Search:
         self.due, self.may_be_last = self._writer.ticks, True
 
     def _append(self, name: str, reference_rad: Real) -> None:
-        place = self._writer.ticks
-        self._stretches.append(_Stretch(name, reference_rad, place, place))
+        tick = self._writer.ticks
+        self._intervals.append(_Interval(name, reference_rad, tick, tick))
         self._writer.append(reference_rad)
 
     def _reference_rad(self, held: int) -> Real:
         """Return the reference of the record up to the end of what is planned, shape (n,)."""
         whole = np.zeros(self._writer.ticks + held)
-        for each in self._stretches:
-            whole[each.begins : each.begins + each.size] = each.reference_rad
+        for each in self._intervals:
+            whole[each.record_tick : each.record_tick + each.size] = each.reference_rad
         return whole
 
-    def _told(
+    def _report(
         self,
         document: Mapping[str, Any],
-        found: Sequence[Stated],
+        found: Sequence[TargetEstimate],
         time_s: float,
         *,
         quietly: bool,
@@ -430,7 +435,9 @@ class Search:
         text = [] if quietly else self._rows(found, time_s, validity)
         return FitTold({**document, "search": state, "text": text})
 
-    def _rows(self, found: Sequence[Stated], time_s: float, validity: Validity) -> list[str]:
+    def _rows(
+        self, found: Sequence[TargetEstimate], time_s: float, validity: Validity
+    ) -> list[str]:
         """Return the next row of the table, with its heads where these are new."""
         rows = []
         columns = [each.name for each in found]
@@ -451,23 +458,25 @@ class Search:
         document
             Answer of the fit program.
         """
-        return {"targets": targets_json(stated(document, self._targets))}
+        return {"targets": targets_json(target_estimates(document, self._targets))}
 
-    def _document(self, piece: Piece, found: Sequence[Stated]) -> dict[str, Any]:
+    def _document(self, segment: Piece, found: Sequence[TargetEstimate]) -> dict[str, Any]:
         """Return what is expected of a piece, and what was stated when it was planned."""
         return {
-            "duration_s": piece.reference_rad.size / self._rate_hz,
+            "duration_s": segment.reference_rad.size / self._rate_hz,
             "stated": {each.name: each.std for each in found if isfinite(each.std)},
             "expected": [
                 {
                     "name": each.target.name,
                     "std": self._factors[each.target.name] * each.std,
-                    "asked_std": self._factors[each.target.name] * each.asked_std / self._share,
+                    "asked_std": self._factors[each.target.name]
+                    * each.asked_std
+                    / self._tightening,
                 }
-                for each in piece.expected
+                for each in segment.expected
                 if isfinite(each.std)
             ],
-            "share_of_limits": piece.share_of_limits,
+            "share_of_limits": segment.share_of_limits,
             "left_s": self._course.left_s,
         }
 
@@ -475,11 +484,11 @@ class Search:
         """End the search; the record ends with what is planned."""
         self.due = None
         segments = {
-            each.name: (each.begins, each.begins + each.size)
-            for each in self._stretches
+            each.name: (each.record_tick, each.record_tick + each.size)
+            for each in self._intervals
             if each.name != "pause"
         }
-        segments["sweep"] = (self._stretches[0].begins, self._most_ticks)
+        segments["sweep"] = (self._intervals[0].record_tick, self._most_ticks)
         return SearchEnded(reached, reason, segments)
 
 
@@ -521,7 +530,7 @@ class _Course:
         )
 
 
-def _cell(each: Stated) -> str:
+def _cell(each: TargetEstimate) -> str:
     """Write a quantity for the table: ratios and frequencies as people read them."""
     if each.value is None or each.doubt:
         return each.doubt if each.doubt == _NOT_SEEN else "doubtful"
@@ -530,13 +539,13 @@ def _cell(each: Stated) -> str:
     return f"{with_half_width(scale * each.value, (-half, half))}{unit}"
 
 
-def targets_json(found: Sequence[Stated]) -> list[dict[str, Any]]:
+def targets_json(found: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
     """Return what is stated of what is asked for, as JSON documents have it.
 
     Parameters
     ----------
     found
-        As of `stated`.
+        As of `target_estimates`.
     """
     return [
         {
@@ -552,7 +561,7 @@ def targets_json(found: Sequence[Stated]) -> list[dict[str, Any]]:
     ]
 
 
-def in_words(found: Sequence[Stated]) -> str:
+def in_words(found: Sequence[TargetEstimate]) -> str:
     """Say how precise everything is.
 
     Parameters
@@ -563,7 +572,7 @@ def in_words(found: Sequence[Stated]) -> str:
     return ", ".join(_one_in_words(each) for each in found)
 
 
-def _one_in_words(each: Stated) -> str:
+def _one_in_words(each: TargetEstimate) -> str:
     if each.value is None or each.doubt:
         return f"{each.name}: {each.doubt}"
     return f"{each.name} {each.value:.5g}, standard deviation {with_share(each.std, each.value)}"

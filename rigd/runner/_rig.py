@@ -19,7 +19,7 @@ from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
-from rigd.runner.session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner.session import SessionFailedError, SessionResult, SessionRun, Watcher, always
 from rigd.runner.signal_blocks import SignalBlock, SignalReader
 from rigd.runner.status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
@@ -75,7 +75,7 @@ class Rig:
         self._fast = fast
         self._live = live
         self._group = group
-        self._told: Connected | None = None
+        self._connection: Connected | None = None
         self._view: LiveView | None = None
         self._zero_set = False
         self._pulse = Pulse()
@@ -89,7 +89,7 @@ class Rig:
     @property
     def simulated(self) -> bool:
         """Whether no motor moves; known once connected."""
-        return self._told is not None and self._told.simulated
+        return self._connection is not None and self._connection.simulated
 
     @property
     def angle_rad(self) -> float:
@@ -105,12 +105,14 @@ class Rig:
     @property
     def calibration(self) -> Mapping[str, Any] | None:
         """Identity and calibration of the connected sensor; None while not connected."""
-        return None if self._told is None or not self.connected else self._told.calibration
+        return (
+            None if self._connection is None or not self.connected else self._connection.calibration
+        )
 
     @property
     def drive_statement(self) -> Mapping[str, str]:
         """What the connected drive states of itself; empty while not connected."""
-        return {} if self._told is None or not self.connected else self._told.drive
+        return {} if self._connection is None or not self.connected else self._connection.drive
 
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
@@ -142,9 +144,9 @@ class Rig:
             _lay_out(group, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
             job = ControlJob(self._profile, moving, group.channels.specs, self._fast)
             group.fresh(CONTROL).start(job)
-            told = self._ask(_CONNECT_PATIENCE_S)
-            assert isinstance(told, Connected)
-            self._told = replace(told, realtime={**told.realtime, **granted})
+            connection = self._ask(_CONNECT_PATIENCE_S)
+            assert isinstance(connection, Connected)
+            self._connection = replace(connection, realtime={**connection.realtime, **granted})
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
@@ -170,7 +172,7 @@ class Rig:
         stop
             The operator's, which ends it.
         watcher, listens
-            See :class:`rigd.runner.session.Session`.
+            See :class:`rigd.runner.session.SessionRun`.
 
         Raises
         ------
@@ -180,7 +182,7 @@ class Rig:
             If the file cannot be written, or the recorder died.
         """
         group = self._require()
-        assert self._told is not None
+        assert self._connection is not None
         if self.zero_lost:
             raise RigError(
                 "The zero of the angle was lost with the connection, and the limits with it; move "
@@ -190,7 +192,7 @@ class Rig:
             self._precedence.cover()
         _wipe(group.channels.board)
         group.channels.clear()
-        session = Session(order, group, self._told, self._view, watcher, listens)
+        session = SessionRun(order, group, self._connection, self._view, watcher, listens)
         outcome = reason = ""
         try:
             result = replace(session.run(stop), hardware=not self.simulated)
@@ -282,13 +284,13 @@ class Rig:
             If it is stopped, an interlock ends it, or the rig is lost.
         """
         group = self._require()
-        board = group.channels.board
+        shared_state = group.channels.board
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(board)
+        _wipe(shared_state)
 
         def request_stop() -> None:
-            board[Word.STOP] = Stop.OPERATOR
+            shared_state[Word.STOP] = Stop.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
@@ -301,7 +303,7 @@ class Rig:
             raise RigError(str(error)) from None
         finally:
             stop.on_request = _nothing
-            _wipe(board)
+            _wipe(shared_state)
         if isinstance(answer, Refused):
             raise RigError(answer.reason)
         assert isinstance(answer, Measured)
@@ -309,19 +311,19 @@ class Rig:
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
         """Wait for the result of a probing move, and watch over the control process meanwhile."""
-        board, pulse = group.channels.board, Pulse()
+        shared_state, pulse = group.channels.board, Pulse()
         assert CONTROL.hung_after_s is not None
         hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
         until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_PATIENCE_S
         while True:
             answer = group.control.poll(_POLL_S)
-            board.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
             if isinstance(answer, Ended):
                 raise RigError(answer.reason or "It was stopped.")
             if answer is not None:
                 return answer
             now_s = time.monotonic()
-            still_s = pulse.look(board[Word.CONTROL_BEAT], now_s)
+            still_s = pulse.look(shared_state[Word.CONTROL_BEAT], now_s)
             if still_s > hung_after_s or now_s > until_s:
                 group.control.kill()
                 raise RigError(
@@ -344,10 +346,10 @@ class Rig:
             message = group.control.poll(0.0)
         except ChildError as error:
             message = Ended(str(error))
-        board = group.channels.board
-        board.beat(Word.SUPERVISOR_BEAT)
+        shared_state = group.channels.board
+        shared_state.beat(Word.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
+        still_s = self._pulse.look(shared_state[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             group.control.kill()
             message = Ended(
@@ -459,13 +461,13 @@ def _nothing() -> None:
     """Leave a stop request to whoever polls it."""
 
 
-def _wipe(board: SharedState) -> None:
+def _wipe(shared_state: SharedState) -> None:
     """Clear the words of the board that belong to one session."""
-    board[Word.STOP] = Stop.NO
-    board[Word.GO] = 0
-    board[Word.LIVE_DROPPED] = 0
-    board[Word.PLANNED] = 0
-    board[Word.LAST_PIECE] = 0
+    shared_state[Word.STOP] = Stop.NO
+    shared_state[Word.GO] = 0
+    shared_state[Word.LIVE_DROPPED] = 0
+    shared_state[Word.PLANNED] = 0
+    shared_state[Word.LAST_PIECE] = 0
 
 
 def _lay_out(group: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:

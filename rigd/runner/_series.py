@@ -22,7 +22,7 @@ from rigd.runner.request import Order, check_required, choose_path, make_room
 from rigd.runner.session import SessionProgress, SessionResult, always
 from rigd.runtime import StopRequest
 
-_LOOK_PATIENCE_S: Final = 8.0
+_QUICK_LOOK_PATIENCE_S: Final = 8.0
 """Longest pause between two sessions of a series for the quick look at the first: two or three
 seconds are enough for most. What is not done by then is suspended."""
 _POLL_S: Final = 0.05
@@ -179,7 +179,7 @@ class Series:
             raise
         for number in range(1, self._repeat + 1):
             if looks is not None and number > 1:
-                _await_look(looks, rig, stop)
+                _await_quick_look(looks, rig, stop)
             if stop.requested:
                 return
             self._make_room()
@@ -239,9 +239,9 @@ class Series:
         make_room(self._folder, self._excitation, self._profile.limits)
 
 
-def _await_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
+def _await_quick_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
     """Give the quick look at the last session its time, before the next one suspends it."""
-    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
     while looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.watch()
         looks.attend()

@@ -135,7 +135,7 @@ class TouchEstimates:
         self._news: list[dict[str, Any]] = []
         self._lost = ""
         self._ready = False
-        self._told: dict[int, TouchTold] = {}
+        self._reports: dict[int, TouchTold] = {}
         job = TouchJob(
             group.channels.specs,
             group.channels.samples.written,
@@ -166,7 +166,7 @@ class TouchEstimates:
         self._listen(patience_s)
         return not self._lost
 
-    def attend(self) -> list[Event]:
+    def poll(self) -> list[Event]:
         """Take what has come, and return what the operator is to be told."""
         self._listen(0.0)
         events, self._events = self._events, []
@@ -192,17 +192,17 @@ class TouchEstimates:
         deadline_s = time.monotonic() + _LAST_PATIENCE_S
 
         def missing() -> bool:
-            final = [told for told in self._told.values() if told.final]
+            final = [report for report in self._reports.values() if report.final]
             return len(final) < touches and not self._lost and time.monotonic() < deadline_s
 
         while missing():
             self._listen(_POLL_S)
             meanwhile()
-        return [_document(number, self._told.get(number)) for number in range(1, touches + 1)]
+        return [_document(number, self._reports.get(number)) for number in range(1, touches + 1)]
 
     def packed(self) -> bytes:
         """Return the last estimates as messages for the session file."""
-        touches = [(told.tick, told.document) for _, told in sorted(self._told.items())]
+        touches = [(report.tick, report.document) for _, report in sorted(self._reports.items())]
         return packed_touches(touches, self._rate_hz)
 
     def news(self) -> list[dict[str, Any]]:
@@ -218,13 +218,13 @@ class TouchEstimates:
                 if isinstance(message, TouchReady):
                     self._ready = True
                 elif isinstance(message, TouchTold):
-                    self._told[message.number] = message
+                    self._reports[message.number] = message
                     self._note(message)
         except ChildError as error:
             self._lose(str(error))
 
-    def _note(self, told: TouchTold) -> None:
-        touch = _document(told.number, told)
+    def _note(self, report: TouchTold) -> None:
+        touch = _document(report.number, report)
         self._news.append(touch)
         self._events.append(Event(0, "info", touch_line(touch), notable=True))
 
@@ -234,8 +234,8 @@ class TouchEstimates:
         self._events.append(Event(0, "warning", text))
 
 
-def _document(number: int, told: TouchTold | None) -> dict[str, Any]:
-    if told is None:
+def _document(number: int, report: TouchTold | None) -> dict[str, Any]:
+    if report is None:
         return {"number": number}
     # The better estimate that a first one announces may never come.
-    return {"number": number, **told.document, **({} if told.final else {"final": False})}
+    return {"number": number, **report.document, **({} if report.final else {"final": False})}

@@ -56,7 +56,7 @@ class RefusedError(UserError):
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class SessionPrediction:
     """Largest magnitudes of a session that starts at the rig's zero, from the linear closed loop.
 
     The torque is not limited: what saturates shows as a peak beyond the motor's.
@@ -80,7 +80,7 @@ class Prediction:
 class Plan:
     """What a session is predicted to do, and whether the limits allow it."""
 
-    prediction: Prediction
+    prediction: SessionPrediction
     """What the session is predicted to do."""
     warnings: tuple[str, ...]
     """Sentences for the operator."""
@@ -146,7 +146,7 @@ class LoopPreview:
         """
         response = self._loop.simulate(reference_rad)
         firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
-        return _share(firm + forcible)
+        return _largest_fraction(firm + forcible)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the rig for planning a move.
@@ -361,26 +361,26 @@ def largest_amplitude(
     # Chirps count as all others here: what is offered keeps the range of the linear model.
     steepest = _slope(profile, predict(loop, excitation))
 
-    def share_at(amplitude_rad: float) -> float:
+    def fraction_at(amplitude_rad: float) -> float:
         scale = amplitude_rad / given_rad
         reference_rad = excitation.reference_rad * scale
         firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
         if steepest is not None:
             firm += (replace(steepest, value=steepest.value * scale),)
-        return _share(firm if force else firm + forcible)
+        return _largest_fraction(firm if force else firm + forcible)
 
     # All peaks are proportional to the amplitude, but for the friction compensation in the torque.
     amplitude_rad = min(given_rad, _MOST_RAD)
     for _ in range(_ROUNDS):
-        share = share_at(amplitude_rad)
-        if not 0.0 < share < math.inf:
+        fraction = fraction_at(amplitude_rad)
+        if not 0.0 < fraction < math.inf:
             return None
-        amplitude_rad = min(amplitude_rad / share, _MOST_RAD)
-        if 0.999 < share <= 1.0:
+        amplitude_rad = min(amplitude_rad / fraction, _MOST_RAD)
+        if 0.999 < fraction <= 1.0:
             break
     digit_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
     digits = math.floor(amplitude_rad / digit_rad)
-    while digits > 0 and not share_at(digits * digit_rad) <= 1.0:
+    while digits > 0 and not fraction_at(digits * digit_rad) <= 1.0:
         digits -= 1
     return float(f"{digits * digit_rad:.3g}") if digits else None
 
@@ -448,7 +448,7 @@ def _sweep_in_words(excitation: Excitation) -> str:
 
 def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
     """Say where a move goes, how long it takes, and what vibration it is predicted to leave."""
-    by_rad, angle_rad, duration_s, share, residual_nm, floor_nm, off_nm, quintic_nm = (
+    by_rad, angle_rad, duration_s, fraction, residual_nm, floor_nm, off_nm, quintic_nm = (
         float(parameters[name])
         for name in (
             *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
@@ -467,7 +467,7 @@ def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
         )
     return (
         f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
-        f"within 1 mrad {arrival} ({100 * share:.0f} % of the limits); vibration left {left}; "
+        f"within 1 mrad {arrival} ({100 * fraction:.0f} % of the limits); vibration left {left}; "
         f"a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
         f"{parameters['file'] or 'profile'})"
     )
@@ -491,14 +491,14 @@ def _scan_in_words(excitation: Excitation) -> str:
         float(excitation.parameters[name])
         for name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
     )
-    asked = ", ".join(str(target) for target in excitation.search.targets)
+    targets = ", ".join(str(target) for target in excitation.search.targets)
     return (
         f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_s:g} s at up to {amplitude_rad:.3g} rad, "
-        f"then excites what tells most until {asked} (standard deviation)"
+        f"then excites what tells most until {targets} (standard deviation)"
     )
 
 
-def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
+def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
     """Predict the peaks of a session.
 
     Parameters
@@ -534,8 +534,8 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     return replace(peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
-def _peaks(reference_rad: Real, response: LoopResponse) -> Prediction:
-    return Prediction(
+def _peaks(reference_rad: Real, response: LoopResponse) -> SessionPrediction:
+    return SessionPrediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
         peak_torque_nm=_peak(response.torque_nm),
@@ -545,7 +545,7 @@ def _peaks(reference_rad: Real, response: LoopResponse) -> Prediction:
 
 
 def predicted_metadata(
-    profile: Profile, predicted: Prediction, excitation: Excitation
+    profile: Profile, predicted: SessionPrediction, excitation: Excitation
 ) -> dict[str, str]:
     """Return the predicted peaks and their limits as a session's file has them.
 
@@ -605,7 +605,7 @@ class _Limited:
 
 
 def _limited(
-    profile: Profile, predicted: Prediction
+    profile: Profile, predicted: SessionPrediction
 ) -> tuple[tuple[_Limited, ...], tuple[_Limited, ...]]:
     """Return what no session may exceed, and what clips a torque."""
     limits, motor = profile.limits, profile.rig.motor
@@ -641,7 +641,7 @@ def _limited(
     return firm, forcible
 
 
-def _slope(profile: Profile, predicted: Prediction) -> _Limited | None:
+def _slope(profile: Profile, predicted: SessionPrediction) -> _Limited | None:
     """Return the slope of the tip with its limit for an identification; None without a beam."""
     if predicted.tip is None:
         return None
@@ -649,10 +649,10 @@ def _slope(profile: Profile, predicted: Prediction) -> _Limited | None:
     return _Limited("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
 
 
-def _share(channels: tuple[_Limited, ...]) -> float:
+def _largest_fraction(channels: tuple[_Limited, ...]) -> float:
     """Return the largest predicted peak as a share of its limit; NaN if one is not a number."""
-    shares = [channel.value / channel.limit for channel in channels]
-    return math.nan if any(map(math.isnan, shares)) else max(shares)
+    fractions = [channel.value / channel.limit for channel in channels]
+    return math.nan if any(map(math.isnan, fractions)) else max(fractions)
 
 
 def _sensor_limit_nm(profile: Profile) -> float:

@@ -31,7 +31,7 @@ _END_S: Final = 0.5
 """Longest wait, when this process ends, for a look that was killed."""
 _MOST_WAITING: Final = 3
 """Looks that wait; of more, the oldest is left out. Only sessions on each other's heels need it."""
-_MOST_SAID: Final = 500
+_LONGEST_ERROR: Final = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +75,9 @@ class QuickLook:
 
     def note(self, results: list[SessionResult]) -> None:
         """Note its file in the result of its session, if that is among these."""
-        for place, result in enumerate(results):
+        for index, result in enumerate(results):
             if result.path == self.session:
-                results[place] = replace(result, look=self.path)
+                results[index] = replace(result, look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as the event of the daemon has it."""
@@ -102,8 +102,8 @@ class QuickLooks:
         self._session = Path()
         self._held = False
         self._spent_s = 0.0
-        """Time that the running look has taken, at `_looked_s`."""
-        self._looked_s = 0.0
+        """Time that the running look has taken, at `_counted_s`."""
+        self._counted_s = 0.0
         self._processor_s = 0.0
         """Processor time that it had used then."""
 
@@ -126,8 +126,8 @@ class QuickLooks:
     def attend(self) -> None:
         """See how far the looks are, and tell; call it some times a second between sessions."""
         with self._lock:
-            told = [*self._see(), *self._go_on()]
-        for each in told:
+            ended = [*self._see(), *self._go_on()]
+        for each in ended:
             self._tell(each)
 
     @contextlib.contextmanager
@@ -141,7 +141,7 @@ class QuickLooks:
         finally:
             with self._lock:
                 self._held = False
-                self._looked_s = time.monotonic()
+                self._counted_s = time.monotonic()
                 self._signal(signal.SIGCONT)
 
     def close(self) -> None:
@@ -166,12 +166,12 @@ class QuickLooks:
                 # Not waited for: at a low priority it ends when others leave it the time.
                 self._process.kill()
             return
-        said = self._process.communicate()[1]
+        errors = self._process.communicate()[1]
         code, self._process = self._process.returncode, None
         if slow and code == -signal.SIGKILL:
             yield QuickLook.failed(self._session, f"it took longer than {_LONGEST_S:g} s.")
         elif code != 0:
-            words = said.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MOST_SAID]
+            words = errors.strip().rpartition("\n")[2].removeprefix("Error: ")[:_LONGEST_ERROR]
             yield QuickLook.failed(
                 self._session, words or f"its program ended with exit code {code}."
             )
@@ -181,7 +181,7 @@ class QuickLooks:
     def _count(self, pid: int) -> None:
         """Count the time that the running look has taken since the last call."""
         now_s = time.monotonic()
-        passed_s, self._looked_s = now_s - self._looked_s, now_s
+        passed_s, self._counted_s = now_s - self._counted_s, now_s
         if (found := processor_use(pid)) is not None:
             wants, processor_s = found
             used_s, self._processor_s = processor_s - self._processor_s, processor_s
@@ -196,7 +196,7 @@ class QuickLooks:
         if self._held or self._process is not None or not self._waiting:
             return
         self._session = self._waiting.popleft()
-        self._spent_s, self._processor_s, self._looked_s = 0.0, 0.0, time.monotonic()
+        self._spent_s, self._processor_s, self._counted_s = 0.0, 0.0, time.monotonic()
         try:
             self._process = subprocess.Popen(
                 [

@@ -318,10 +318,10 @@ def what_is_kept(path: Path | None) -> str:
         return "It has no file."
     part = part_of(path)
     try:
-        kept, whole = part.exists(), path.exists()
+        unfinished, whole = part.exists(), path.exists()
     except OSError as error:
         return f"Its folder {path.parent} cannot be read ({error.strerror})."
-    if not kept:
+    if not unfinished:
         return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
     if not holds_samples(part):
         return f"Nothing was recorded; {part} holds no sample and can be removed."

@@ -33,7 +33,7 @@ from rigd.engine.reference import is_whole, put_reference
 from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
-from rigd.runner._online_fit import OnlineFit
+from rigd.runner._online_fit import FitSupervisor
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._touch_search import TouchEstimates
 from rigd.runner.request import Order, another_path, file_header, part_of
@@ -67,7 +67,7 @@ class SessionFailedError(FailureError):
     ----------
     path
         File of the session, if one was begun.
-    kept
+    saved_path
         Path where the record was saved, if that is not the ``.part`` of the file.
     counts
         Counts of ticks, as far as known: ``scheduled``, ``missed``, ``late``,
@@ -75,13 +75,13 @@ class SessionFailedError(FailureError):
     """
 
     path: Path | None = None
-    kept: Path | None = None
+    saved_path: Path | None = None
     counts: Mapping[str, int] = _NO_TICKS
     hardware: bool | None = None
 
     def result(self) -> "SessionResult":
         """Return how the session ended, once its processes have."""
-        part, whole = self.kept, None
+        part, whole = self.saved_path, None
         if part is None and self.path is not None:
             try:
                 if part_of(self.path).exists():
@@ -197,7 +197,7 @@ Watcher = Callable[[SessionProgress, list[Event]], None]
 T = TypeVar("T")
 
 
-class Session:
+class SessionRun:
     """One session; :meth:`run` may be called once.
 
     Parameters
@@ -235,7 +235,7 @@ class Session:
         self._group = group
         self._connected = connected
         self._live = live
-        self._board = group.channels.board
+        self._shared_state = group.channels.board
         self._events = Observer(group.channels.events)
         self._watcher = watcher
         self._listens = listens
@@ -246,9 +246,9 @@ class Session:
         # Until it is enabled it is off; then the control process has to have seen that it is.
         self._drive_at_end = "The drive is disabled."
         self._opened: Path | None = None
-        self._kept: Path | None = None
+        self._saved_path: Path | None = None
         self._touches: TouchEstimates | None = None
-        self._fit: OnlineFit | None = None
+        self._fit: FitSupervisor | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -267,17 +267,17 @@ class Session:
         except (ChildError, SessionFailedError) as error:
             self._recorder_lost = self._recorder_lost or str(error)
             if self._control_at_work:
-                self._board[Word.STOP] = Stop.NO_RECORDER
+                self._shared_state[Word.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
             failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
-            failure.path, failure.kept = self._opened, self._kept
+            failure.path, failure.saved_path = self._opened, self._saved_path
             failure.counts = self._counts()
             raise failure from None
         finally:
             stop.on_request = _nothing
 
     def _stop(self) -> None:
-        self._board[Word.STOP] = Stop.OPERATOR
+        self._shared_state[Word.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
         group, search = self._group, self._order.excitation.search
@@ -299,7 +299,7 @@ class Session:
             self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
             self._touches.await_ready(self._reports)
         if search is not None or order.watch_fit:
-            self._fit = OnlineFit(group, profile, reference, search, realtime)
+            self._fit = FitSupervisor(group, profile, reference, search, realtime)
             lost = self._fit.await_ready(self._reports)
             if lost and search is not None:
                 raise SessionFailedError(lost)
@@ -324,7 +324,7 @@ class Session:
             if self._fit is not None:
                 self._fit.begin(header)
             self._ask_recorder(Armed)
-            self._board[Word.GO] = 1
+            self._shared_state[Word.GO] = 1
             answer = self._listen_to_control()
         if self._recorder_lost is not None:
             raise SessionFailedError(self._recorder_lost)
@@ -334,7 +334,7 @@ class Session:
     def _reports(self) -> bool:
         """Report while nothing moves yet; return whether the session is still wanted."""
         self._report()
-        return self._board[Word.STOP] == Stop.NO
+        return self._shared_state[Word.STOP] == Stop.NO
 
     def _open_file(self) -> None:
         """Have the file made, under another name if somebody else has just taken the one chosen."""
@@ -377,16 +377,16 @@ class Session:
             self._report()
             now_s = time.monotonic()
             # In lock-step with a simulated rig each tick may wait for replies that do not come.
-            torque = self._board[Word.PHASE] in _TORQUE_PHASES and not self._virtual
-            if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
-                phase = self._board[Word.PHASE]
+            torque = self._shared_state[Word.PHASE] in _TORQUE_PHASES and not self._virtual
+            if self._shared_state[Word.STOP] == Stop.NO or self._shared_state[Word.PHASE] != phase:
+                phase = self._shared_state[Word.PHASE]
                 patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
                 deadline = now_s + patience_s
             elif answer is None and now_s > deadline:
                 return self._kill_control(f"did not stop within {patience_s:g} s")
             assert CONTROL.hung_after_s is not None
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
-            still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
+            still_s = self._pulse.look(self._shared_state[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
@@ -394,7 +394,7 @@ class Session:
             if self._recorder_lost is None:
                 self._recorder_lost = self._recorder_trouble()
                 if self._recorder_lost is not None:
-                    self._board[Word.STOP] = Stop.NO_RECORDER
+                    self._shared_state[Word.STOP] = Stop.NO_RECORDER
 
     def _understood(self, answer: object) -> Ready | Finished:
         match answer:
@@ -434,7 +434,7 @@ class Session:
         """Make up the control process's result from its words on the board."""
         counts = self._counts()
         whole = is_whole(
-            self._board, counts["scheduled"], self._order.excitation.reference_rad.size
+            self._shared_state, counts["scheduled"], self._order.excitation.reference_rad.size
         )
         return Finished(
             outcome="complete" if whole else "fault",
@@ -444,9 +444,12 @@ class Session:
         )
 
     def _counts(self) -> dict[str, int]:
-        board = self._board
+        shared_state = self._shared_state
         # Before this session's record they stand where the last one left them.
-        return {name: board[word] if board[Word.GO] else 0 for name, word in _COUNTED.items()}
+        return {
+            name: shared_state[word] if shared_state[Word.GO] else 0
+            for name, word in _COUNTED.items()
+        }
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -454,7 +457,7 @@ class Session:
         except ChildError as error:
             return str(error)
         if isinstance(message, Failed):
-            self._kept = message.kept
+            self._saved_path = message.kept
             return message.reason
         return None if message is None else str(message)
 
@@ -471,35 +474,35 @@ class Session:
                 "disk."
             )
         if isinstance(message, Failed):
-            self._kept = message.kept
+            self._saved_path = message.kept
             raise (_NameTakenError if message.taken else SessionFailedError)(message.reason)
         if not isinstance(message, expected):
             raise SessionFailedError(f"The recorder process answers {message}.")
         return message
 
     def _report(self) -> None:
-        board = self._board
+        shared_state = self._shared_state
         if self._listens():
-            board.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
         events = read_events(self._events.take(16))
         if self._live is not None:
-            events += self._live.attend()
+            events += self._live.poll()
         if self._touches is not None:
-            events += self._touches.attend()
+            events += self._touches.poll()
             if self._live is not None:
                 self._live.touched(self._touches.news())
         fits: Sequence[Mapping[str, Any]] = ()
         if self._fit is not None:
-            events += self._fit.attend()
+            events += self._fit.poll()
             fits = self._fit.news()
             if self._live is not None:
                 self._live.fitted(fits)
         self._watcher(
             SessionProgress(
-                Phase(board[Word.PHASE]),
-                board[Word.SCHEDULED],
-                board[Word.MISSED],
-                board[Word.LATE],
+                Phase(shared_state[Word.PHASE]),
+                shared_state[Word.SCHEDULED],
+                shared_state[Word.MISSED],
+                shared_state[Word.LATE],
                 tuple(fits),
             ),
             events,
@@ -515,7 +518,7 @@ class Session:
             **finished.results,
         }
         if self._touches is not None:
-            touches = self._touches.finish(self._board[Word.TOUCHES], self._report)
+            touches = self._touches.finish(self._shared_state[Word.TOUCHES], self._report)
             outcome["touches"] = json.dumps(touches)
             self._report()
         fit: dict[str, Any] | None = None
@@ -555,7 +558,7 @@ class Session:
             fault=finished.fault
             or ended == "fault"
             or (self._fit is not None and bool(self._fit.failure)),
-            live_dropped=self._board[Word.LIVE_DROPPED],
+            live_dropped=self._shared_state[Word.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
             fit=fit,
         )

@@ -66,7 +66,7 @@ class SignalReader:
         time_constant_s = rig.motor.thermal_time_constant_s
         self._gauges = Gauges(rig.rate_hz, gauge_limits(profile), time_constant_s)
         self._seen: tuple[Ring, Observer] | None = None
-        self._looked_s = 0.0
+        self._read_s = 0.0
         self._gauged_s = 0.0
         self._ungauged: list[npt.NDArray[Any]] = []
         """Samples of the record since the last gauges."""
@@ -83,23 +83,23 @@ class SignalReader:
             The rings and words of the rig's processes.
         """
         now_s = time.monotonic()
-        ring, board = channels.samples, channels.board
-        if self._seen is None or self._seen[0] is not ring or now_s > self._looked_s + _ABANDONED_S:
+        ring, shared_state = channels.samples, channels.board
+        if self._seen is None or self._seen[0] is not ring or now_s > self._read_s + _ABANDONED_S:
             self._seen = ring, Observer(ring)
             self._last = None
             self._ungauged = []
             self._gauges.forget_angle()
-        self._looked_s = now_s
+        self._read_s = now_s
         blocks = list(self._blocks(self._seen[1], ring.written))
         if now_s - self._gauged_s < _GAUGES_S:
             return blocks
         self._gauged_s = now_s
         gauges = self._take_gauges()
         if not blocks:
-            at_work = board[Word.PHASE] != Phase.PREPARING
+            at_work = shared_state[Word.PHASE] != Phase.PREPARING
             peaks = {
-                "angle": abs(board[Word.ANGLE_NRAD]) * 1e-9 if at_work else None,
-                "torque_command": abs(board[Word.TORQUE_COMMAND_NNM]) * 1e-9,
+                "angle": abs(shared_state[Word.ANGLE_NRAD]) * 1e-9 if at_work else None,
+                "torque_command": abs(shared_state[Word.TORQUE_COMMAND_NNM]) * 1e-9,
                 "i2t": self._cool(0.0),
             }
             nothing = dict.fromkeys(_FIELDS, np.empty(0, dtype=np.float32))

@@ -205,23 +205,23 @@ class StatusWatch:
 
     def look(self, group: ProcessGroup) -> RigStatus:
         """Return the status now."""
-        board = group.channels.board
-        load_ppm = board.known(Word.BUS_LOAD_PPM)
+        shared_state = group.channels.board
+        load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
         return RigStatus(
-            phase=Phase(board[Word.PHASE]),
-            activity=activity(board),
-            angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
-            coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
-            torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,
-            tick=board[Word.SCHEDULED],
-            missed=board[Word.MISSED],
-            late=board[Word.LATE],
-            lost=board[Word.LOST],
+            phase=Phase(shared_state[Word.PHASE]),
+            activity=activity(shared_state),
+            angle_rad=shared_state[Word.ANGLE_NRAD] * 1e-9,
+            coupling_torque_nm=shared_state[Word.COUPLING_TORQUE_NNM] * 1e-9,
+            torque_command_nm=shared_state[Word.TORQUE_COMMAND_NNM] * 1e-9,
+            tick=shared_state[Word.SCHEDULED],
+            missed=shared_state[Word.MISSED],
+            late=shared_state[Word.LATE],
+            lost=shared_state[Word.LOST],
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=board.known(Word.BUS_ERRORS),
-            sensor_status=board.known(Word.SENSOR_STATUS),
-            disk_free_mb=board[Word.DISK_FREE_MB] or None,
-            view_dropped=board[Word.LIVE_DROPPED],
+            bus_errors=shared_state.known(Word.BUS_ERRORS),
+            sensor_status=shared_state.known(Word.SENSOR_STATUS),
+            disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
+            view_dropped=shared_state[Word.LIVE_DROPPED],
             signals=self._signals.look(group.channels.samples),
             processes=tuple(self._processes(group)),
             topics=tuple(self._topics(group)),
@@ -240,9 +240,9 @@ class StatusWatch:
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
     def _processes(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
-        board, now_s = group.channels.board, time.monotonic()
+        shared_state, now_s = group.channels.board, time.monotonic()
         for process in PROCESSES:
-            still_s = self._pulses[process].look(board[process.beat], now_s)
+            still_s = self._pulses[process].look(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue
