@@ -40,7 +40,7 @@
      |    +-- LoopError, CyclictestError      rigd bench could not measure
      +-- CommandError, RefusedByDaemonError   of either kind, as the daemon says
 
-The command line translates them in one place (`rigd.cli.options.errors_told`). What is no
+The command line translates them in one place (`rigd.cli.options.exit_on_errors`). What is no
 `RigdError` is a mistake in the program, and ends with a traceback; the control process ends with
 the torque off whatever it was.
 """

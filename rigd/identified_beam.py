@@ -262,11 +262,12 @@ def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) 
     for entry in modes if isinstance(modes, list) else []:
         if not isinstance(entry, dict) or not entry.get("shown", True):
             break
-        told = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
+        quantities = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
         hz, ratio, inertia = (
-            finite_number(each.get("value")) if isinstance(each, dict) else None for each in told
+            finite_number(each.get("value")) if isinstance(each, dict) else None
+            for each in quantities
         )
-        flags = [each.get("flag") for each in told if isinstance(each, dict)]
+        flags = [each.get("flag") for each in quantities if isinstance(each, dict)]
         if not hz or not ratio or hz < 0 or any(flags):
             break
         shown.append((hz, ratio, inertia))

@@ -131,7 +131,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     11 998 of 12 000 samples, 2 missed, 5 late
     """
     rare = ("lost", "stale_angles", "stale_wrenches")
-    told = [
+    counted = [
         f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
         *(f"{_count_text(counts[name])} {name}" for name in ("missed", "late")),
         *(
@@ -140,7 +140,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
             if name in counts and (counts[name] is None or int(counts[name]))
         ),
     ]
-    return ", ".join(told)
+    return ", ".join(counted)
 
 
 def _count_text(count: int | str | None) -> str:

@@ -64,8 +64,8 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
             env=os.environ | {"LC_ALL": "C"},
         )
     except (OSError, subprocess.SubprocessError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        raise CyclictestError(said[-1] if said else "it failed without a message") from error
+        message = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        raise CyclictestError(message[-1] if message else "it failed without a message") from error
     return measured(done.stdout, rate_hz)
 
 

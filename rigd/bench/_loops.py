@@ -28,14 +28,14 @@ from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.session.layout import decode_samples
 
-LOOK_S = 0.1
+_POLL_S = 0.1
 AROUND_S = 3.5
 """Time that a measurement takes beyond its record."""
 _BLOCK = 10_000
 _TARE_S = 0.2
 _NO_LIMIT = 1_000_000_000
 
-OnLook = Callable[[], None]
+OnPoll = Callable[[], None]
 
 
 class LoopError(FailureError):
@@ -116,7 +116,7 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Pr
         raise LoopError(str(error)) from error
 
 
-def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Measurement:
+def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> Measurement:
     """Run the loop with only a reader that empties the ring from time to time.
 
     Parameters
@@ -137,23 +137,23 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
     """
     rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
     with connected(profile) as (_, group):
-        channels, board = group.channels, group.channels.board
+        channels, shared_state = group.channels, group.channels.board
         meter = UsageMeter(group.control.pid)
-        board[Word.STOP] = Stop.NO
-        board[Word.GO] = 1
+        shared_state[Word.STOP] = Stop.NO
+        shared_state[Word.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
         group.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
         while not isinstance(finished, Finished):
-            finished = group.control.poll(LOOK_S)
-            board.beat(Word.SUPERVISOR_BEAT)
-            meter.look(Phase(board[Word.PHASE]))
+            finished = group.control.poll(_POLL_S)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
+            meter.look(Phase(shared_state[Word.PHASE]))
             while block := channels.samples.take(_BLOCK):
                 blocks.append(block)
             channels.controls.discard()
             channels.timings.discard()
-            look()
+            on_poll()
     _require(finished.outcome, finished.reason)
     return measurement(
         name,
@@ -166,7 +166,7 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
 
 
 def run_session(
-    name: str, profile: Profile, seconds: float, look: OnLook, *, live: bool = False
+    name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
 ) -> Measurement:
     """Run a whole session, as ``rigd run`` does, into a temporary file.
 
@@ -195,7 +195,7 @@ def run_session(
 
         def watch(progress: SessionProgress, _: object) -> None:
             meter.look(progress.phase)
-            look()
+            on_poll()
 
         result = rig.run(order, stop, watch)
         _require(result.outcome, result.reason)

@@ -22,7 +22,7 @@ LOADED = "… and load on other cores"
 HIGHEST_HZ = 16_000.0
 LOWEST_HZ = 100.0
 
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 """Told what is measured and for how many seconds the whole will still take, about."""
 
 
@@ -107,13 +107,19 @@ class Bench:
     """
 
     def __init__(
-        self, profile: Profile, *, rate_hz: float, seconds: float, spin_us: float, tell: Tell
+        self,
+        profile: Profile,
+        *,
+        rate_hz: float,
+        seconds: float,
+        spin_us: float,
+        on_progress: OnProgress,
     ) -> None:
         self._profile = profile
         self._rate_hz = rate_hz
         self._seconds = seconds
         self._spin_us = spin_us
-        self._tell = tell
+        self._on_progress = on_progress
         self._left_s = (2 * ROUNDS + 5) * (seconds + loops.AROUND_S)
         self._what = ""
         self._ends_s = 0.0
@@ -189,16 +195,16 @@ class Bench:
         rate_hz = rate_hz or self._rate_hz
         self._begin(name)
         profile = loops.rig_for(self._profile, rate_hz, self._spin_us)
-        return loops.run_session(name, profile, self._seconds, self._look, live=live)
+        return loops.run_session(name, profile, self._seconds, self._show_progress, live=live)
 
     def _alone(self) -> Measurement:
         self._begin(ALONE)
         profile = loops.rig_for(self._profile, self._rate_hz, self._spin_us)
-        return loops.run_alone(ALONE, profile, self._seconds, self._look)
+        return loops.run_alone(ALONE, profile, self._seconds, self._show_progress)
 
     def _peer(self, results: Results) -> Measurement | None:
         self._begin(cyclictest.NAME)
-        self._look()
+        self._show_progress()
         if not cyclictest.installed():
             results.no_peer = "not installed (package rt-tests)"
             return None
@@ -226,8 +232,8 @@ class Bench:
         self._left_s = max(0.0, self._left_s - duration_s)
         self._ends_s = time.monotonic() + duration_s
 
-    def _look(self) -> None:
-        self._tell(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
+    def _show_progress(self) -> None:
+        self._on_progress(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
 
 
 def core_of(granted: dict[str, str]) -> int:

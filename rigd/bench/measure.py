@@ -61,7 +61,7 @@ class UsageMeter:
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._looks: list[tuple[float, Usage]] = []
+        self._readings: list[tuple[float, Usage]] = []
 
     def look(self, phase: Phase) -> None:
         """Take a look, if the record is running."""
@@ -70,22 +70,22 @@ class UsageMeter:
                 usage = usage_of(self._pid)
             except OSError:
                 return  # this kernel keeps no such account
-            self._looks = [*self._looks[:1], (time.monotonic(), usage)]
+            self._readings = [*self._readings[:1], (time.monotonic(), usage)]
 
     @property
     def cpu_percent(self) -> float | None:
         """Share of a core; None if there were not two looks."""
-        if len(self._looks) < 2:
+        if len(self._readings) < 2:
             return None
-        (begin_s, first), (end_s, last) = self._looks
+        (begin_s, first), (end_s, last) = self._readings
         return 100.0 * (last.cpu_s - first.cpu_s) / (end_s - begin_s)
 
     @property
     def page_faults(self) -> int | None:
         """Page faults between them."""
-        if len(self._looks) < 2:
+        if len(self._readings) < 2:
             return None
-        return self._looks[1][1].page_faults - self._looks[0][1].page_faults
+        return self._readings[1][1].page_faults - self._readings[0][1].page_faults
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from rigd.cli.entry import run_command
 from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
-from rigd.cli.options import errors_told
+from rigd.cli.options import exit_on_errors
 from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
@@ -20,8 +20,8 @@ from rigd.cli.simulate import inject, simulate
 from rigd.printable import readable_errors
 
 
-def _tell(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"rigd {rigd.__version__}")
         raise typer.Exit
 
@@ -29,7 +29,9 @@ def _tell(asked: bool) -> None:
 def before_a_command(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Take the options that stand before a command; they have done their work by then."""
@@ -69,7 +71,7 @@ class RigdGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
-        with readable_errors(), errors_told():
+        with readable_errors(), exit_on_errors():
             return super().invoke(ctx)
 
 

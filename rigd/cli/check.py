@@ -179,8 +179,10 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
         Status("preparing", console=console) as status,
     ):
 
-        def tell(what: str, left_s: float) -> None:
+        def on_progress(what: str, left_s: float) -> None:
             status.update(f"{what}; {left_s // 60:.0f}:{left_s % 60:02.0f} left")
 
-        bench = Bench(profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, tell=tell)
+        bench = Bench(
+            profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress
+        )
         return bench.run()

@@ -22,7 +22,7 @@ from rigd.units import with_half_width
 
 if TYPE_CHECKING:
     from rigd.library import SessionRow
-    from rigd.library.trend import Change, ModeTrend, Quantity, TrendPoint
+    from rigd.library.trend import ModeChange, ModeTrend, Quantity, TrendPoint
 
 _WIDEST: Final = 24
 """Characters of a text in a table."""
@@ -114,14 +114,14 @@ def specimens() -> None:
         try:
             found = load_specimen(path)
         except ProfileError as error:
-            told = f"cannot be used: {str(error).splitlines()[0]}"
+            text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
             beam = found.beam
-            told = (
+            text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
                 f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
             )
-        typer.echo(readable_message(f"{name}: {told}"))
+        typer.echo(readable_message(f"{name}: {text}"))
 
 
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
@@ -255,13 +255,13 @@ def _interval(point: "TrendPoint", low: float, high: float) -> str:
     if high <= low:
         return ""
 
-    def place(frequency_hz: float) -> int:
+    def column_of(frequency_hz: float) -> int:
         return min(max(round((frequency_hz - low) / (high - low) * (_PLOT - 1)), 0), _PLOT - 1)
 
     value = point.frequency_hz["value"]
-    first, last = map(place, point.frequency_hz["interval_95"] or (value, value))
+    first, last = map(column_of, point.frequency_hz["interval_95"] or (value, value))
     drawn = ["─" if first <= column <= last else " " for column in range(_PLOT)]
-    drawn[place(value)] = "●"
+    drawn[column_of(value)] = "●"
     return "".join(drawn)
 
 
@@ -270,7 +270,7 @@ def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
     return f"{text} ?" if quantity["flag"] else text
 
 
-def _relative(change: "Change | None", first: float) -> str:
+def _relative(change: "ModeChange | None", first: float) -> str:
     if change is None or first == 0:
         return ""
     percent = 100 * change.difference / first

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
 
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def has_screen() -> bool:
@@ -55,13 +55,13 @@ def scratch_folder() -> Iterator[Path]:
 @contextlib.contextmanager
 def ended_gently() -> Iterator[None]:
     """Have every way of being asked to end mean Ctrl-C, so that temporary files go too."""
-    asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in asked]
-    raise_on(*asked)
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    raise_on(*numbers)
     try:
         yield
     finally:
-        for number, handler in zip(asked, before, strict=True):
+        for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 
 
@@ -134,7 +134,7 @@ def _only_one(rig: str | None) -> "LiveAddress | None":
 def _await(rig: str | None) -> "LiveAddress":
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
     while (view := _only_one(rig)) is None:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     return view
 
 
@@ -191,7 +191,7 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
 
     there = True
     while (code := viewer.exit_code) is None:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
         view = next(iter(find_views(shown.rig)), None)
         if view is not None and view.server != shown.server:
             if not viewer.connect(view):

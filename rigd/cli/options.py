@@ -32,7 +32,7 @@ def complain(message: str) -> None:
 
 
 @contextlib.contextmanager
-def errors_told() -> Iterator[None]:
+def exit_on_errors() -> Iterator[None]:
     """End the command with what an error of the rig says: 2 for a usage error, else 1."""
     try:
         yield
@@ -56,12 +56,12 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
     with contextlib.ExitStack() as stack:
         show: Callable[[float], None] | None = None
 
-        def on_progress(share: float) -> None:
+        def on_progress(fraction: float) -> None:
             nonlocal show
             if show is None and time.monotonic() - started > _QUIET_S:
                 show = stack.enter_context(_bar(name))
             if show is not None:
-                show(share)
+                show(fraction)
 
         yield on_progress
 
@@ -70,7 +70,7 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 def _bar(name: str) -> Iterator[Callable[[float], None]]:
     with progress_bar() as bar:
         task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        yield lambda fraction: bar.update(task, completed=fraction)
 
 
 # Options
@@ -148,7 +148,7 @@ TipSlope = Annotated[
     ),
 ]
 
-NoLook = Annotated[
+NoQuickLook = Annotated[
     bool,
     typer.Option(
         "--no-look", envvar="RIGD_NO_LOOK", help="Skip the quick look after each session."

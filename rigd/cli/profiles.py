@@ -54,10 +54,10 @@ def list_profiles() -> None:
 
     for name, (used, *hidden) in profile_files().items():
         try:
-            told = load_profile(used.path).description
+            description = load_profile(used.path).description
         except ProfileError as error:
-            told = f"cannot be used: {str(error).splitlines()[0]}"
-        typer.echo(printable(f"{name}: {told} ({used.path}, {used.origin})"))
+            description = f"cannot be used: {str(error).splitlines()[0]}"
+        typer.echo(printable(f"{name}: {description} ({used.path}, {used.origin})"))
         for other in hidden:
             typer.echo(printable(f"  hides {other.path} ({other.origin})"))
 
@@ -106,10 +106,10 @@ def copy(
     path = folder / f"{stem}.toml"
     copy_profile(profile, path, new_name)
     files = profile_files()[stem]
-    place = [file.path.resolve() for file in files].index(path.resolve())
-    if place:
+    position = [file.path.resolve() for file in files].index(path.resolve())
+    if position:
         typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
-    for other in files[place + 1 :]:
+    for other in files[position + 1 :]:
         typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
     typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {stem}")
 
@@ -141,7 +141,7 @@ def new(
     base = profile_named(start_from)
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
-    write_new(output, _asked(draft) if is_terminal() else draft.text())
+    write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
     for doubt in draft.doubts:
         typer.echo(f"Note: {doubt}", err=True)
     missing = draft.unanswered()
@@ -164,7 +164,7 @@ def is_terminal() -> bool:
     return sys.stdin.isatty()
 
 
-def _asked(draft: "Draft") -> str:
+def _ask_for_values(draft: "Draft") -> str:
     """Ask for what no file tells, until the answers make a profile; returns its text."""
     from rigd.profile import ProfileError
 

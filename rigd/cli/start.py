@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 _POLL_S = 0.2
-_LOOK_PATIENCE_S = 10.0
+_QUICK_LOOK_PATIENCE_S = 10.0
 """Longest wait for the last quick look at the end."""
 
 
@@ -138,8 +138,8 @@ def start_sessions(
         if not detach:
             client.ask("watch")
         with _Interrupts.caught() as interrupts:
-            told = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
-            if told["reply"] == "stop":
+            reply = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
+            if reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach and interrupts.count:
@@ -147,17 +147,19 @@ def start_sessions(
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach:
                 if as_json:
-                    typer.echo(json.dumps({"series": told["series"]}))
+                    typer.echo(json.dumps({"series": reply["series"]}))
                 else:
-                    _tell_plan(told["plan"], err=False)
+                    _print_plan(reply["plan"], err=False)
                     typer.echo(
                         "Running; rigd status shows the progress, rigd stop ends the session."
                     )
                 return
-            _tell_plan(told["plan"], err=as_json)
+            _print_plan(reply["plan"], err=as_json)
             # A daemon of before an update makes none, or does not tell at which sessions.
-            looks = daemon.get("quick_looks", False)
-            series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
+            quick_looks = daemon.get("quick_looks", False)
+            series = _follow(
+                client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
+            )
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
@@ -190,27 +192,27 @@ class _Interrupts:
 
 
 def _follow(
-    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, looks: bool
+    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, quick_looks: bool
 ) -> dict[str, Any]:
     """Show the progress of a series to its end, and return what the daemon says of it."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
 
-    asked = False
+    stop_sent = False
     done = 0
     awaited: set[str] = set()
     made: dict[str, str] = {}
     fits: dict[str, Any] = {}
     ended: dict[str, Any] | None = None
-    heard, deadline_s = 0, 0.0
+    interrupts_before, deadline_s = 0, 0.0
     line = ProgressLine()
     try:
         while ended is None or (awaited and time.monotonic() < deadline_s):
-            if ended is not None and interrupts.count > heard:
+            if ended is not None and interrupts.count > interrupts_before:
                 break
-            if interrupts.count and not asked:
-                asked = True
+            if interrupts.count and not stop_sent:
+                stop_sent = True
                 client.send("stop")
                 line.say("Stopping; press Ctrl-C again to leave while the daemon finishes.")
             if ended is None and interrupts.count > 1:
@@ -241,21 +243,21 @@ def _follow(
                     if event["path"] is not None:
                         if not as_json:
                             typer.echo(event["path"])
-                        if event.get("look_follows", looks):
+                        if event.get("look_follows", quick_looks):
                             awaited.add(event["path"])
                         if "fit" in event:
                             fits[event["path"]] = event["fit"]
                     line, done = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited:
                     awaited.discard(event["path"])
-                    look = QuickLook.of_event(event)
-                    if look.path is not None:
-                        made[event["path"]] = str(look.path)
-                    for text in look.lines:
+                    quick_look = QuickLook.of_event(event)
+                    if quick_look.path is not None:
+                        made[event["path"]] = str(quick_look.path)
+                    for text in quick_look.lines:
                         line.say(text)
                 case "series" if event["series"] == number:
-                    ended, heard = event, interrupts.count
-                    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+                    ended, interrupts_before = event, interrupts.count
+                    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
                     if awaited:
                         line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
@@ -269,7 +271,7 @@ def _follow(
     return ended | {"sessions": sessions}
 
 
-def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
+def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
     from rigd.runner import plan_lines
 
     for line in plan_lines(plan):

@@ -23,12 +23,12 @@ _SHOWN_TRANSITIONS = 4
 _BUSY_PERCENT = 80.0
 
 
-def print_status(told: dict[str, Any]) -> None:
+def print_status(status: dict[str, Any]) -> None:
     """Write it to standard output."""
-    Console(highlight=False).print(status_table(told))
+    Console(highlight=False).print(status_table(status))
 
 
-def status_table(told: dict[str, Any]) -> RenderableType:
+def status_table(status: dict[str, Any]) -> RenderableType:
     """Return it as something that rich can show.
 
     Parameters
@@ -39,37 +39,37 @@ def status_table(told: dict[str, Any]) -> RenderableType:
     head = Table(box=None, pad_edge=False, show_header=False)
     head.add_column(style="dim", no_wrap=True)
     head.add_column(overflow="fold")
-    for name, value in _rows(told):
+    for name, value in _rows(status):
         head.add_row(name, value)
     parts: list[RenderableType] = [head]
-    rig = told["rig"]
+    rig = status["rig"]
     if rig is not None:
-        recording = told["state"] in ("running", "stopping")
-        beside = Table.grid(padding=(0, 2, 0, 0))
-        beside.add_row(
+        recording = status["state"] in ("running", "stopping")
+        side_by_side = Table.grid(padding=(0, 2, 0, 0))
+        side_by_side.add_row(
             Group("", _signals(rig), "", _health(rig)),
             Group(
                 "", _processes(rig["processes"]), "", _topics(rig["topics"], recording=recording)
             ),
         )
-        parts.append(beside)
-    parts.append(_history(told["history"]))
+        parts.append(side_by_side)
+    parts.append(_history(status["history"]))
     return Group(*parts)
 
 
-def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
-    daemon, series, progress = (told[name] for name in ("daemon", "series", "progress"))
+def _rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
+    daemon, series, progress = (status[name] for name in ("daemon", "series", "progress"))
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
-    doing = f" ({told['doing']})" if told["doing"] else ""
-    word = told["state"]
+    doing = f" ({status['doing']})" if status["doing"] else ""
+    word = status["state"]
     if word == "running" and progress is not None:
         word = progress.get("activity", word)  # a daemon of before an update has none
-    state = Text(f"{word}{doing}", style=_STYLES.get(told["state"], ""))
-    state.append(f" since {_clock(told['since_utc_ns'])}: {told['reason']}", style="default")
+    state = Text(f"{word}{doing}", style=_STYLES.get(status["state"], ""))
+    state.append(f" since {_clock(status['since_utc_ns'])}: {status['reason']}", style="default")
     yield "state", state
-    if told["zero_lost"]:
+    if status["zero_lost"]:
         yield "zero", Text("lost with the connection: run rigd zero", style="bold yellow")
-    controller = told["controller"]
+    controller = status["controller"]
     yield (
         "control",
         Text(
@@ -83,7 +83,7 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     # A daemon of before an update tells none; one without lines is of a record that was lost.
     if series is not None and (lines := (series.get("fit") or {}).get("text")):
         yield "fit", Text("\n".join(lines))
-    rig = told["rig"]
+    rig = status["rig"]
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])
     if daemon.get("web") is not None:

@@ -27,7 +27,7 @@ _APPLICATION: Final = 0x72696764  # "rigd"
 _VERSION: Final = 3
 """Greater whenever the table, or what a row is made of, is another: older indexes are rebuilt."""
 _HEADER: Final = b"SQLite format 3\0"
-_APPLICATION_PLACE: Final = slice(68, 72)
+_APPLICATION_OFFSET: Final = slice(68, 72)
 _PATIENCE_S: Final = 2.0
 """Longest wait for another program that writes."""
 
@@ -162,11 +162,11 @@ class Index:
         """Tell whether the file is an index, or one that was begun and is still empty."""
         try:
             with self._path.open("rb") as file:
-                head = file.read(_APPLICATION_PLACE.stop)
+                head = file.read(_APPLICATION_OFFSET.stop)
         except OSError:
             return False
         mark = _APPLICATION.to_bytes(4, "big")
-        return not head or (head.startswith(_HEADER) and head[_APPLICATION_PLACE] == mark)
+        return not head or (head.startswith(_HEADER) and head[_APPLICATION_OFFSET] == mark)
 
     def _row(self, file: str, values: dict[str, object]) -> SessionRow:
         """Make a row of the columns.

@@ -93,7 +93,7 @@ class SessionRow:
         return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
 
 
-def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
+def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
     """Read what is known of a session; what cannot be read is told in the row.
 
     Parameters
@@ -122,7 +122,7 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[Sessio
 
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
-    results: dict[str, Any] = _modes(look, report)
+    results: dict[str, Any] = _modes(quick_look, report)
     if report is not None and (report / REPORT_PAGE).is_file():
         results["report"] = report / REPORT_PAGE
     try:
@@ -196,13 +196,13 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes(look: Path | None, report: Path | None) -> Document:
+def _modes(quick_look: Path | None, report: Path | None) -> Document:
     """Return modes and validity of the report, or else of the quick look; nothing without them."""
     if report is not None:
         for headline in _list(_document(report / NUMBERS), "headlines"):
             if modes := usable_modes(_list(headline, "modes")):
                 return _with_validity(modes, headline)
-    found = None if look is None else read_look(look)
+    found = None if quick_look is None else read_look(quick_look)
     return {} if found is None else _with_validity(usable_modes(found["modes"]), found)
 
 

@@ -133,14 +133,14 @@ class _Found:
     def __init__(self, entry: os.DirEntry[str]) -> None:
         self.path = Path(entry.path)
         self.stamp = _stamp_of(entry.path)
-        self.look: Path | None = None
+        self.quick_look: Path | None = None
         self.report: Path | None = None
 
-    def with_results(self, look: Path | None, report: Path | None) -> None:
+    def with_results(self, quick_look: Path | None, report: Path | None) -> None:
         """Take note of quick look and report, whose stamps become part of this one."""
-        self.look, self.report = look, report
-        if look is not None:
-            self.stamp += f" look {_stamp_of(look)}"
+        self.quick_look, self.report = quick_look, report
+        if quick_look is not None:
+            self.stamp += f" look {_stamp_of(quick_look)}"
         if report is not None:
             self.stamp += (
                 f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / REPORT_PAGE)}"
@@ -164,7 +164,7 @@ def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[Ses
     for number, name in enumerate(unread, start=1):
         file = found[name]
         try:
-            row, holds = read_row(file.path, file.look, file.report)
+            row, holds = read_row(file.path, file.quick_look, file.report)
         except OSError:  # it has gone, or has got its final name
             continue
         rows.append(row)
@@ -187,7 +187,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
         If it is not a folder, or cannot be read.
     """
     found: dict[str, _Found] = {}
-    looks: dict[str, Path] = {}
+    quick_looks: dict[str, Path] = {}
     reports: dict[str, tuple[int, Path]] = {}
     try:
         with os.scandir(folder) as entries:
@@ -196,7 +196,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
                 if name.endswith((SUFFIX, TORN_SUFFIX)):
                     found[name] = _Found(entry)
                 elif name.endswith(LOOK_SUFFIX):
-                    looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
+                    quick_looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
                 elif match := REPORT_FOLDER.fullmatch(name):
                     number = int((match[2] or "1")[:9])
                     if number >= reports.get(match[1], (0, None))[0]:
@@ -209,7 +209,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
     for name, file in found.items():
         if name.endswith(SUFFIX):
             stem = name.removesuffix(SUFFIX)
-            file.with_results(looks.get(stem), reports.get(stem, (0, None))[1])
+            file.with_results(quick_looks.get(stem), reports.get(stem, (0, None))[1])
     return found
 
 

@@ -18,7 +18,7 @@ Quantity = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ModeChange:
     """Difference of a quantity between two sessions."""
 
     difference: float
@@ -38,9 +38,9 @@ class TrendPoint:
     """Natural frequency."""
     damping_ratio: Quantity
     """Damping ratio."""
-    frequency_change: Change | None
+    frequency_change: ModeChange | None
     """Change since the mode's first session; None of that one."""
-    damping_change: Change | None
+    damping_change: ModeChange | None
     """Likewise of the damping ratio."""
 
 
@@ -70,7 +70,7 @@ class ModeTrend:
         }
 
 
-def change_between(before: Quantity, after: Quantity) -> Change:
+def change_between(before: Quantity, after: Quantity) -> ModeChange:
     """Compare a quantity of two sessions.
 
     Parameters
@@ -98,10 +98,10 @@ def change_between(before: Quantity, after: Quantity) -> Change:
     """
     difference = after["value"] - before["value"]
     if any(each.get("interval_95") is None or each.get("flag") for each in (before, after)):
-        return Change(difference, None)
+        return ModeChange(difference, None)
     low, high = (before, after) if difference >= 0 else (after, before)
     allowed = hypot(low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0])
-    return Change(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
+    return ModeChange(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
 
 
 def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
@@ -134,7 +134,7 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
                 trends.append([])
             taken.add(nearest)
             points = trends[nearest]
-            changes: tuple[Change | None, Change | None] = (None, None)
+            changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
             if points:
                 first = points[0]
                 changes = (
@@ -146,7 +146,7 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
     return [ModeTrend(tuple(points)) for points in trends]
 
 
-def _document(change: Change | None) -> dict[str, Any] | None:
+def _document(change: ModeChange | None) -> dict[str, Any] | None:
     if change is None:
         return None
     return {"difference": change.difference, "significant": change.significant}

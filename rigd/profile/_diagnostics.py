@@ -116,10 +116,10 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
             f"{peak:g} N·m; continuous torque must not exceed peak torque."
         )
-    asked = values["limits.torque_command_nm"]
-    if asked < peak:
+    limit_nm = values["limits.torque_command_nm"]
+    if limit_nm < peak:
         yield (
-            f"limits.torque_command_nm = {asked:g} N·m is below motor.peak_torque_nm = {peak:g} "
+            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = {peak:g} "
             "N·m, where commands saturate; the controller's command limit must be higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
@@ -129,7 +129,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             "the shaft could not come to rest before it is stopped by force."
         )
     yield from _out_of_reach(values)
-    yield from _not_beside_air(values)
+    yield from _incompatible_with_drag(values)
     yield from _hum(values)
     warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
     if drift < warning:
@@ -179,7 +179,7 @@ def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
+def _incompatible_with_drag(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the simulated rig cannot have together with drag of the air."""
     if not values.get("simulation.air_drag_m"):
         return
@@ -327,10 +327,10 @@ _RANGES = {
 
 def wrong(detail: ErrorDetails) -> str:
     """Complain about a value of the wrong type or out of its range."""
-    key, *place = detail["loc"]
+    key, *position = detail["loc"]
     if detail["type"] == "missing":  # one of the six
-        place = []
-    where = f"{key}[{place[0]}]" if place else str(key)
+        position = []
+    where = f"{key}[{position[0]}]" if position else str(key)
     what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
     if detail["type"] == "literal_error":
         remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')

@@ -97,7 +97,7 @@ class Draft:
         self._path = path
         self._findings = judgement.findings
         self._accepted: list[str] = []
-        self._settings = {setting.key: setting for setting in self._told()}
+        self._settings = {setting.key: setting for setting in self._eds_settings()}
         # The motor, gear and encoder of the profile started from are others: no number of theirs.
         for question in self.questions():
             if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
@@ -178,8 +178,8 @@ class Draft:
     def doubts(self) -> list[str]:
         """Remarks on this drive for the operator, in sentences."""
         findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
-        told = [f.sentence for f in findings if f.sentence]
-        return told + [
+        remarks = [f.sentence for f in findings if f.sentence]
+        return remarks + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
             "rigd check asks the drive."
             for f in findings
@@ -251,17 +251,19 @@ class Draft:
         """Return the names of what a profile has to accept that this drive has not."""
         return [finding.accept for finding in self._findings if finding.accept]
 
-    def _told(self) -> Iterator[Setting]:
+    def _eds_settings(self) -> Iterator[Setting]:
         """Yield what the file tells, and what follows from what the drive lacks."""
         eds, path = self._eds, self._path
         product = " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
         yield Setting("name", path.stem)
         yield Setting("description", f"{product}, from {eds.path.name}")
-        place = os.path.relpath(eds.path.resolve(), path.resolve().parent)
-        yield Setting("cia402.eds", place, reason="The file of the drive, from this folder on.")
-        for key, told in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
-            if told:
-                yield Setting(f"cia402.{key}", told, "datasheet", hexadecimal=True)
+        relative_path = os.path.relpath(eds.path.resolve(), path.resolve().parent)
+        yield Setting(
+            "cia402.eds", relative_path, reason="The file of the drive, from this folder on."
+        )
+        for key, number in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
+            if number:
+                yield Setting(f"cia402.{key}", number, "datasheet", hexadecimal=True)
         if eds.commissioned_node_id:
             why = "The node id for which the file configures the drive."
             yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", why)

@@ -22,7 +22,7 @@ from rigd.devices.parameters import RigParameters
 from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
-from rigd.profile._places import profile_files
+from rigd.profile._locations import profile_files
 from rigd.profile._schema import (
     OPTIONAL_SECTIONS,
     SECTIONS,

@@ -8,7 +8,7 @@ from rigd.beam import Beam, Damping
 from rigd.devices import WhatMoves, reality
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
-from rigd.profile._places import specimen_files
+from rigd.profile._locations import specimen_files
 from rigd.profile._schema import (
     SECTIONS,
     BeamSection,

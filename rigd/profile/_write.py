@@ -49,15 +49,15 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     """
     lines = text.splitlines()
     for setting in settings:
-        places = _places(lines)
+        indices = _line_indices(lines)
         line = _line(setting)
         new = [*_comment(setting.reason), f"# {line}" if setting.commented else line]
-        if setting.key in places:
-            place = places[setting.key]
-            lines[place : place + 1] = new
+        if setting.key in indices:
+            index = indices[setting.key]
+            lines[index : index + 1] = new
         else:
-            place = places[setting.key.rpartition(".")[0]] + 1
-            lines[place:place] = new
+            index = indices[setting.key.rpartition(".")[0]] + 1
+            lines[index:index] = new
     return "\n".join(lines) + "\n"
 
 
@@ -157,23 +157,23 @@ def _taken(path: Path) -> ProfileError:
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
-def _places(lines: Sequence[str]) -> dict[str, int]:
+def _line_indices(lines: Sequence[str]) -> dict[str, int]:
     """Return the number of the line on which each section and each key of a profile stands.
 
     A key that stands in a comment only has the comment's place.
     """
-    places: dict[str, int] = {}
+    indices: dict[str, int] = {}
     shown: dict[str, int] = {}
     section = ""
-    for place, line in enumerate(lines):
+    for index, line in enumerate(lines):
         if title := re.match(r"\[([^\]]+)\]", line):
-            places[title[1]] = place
+            indices[title[1]] = index
             section = title[1] + "."
         elif key := re.match(r"(\w+)\s*=", line):
-            places[section + key[1]] = place
+            indices[section + key[1]] = index
         elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in keys():
-            shown[section + key[1]] = place
-    return shown | places
+            shown[section + key[1]] = index
+    return shown | indices
 
 
 def _comment(text: str) -> list[str]:

@@ -111,9 +111,9 @@ def begin_background(parser: "ArgumentParser") -> "Namespace":
         What the command line says.
     """
     parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    asked = parser.parse_args()
-    if asked.parent is not None:
-        end_with(asked.parent)
+    arguments = parser.parse_args()
+    if arguments.parent is not None:
+        end_with(arguments.parent)
     killed_first()
     use_one_thread()
-    return asked
+    return arguments

@@ -92,11 +92,11 @@ def _lock(fd: int, *, alone: bool) -> None:
     try:
         fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
-        said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
-        raise HeldError(said + _others(fd, said)) from None
+        holder = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
+        raise HeldError(holder + _others(fd, holder)) from None
 
 
-def _others(fd: int, said: str) -> str:
+def _others(fd: int, holder: str) -> str:
     """Name who holds the file by the kernel's table, if that is not who the file says it is.
 
     Any user may write to the file, and hold the lock.
@@ -108,7 +108,7 @@ def _others(fd: int, said: str) -> str:
         return ""
     found = ""
     for pid in holders:
-        if re.search(rf"\bprocess {pid}\b", said):
+        if re.search(rf"\bprocess {pid}\b", holder):
             return ""
         with suppress(OSError):
             found = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"

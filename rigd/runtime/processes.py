@@ -94,20 +94,20 @@ def read_process(pid: int) -> RunningProcess | None:
 
 def _row(pid: int, status: str, command: bytes) -> RunningProcess | None:
     rows = [line.partition(":\t") for line in status.split("\n")]
-    told = {key: value for key, _, value in reversed(rows)}  # the first of a name counts
-    state = told["State"][:1]
+    fields = {key: value for key, _, value in reversed(rows)}  # the first of a name counts
+    state = fields["State"][:1]
     if state in "ZX":
         return None
-    users = {int(number) for number in told["Uid"].split()}
+    users = {int(number) for number in fields["Uid"].split()}
     return RunningProcess(
         pid=pid,
-        parent=int(told["PPid"]),
+        parent=int(fields["PPid"]),
         uid=users.pop() if len(users) == 1 else -1,
-        name=told["Name"],
+        name=fields["Name"],
         command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        caught=int(told["SigCgt"], 16),
-        ignored=int(told["SigIgn"], 16),
-        pending=int(told["SigPnd"], 16) | int(told["ShdPnd"], 16),
+        caught=int(fields["SigCgt"], 16),
+        ignored=int(fields["SigIgn"], 16),
+        pending=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
         suspended=state in "Tt",
     )
 

@@ -33,7 +33,7 @@ _NUMBERING_LINES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TextRow:
     """A line of the file, or several where a quoted cell has ends of lines.
 
     Attributes
@@ -52,7 +52,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class TableLayout:
     """Where in a text the numbers are.
 
     Attributes
@@ -151,7 +151,7 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
+def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     """Find the table in the first lines of a file.
 
     Parameters
@@ -177,11 +177,11 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
     present = [mark for mark in _SEPARATORS if any(mark in line for line in lines)]
     candidates = [stated] if stated else [*present, BLANKS]
     failures: list[_UnlikelyError] = []
-    found: Layout | None = None
+    found: TableLayout | None = None
     for separator in candidates:
         try:
             rows = [
-                Row(line, [cell.strip() for cell in cells], index)
+                TextRow(line, [cell.strip() for cell in cells], index)
                 for index, (line, cells) in enumerate(rows_of(lines, separator))
             ]
         except csv.Error as error:
@@ -230,23 +230,23 @@ _NO_ROWS, _NO_TITLES, _SOME_TITLES, _TITLES = range(4)
 
 
 def _layout(
-    rows: Sequence[Row],
+    rows: Sequence[TextRow],
     separator: str,
     names: Sequence[str],
     labview: "_labview.LabviewHead | None",
-) -> Layout:
+) -> TableLayout:
     numbers = [_number(name) for name in names]
     titled = [name for name, number in zip(names, numbers, strict=True) if number is None]
     if not rows:
         raise _UnlikelyError(_NO_ROWS, TableError("has no lines below its head."))
     failure: _UnlikelyError | None = None
-    for place, row in enumerate(rows):
+    for index, row in enumerate(rows):
         if titled and not _has_titles(row, titled):
             continue
         try:
             if titled:
-                return _below_titles(rows, place, separator, names, labview)
-            found = _with_numbers(rows, place, separator, [n or 0 for n in numbers], labview)
+                return _below_titles(rows, index, separator, names, labview)
+            found = _with_numbers(rows, index, separator, [n or 0 for n in numbers], labview)
             if found is not None:
                 return found
         except _UnlikelyError as unlikely:
@@ -271,27 +271,27 @@ def _number(name: str) -> int | None:
     return int(digits) if name != digits and digits.isdecimal() and int(digits) > 0 else None
 
 
-def _plain_titles(row: Row) -> list[str]:
+def _plain_titles(row: TextRow) -> list[str]:
     """Return the titles of a row without the mark of a comment, and without empty ones behind."""
     cells = fitted(row.cells, 0)
     if cells and cells[0] in ("#", "%"):  # between blanks, the mark is a cell of its own
         return cells[1:]
-    return [without_comment_mark(cell) if not place else cell for place, cell in enumerate(cells)]
+    return [without_comment_mark(cell) if not index else cell for index, cell in enumerate(cells)]
 
 
-def _has_titles(row: Row, names: Iterable[str]) -> bool:
+def _has_titles(row: TextRow, names: Iterable[str]) -> bool:
     return all(name in row.cells or name in _plain_titles(row) for name in names)
 
 
 def _below_titles(
-    rows: Sequence[Row],
-    place: int,
+    rows: Sequence[TextRow],
+    index: int,
     separator: str,
     names: Sequence[str],
     labview: "_labview.LabviewHead | None",
-) -> Layout:
+) -> TableLayout:
     """Return the layout of the table whose titles are in one row."""
-    head = rows[place]
+    head = rows[index]
     raw, plain = fitted(head.cells, 0), _plain_titles(head)
     titles = raw if all(name in raw for name in names if _number(name) is None) else plain
     if len(plain) < len(raw):  # a mark by itself may be one of a comment, or the title of an index
@@ -317,15 +317,15 @@ def _below_titles(
             raise _UnlikelyError(_TITLES, MissingColumnError(name, titles, head.line))
     optional = int(labview is not None and titles[-1] == _labview.COMMENT)
     units: Sequence[str] = ()
-    above = rows[place - 1].cells if place else []
+    above = rows[index - 1].cells if index else []
     if len(fitted(above, width)) == width and all(is_unit(cell) for cell in above if cell):
         units = above
-    for row in rows[place + 1 : place + 2 + _BETWEEN]:
+    for row in rows[index + 1 : index + 2 + _BETWEEN]:
         cells = fitted(row.cells, width)
         fits = width - optional <= len(cells) <= width
         if fits and _is_data(cells, columns, _next(rows, row)):
             _check_single(row.line, cells)
-            return Layout(
+            return TableLayout(
                 separator=separator,
                 titles=tuple(titles),
                 titles_line=head.line,
@@ -363,11 +363,11 @@ def comma_in_single(line: int) -> str:
     )
 
 
-def _next(rows: Sequence[Row], row: Row) -> Row | None:
+def _next(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
     return next((each for each in rows if each.index > row.index), None)
 
 
-def _is_data(cells: Sequence[str], columns: Sequence[int], below: Row | None) -> bool:
+def _is_data(cells: Sequence[str], columns: Sequence[int], below: TextRow | None) -> bool:
     """Whether a row has numbers in the columns asked for, and no text where the next has none."""
     if max(columns) >= len(cells):
         return False
@@ -383,11 +383,11 @@ def _is_data(cells: Sequence[str], columns: Sequence[int], below: Row | None) ->
 
 
 def _not_data(
-    row: Row,
+    row: TextRow,
     cells: Sequence[str],
     columns: Sequence[int],
     names: Sequence[str],
-    head: Row,
+    head: TextRow,
     width: int,
     separator: str,
 ) -> TableError:
@@ -420,18 +420,18 @@ def not_a_number(line: int, name: str, cell: str) -> TableError:
 
 
 def _with_numbers(
-    rows: Sequence[Row],
-    place: int,
+    rows: Sequence[TextRow],
+    index: int,
     separator: str,
     numbers: Sequence[int],
     labview: "_labview.LabviewHead | None",
-) -> Layout | None:
+) -> TableLayout | None:
     """Return the layout if this row is the first of numbers, by the columns' numbers alone."""
-    row, above = rows[place], list(takewhile(lambda each: each.index < rows[place].index, rows))
+    row, above = rows[index], list(takewhile(lambda each: each.index < rows[index].index, rows))
     columns = [number - 1 for number in numbers]
     if is_comment(row.cells):
         return None
-    if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, place):
+    if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, index):
         partly = [c for c in columns if c < len(row.cells) and row.cells[c]]
         known = [c for c in partly if is_any_number(row.cells[c])]
         following = _next(rows, row)
@@ -440,7 +440,7 @@ def _with_numbers(
             and len(known) < len(partly)
             and following is not None
             and len(following.cells) == len(row.cells)
-            and not _numbers_the_columns(rows, place)
+            and not _numbers_the_columns(rows, index)
         ):
             column = next(c for c in partly if c not in known)
             raise _UnlikelyError(
@@ -469,7 +469,7 @@ def _with_numbers(
         titles, titles_line = (), 0  # several words each: nothing says which belong together
     width = len(titles) if titles else len(cells)
     _check_single(row.line, cells)
-    return Layout(
+    return TableLayout(
         separator=separator,
         titles=tuple(titles),
         titles_line=titles_line,
@@ -485,10 +485,10 @@ def _with_numbers(
     )
 
 
-def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
+def _numbers_the_columns(rows: Sequence[TextRow], index: int) -> bool:
     """Whether the first row numbers the columns: no row below has whole numbers only."""
-    cells = [cell for cell in rows[place].cells if cell]
-    if place or len(cells) < 2:
+    cells = [cell for cell in rows[index].cells if cell]
+    if index or len(cells) < 2:
         return False
     counted = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
     below = rows[1 : 1 + _NUMBERING_LINES]
@@ -501,10 +501,10 @@ def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
     )
 
 
-def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
+def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
     """Say which title is missing, from the line that has most of them or seems to have titles."""
 
-    def found(row: Row) -> int:
+    def found(row: TextRow) -> int:
         return sum(name in row.cells or name in _plain_titles(row) for name in names)
 
     best = max(rows, key=found)
@@ -512,20 +512,20 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
         titles = _plain_titles(best)
         name = next(each for each in names if each not in titles and each not in best.cells)
         return _UnlikelyError(_SOME_TITLES, MissingColumnError(name, titles, best.line))
-    place = next(
+    index = next(
         (
-            place
-            for place, row in enumerate(rows)
+            index
+            for index, row in enumerate(rows)
             if all(map(is_any_number, filter(None, row.cells)))
         ),
         None,
     )
-    if place is None:
+    if index is None:
         return _UnlikelyError(
             _NO_ROWS, MissingColumnError(names[0], _plain_titles(rows[0]), rows[0].line)
         )
-    width = len(rows[place].cells)
-    above = [row for row in rows[:place] if len(_plain_titles(row)) == width]
+    width = len(rows[index].cells)
+    above = [row for row in rows[:index] if len(_plain_titles(row)) == width]
     if above:
         best = (
             above[-2]
@@ -540,7 +540,7 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
     )
 
 
-def _no_numbers(rows: Sequence[Row], names: Sequence[str]) -> TableError:
+def _no_numbers(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
     """Say that no row has numbers in the columns asked for."""
     width = max(len(row.cells) for row in rows)
     for name in names:
@@ -552,7 +552,7 @@ def _no_numbers(rows: Sequence[Row], names: Sequence[str]) -> TableError:
     )
 
 
-def _check_split_decimals(rows: Sequence[Row], layout: Layout) -> None:
+def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
     written = [fitted(row.cells, layout.width) for row in rows if any(row.cells)]
     if are_split_decimals(written):
         raise TableError(

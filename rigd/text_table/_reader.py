@@ -26,7 +26,7 @@ from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
     HEAD_LINES,
-    Layout,
+    TableLayout,
     comma_in_single,
     find_layout,
     fitted,
@@ -214,10 +214,10 @@ def _bounded(text: TextIOWrapper) -> Iterator[str]:
 
 
 @dataclass(slots=True)
-class _Rows:
+class _NumberRows:
     """Rows of numbers of a table as they are read, each checked against the layout."""
 
-    layout: Layout
+    layout: TableLayout
     names: Sequence[str]
     mark: str
     wanted: Sequence[int]
@@ -329,14 +329,14 @@ class _Rows:
 def _columns(
     stream: BinaryIO,
     encoding: str,
-    layout: Layout,
+    layout: TableLayout,
     names: Sequence[str],
     most_rows: int,
     mark: str,
 ) -> TextTable:
     times = _times_column(layout)
     wanted = sorted({*layout.columns, *(() if times is None else (times,))})
-    rows = _Rows(layout, names, mark, wanted)
+    rows = _NumberRows(layout, names, mark, wanted)
     values = {column: array("d") for column in wanted}
     appends = [
         (values[column].append, rows.checked.index(column))
@@ -383,8 +383,8 @@ def _columns(
                     values[column].extend(len(empty) * [float("nan")])
                 numbers_of_lines.extend(empty)
                 empty = []
-            for append, place in appends:
-                append(numbers[place])
+            for append, index in appends:
+                append(numbers[index])
             for append, column in stamps:
                 append(rows.stamp(row, column, line))
             numbers_of_lines.append(line)
@@ -401,7 +401,7 @@ def _without_statement(lines: Iterator[str]) -> Iterator[str]:
     yield from lines
 
 
-def _remark(rows: _Rows) -> str:
+def _remark(rows: _NumberRows) -> str:
     if not rows.blank_count:
         return ""
     return (
@@ -410,7 +410,7 @@ def _remark(rows: _Rows) -> str:
     )
 
 
-def _times_column(layout: Layout) -> int | None:
+def _times_column(layout: TableLayout) -> int | None:
     """Find a column of times beside those asked for."""
     for column, cell in enumerate(layout.first):
         if column in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
@@ -425,14 +425,14 @@ def _times_column(layout: Layout) -> int | None:
     return None
 
 
-def _time_unit_s(layout: Layout, column: int) -> float | None:
+def _time_unit_s(layout: TableLayout, column: int) -> float | None:
     unit = time_unit_s(_unit(layout, column))
     if unit is None and layout.titles and is_title_of_times(layout.titles[column]):
         unit = time_unit_s(layout.titles[column].rpartition("_")[2])
     return unit
 
 
-def _unit(layout: Layout, column: int) -> str:
+def _unit(layout: TableLayout, column: int) -> str:
     """Return what the file states of a column's unit; times of day are read in seconds."""
     if is_stamp(layout.first[column]):
         return "s"
@@ -443,12 +443,12 @@ def _unit(layout: Layout, column: int) -> str:
 
 
 def _table(
-    layout: Layout,
+    layout: TableLayout,
     names: Sequence[str],
     values: Mapping[int, "array[float]"],
     lines: npt.NDArray[np.uint32],
     times: int | None,
-    rows: _Rows,
+    rows: _NumberRows,
 ) -> TextTable:
     columns = {}
     for name, column in zip(names, layout.columns, strict=True):
