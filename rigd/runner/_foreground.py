@@ -1,4 +1,4 @@
-"""Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
+"""Sessions in the foreground: plan them, show their progress, and print their results."""
 
 import contextlib
 import time
@@ -26,29 +26,29 @@ from rigd.runner.session import SessionFailedError, SessionProgress, SessionResu
 from rigd.runtime import RigLock, StopRequest
 
 _QUICK_LOOK_PATIENCE_S: Final = 10.0
-"""Longest wait for the last quick look at the end, without the time for which it waits for a
-processor that other programs use."""
+"""Longest run time of the last quick look after the end, without the time in which other programs
+use the processor."""
 _LONGEST_QUICK_LOOK_S: Final = 120.0
-"""Longest wait for it in all."""
+"""Longest total wait for it."""
 _POLL_S: Final = 0.05
 
 _Print = Callable[[str], None]
 
 
 class SeriesFailedError(FailureError):
-    """No session, or no further one.
+    """A session of a series could not be run, or failed.
 
     Parameters
     ----------
     message
         Reason, for the operator.
     results
-        The sessions before, and the one that failed if it had begun.
+        Results of the earlier sessions, and of the failed session if it had begun.
 
     Attributes
     ----------
     results
-        List of the same.
+        The same results as a list.
     """
 
     def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:
@@ -80,47 +80,47 @@ def run_in_foreground(
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
-    """Run `repeat` sessions, up to a stop or the first that does not end well.
+    """Run `repeat` sessions; end at a stop or at the first incomplete session.
 
     Parameters
     ----------
     build
-        Makes the excitation for a rig, from its profile.
+        Returns the excitation for a profile.
     group
-        The processes, started but not yet needed; ended when this returns.
+        The started processes. They are ended when this function returns.
     stop
-        The operator's.
+        Stop request of the operator.
     profile_name
         Name or path of the profile.
     folder
-        Where the files go; made if it does not exist.
+        Folder of the session files; created if it does not exist.
     repeat, seed, notes, fast, live, force, accept, hardware
-        As on the command line. The sessions of a series follow each other on one connection: each
-        waits until the beam has come to rest.
+        As on the command line. The sessions of a series share one connection. Each session waits
+        until the beam is at rest.
     quiet_stdout
-        Tell the operator on standard error, because standard output is for a document.
-    look
-        Take a quick look at each session, and wait some seconds for the last one.
+        Print all text on standard error, because standard output is reserved for a document.
+    quick_look
+        Make a quick look at each session, and wait some seconds for the last one.
     from_angle
-        The excitation depends on where the motor stands: the rig is connected before it is made,
-        with the angle as ``start_rad``.
+        The excitation depends on the motor angle. The rig is connected first, and `build` receives
+        the angle as ``start_rad``.
     prepare
-        Changes the profile before it is planned with.
+        Returns a modified profile, applied before planning.
     obstacles
-        What a simulated beam meets, as on the command line.
+        Obstacles of a simulated beam, as on the command line.
     watch_fit
-        Fit each record while it is recorded, and tell.
+        Fit each record while it is recorded, and print the fits.
     identifies_motor
         See :class:`rigd.runner._series.Series`.
     tip_slope_rad
-        Largest slope of the tip in an identification; None: the profile's.
+        Largest tip slope of an identification; None: the limit of the profile.
 
     Raises
     ------
     UserError
-        If a session is refused before any was run.
+        If a session is refused before the first one is run.
     SeriesFailedError
-        If one cannot be run, or failed.
+        If a session cannot be run, or failed.
     """
     write: _Print = partial(_print, err=quiet_stdout)
     results: list[SessionResult] = []
@@ -132,7 +132,7 @@ def run_in_foreground(
 
     quick_looks = QuickLooks(report) if quick_look else None
     try:
-        # The rig is given up last, when no process uses the devices any more.
+        # The rig is released last, when no process uses the devices any more.
         with contextlib.ExitStack() as reserved, group:
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
@@ -176,7 +176,7 @@ def run_in_foreground(
         if quick_looks is not None:
             _await_quick_looks(quick_looks, stop)
     except SessionFailedError as error:
-        # Its processes have ended, so that what they have left can be told.
+        # The processes have ended, so that the remaining file can be reported.
         results.append(error.result())
         raise SeriesFailedError(f"{error} {what_is_kept(error.path)}", results) from error
     except RigdError as error:
@@ -190,7 +190,7 @@ def run_in_foreground(
 
 
 class _Operator:
-    """Tells the operator of a series; leaving its context takes the progress away."""
+    """Print the progress and the results of a series of sessions."""
 
     def __init__(self, ticks: int, repeat: int, write: _Print) -> None:
         self._ticks = ticks
@@ -206,7 +206,7 @@ class _Operator:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - told when it is there
+    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
         self._line = ProgressLine()
 
@@ -254,7 +254,7 @@ def _print(text: str, *, err: bool) -> None:
 
 
 def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
-    """Give the last quick looks their time; another Ctrl-C skips them."""
+    """Wait for the last quick looks; another Ctrl-C skips them."""
     stop.sessions_are_over()
     before, skipped = stop.requested, False
 
@@ -285,11 +285,11 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
             f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
             err=True,
         )
-    stop.requested = before  # what was skipped is not a session
+    stop.requested = before  # this Ctrl-C skipped a quick look, not a session
 
 
 def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
-    """Tell of a stop between two sessions or before the first; within one, the session tells."""
+    """Report a stop between two sessions or before the first one; a session reports its own."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""

@@ -1,4 +1,4 @@
-"""Fits of a running session: what its fit process tells, and what follows for the session."""
+"""Fits of a running session: supervision of the fit process and use of its estimates."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,42 +26,23 @@ if TYPE_CHECKING:
     from rigd.runner._process_group import ProcessGroup
 
 _LAST_PATIENCE_S: Final = 60.0
-"""Time for the fit of the whole record, when the torque is off; a stop skips it."""
+"""Time for the fit of the whole record, with the torque off; a stop skips it."""
 _STOP_PATIENCE_S: Final = 5.0
 _POLL_S: Final = 0.05
 _STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
 )  # fmt: skip
-"""What of the last estimate goes into the file; the rest is what pieces are designed from."""
+"""Keys of the last estimate that are stored in the file."""
 
 
 class FitSupervisor:
-    """What the fit process tells of one session.
+    """Supervise the fit process of one session and collect its estimates.
 
-    A session that goes on until a precision is reached ends with its last piece: when the process
-    says so, and when the process is lost.
-
-    Parameters
-    ----------
-    group
-        Processes of the rig, their memory laid out.
-    profile
-        Profile of the rig.
-    reference
-        Reference of the session.
-    search
-        What the session goes on for; None: its reference is given.
-    realtime
-        Where the loop runs; None: not in real time.
-
-    Attributes
-    ----------
-    segments
-        Those that were planned while the record ran, once the search has ended.
-    shortcoming
-        What is missing of the precision that was asked for, or that this is not known; empty if
-        the whole record has it.
+    A session with a precision search ends with its last segment, when the process reports the end
+    of the search or when the process is lost. `segments` holds the planned segments after the end
+    of the search. `shortcoming` states why the whole record does not have the requested precision,
+    or why this is not known; it is empty if the record has the precision.
     """
 
     def __init__(
@@ -94,25 +75,19 @@ class FitSupervisor:
             self._lose(str(error))
 
     def await_ready(self, meanwhile: Callable[[], bool]) -> str:
-        """Wait until the process can fit; return why it cannot, or nothing.
-
-        Parameters
-        ----------
-        meanwhile
-            Called some times a second; says whether to go on waiting.
-        """
+        """Wait until the process is ready; return why it is not, else an empty text."""
         late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
         if late:
             self._lose(f"The fit process was {late}.")
         return self._lost
 
     def begin(self, header: FileHeader) -> None:
-        """Tell what the file says of the session, before its record begins."""
+        """Send the header of the session file to the process, before the record begins."""
         self._begun = True
         self._send(header)
 
     def poll(self) -> list[Event]:
-        """Take what has come, and return what the operator is to be told."""
+        """Read the received messages, and return the events for the operator."""
         self._listen(0.0)
         if self._ready and not self._lost:
             self._feel_pulse()
@@ -120,7 +95,7 @@ class FitSupervisor:
         return events
 
     def _feel_pulse(self) -> None:
-        """End a process that hangs."""
+        """End the process if it hangs."""
         assert FIT.hung_after_s is not None
         still_s = self._pulse.look(self._shared_state[Word.FIT_BEAT], time.monotonic())
         if still_s > FIT.hung_after_s:
@@ -128,20 +103,12 @@ class FitSupervisor:
             self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
 
     def news(self) -> list[Mapping[str, Any]]:
-        """Return the estimates that came since the last time, for the live view."""
+        """Return the estimates received since the last call, for the live view."""
         news, self._news = self._news, []
         return news
 
     def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
-        """Wait for the fit of the whole record; return what is known as a JSON document.
-
-        Parameters
-        ----------
-        ticks
-            Ticks that were scheduled.
-        meanwhile
-            Called some times a second.
-        """
+        """Wait for the fit of the whole record of `ticks` ticks; return the result for JSON."""
         self._send(RecordEnded(ticks))
         begun_s = time.monotonic()
         while self._begun and not (
@@ -174,20 +141,20 @@ class FitSupervisor:
 
     @property
     def _reason(self) -> str:
-        """Why a search for a precision ended, a sentence; empty if it was stopped."""
+        """Reason for the end of the search as a sentence; empty if it was stopped."""
         return self._ended.reason if self._ended is not None else self._lost
 
     @property
     def _success(self) -> str:
-        """How what was asked for was reached, a sentence."""
+        """Statement that the requested precision was reached, as a sentence."""
         if self._ended is not None and self._ended.reached:
             return self._ended.reason
         return "Reached by the fit of the whole record."
 
     def _assess(self, found: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
-        """Return whether the whole record has what was asked for, and what is missing of it.
+        """Return whether the whole record has the requested precision, and the shortcoming.
 
-        Without a fit of the whole record that is not known, whatever was found on the way.
+        Without a fit of the whole record this is not known, whatever earlier estimates stated.
         """
         report, ended = self._last_report, self._ended
         on_the_way = ended is not None and ended.reached
@@ -212,7 +179,7 @@ class FitSupervisor:
 
     @property
     def failure(self) -> str:
-        """Why the process was lost before its search ended, which ends a session; else empty."""
+        """Reason for a loss of the process before the end of its search; else empty."""
         return self._lost if self._search is not None and self._ended is None else ""
 
     def _send(self, message: object) -> None:
@@ -251,7 +218,7 @@ class FitSupervisor:
                 self._lose(reason)
 
     def _lose(self, why: str) -> None:
-        """Go on without the process; a reference that it was to plan ends with what there is."""
+        """Continue without the process; a planned reference ends with its last segment."""
         self._lost = why
         follows = "The session continues without fits."
         if self._search is not None and self._ended is None:

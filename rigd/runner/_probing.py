@@ -46,15 +46,7 @@ class ProbeResult:
     """Scales and friction."""
 
     def contradiction(self, profile: Profile, *, motor: bool = True) -> str:
-        """Return what contradicts the profile; empty if nothing does.
-
-        Parameters
-        ----------
-        profile
-            Profile of the rig.
-        motor
-            Judge the motor's torque and inertia too.
-        """
+        """Return what contradicts the profile; empty if nothing does."""
         return contradiction(probed_rig(profile), self.end, self.estimate, motor=motor)
 
     def as_metadata(self) -> dict[str, str]:
@@ -63,13 +55,7 @@ class ProbeResult:
         return {f"probe_{key}": repr(numbers[key]) for key in numbers if numbers[key] is not None}
 
     def lines(self, profile: Profile) -> list[str]:
-        """Return the result in words.
-
-        Parameters
-        ----------
-        profile
-            Profile of the rig.
-        """
+        """Return the result in words."""
         estimate = self.estimate
         rows = (
             ("coupling torque over the beam's at the measured angle", estimate.coupling_ratio,
@@ -100,33 +86,7 @@ def verify(
     *,
     motor: bool = True,
 ) -> ProbeResult | None:
-    """Make a probing move where motor and encoder are not known, and no stored result holds.
-
-    Parameters
-    ----------
-    profile
-        Profile whose values are verified.
-    rig
-        Connected.
-    stop
-        The operator's.
-    says
-        Takes level and text of what the operator should know.
-    motor
-        Judge the motor's torque and inertia too.
-
-    Returns
-    -------
-    ProbeResult or None
-        None: no move is needed.
-
-    Raises
-    ------
-    ProbeFailedError
-        If the rig contradicts the profile.
-    RigError
-        If the move is stopped, or an interlock ends it.
-    """
+    """Make a probing move where motor and encoder are not known, and no stored result holds."""
     if _is_identified(profile) or _is_simulated_alike(profile):
         return None
     result = stored_result(profile, rig)
@@ -159,13 +119,7 @@ def _is_simulated_alike(profile: Profile) -> bool:
 
 
 def announcement(profile: Profile) -> str:
-    """Return a sentence on what the shaft is about to do.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    """
+    """Return a sentence on what the shaft is about to do."""
     plan = plan_probe(probed_rig(profile))
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
@@ -175,22 +129,7 @@ def announcement(profile: Profile) -> str:
 
 
 def probe(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
-    """Make a probing move, and store its result.
-
-    Parameters
-    ----------
-    profile
-        Profile whose values are verified.
-    rig
-        Connected.
-    stop
-        The operator's.
-
-    Raises
-    ------
-    RigError
-        If the move is stopped, or an interlock ends it.
-    """
+    """Make a probing move, and store its result."""
     result = _result(rig.probe(profile, stop))
     document = {"key": _key(profile, rig), "boot": _boot(), "end": result.end.name}
     path = _file(profile)
@@ -251,15 +190,7 @@ def probe_in_foreground(
 
 
 def stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
-    """Return the result of the last probing move that still holds, or None.
-
-    Parameters
-    ----------
-    profile
-        Profile whose values it verified.
-    rig
-        Connected.
-    """
+    """Return the result of the last probing move that still holds, or None."""
     try:
         document = json.loads(_file(profile).read_text("utf-8"))
         if document.pop("key") != _key(profile, rig) or document.pop("boot") != _boot():

@@ -26,22 +26,7 @@ _POLL_S = 0.05
 def await_ready(
     settled: Callable[[], bool], listen: Callable[[float], None], meanwhile: Callable[[], bool]
 ) -> str:
-    """Wait until a process of one session is ready, or is lost.
-
-    Parameters
-    ----------
-    settled
-        Says whether it is either.
-    listen
-        Takes what it sends, waiting for so many seconds at most.
-    meanwhile
-        Called some times a second; says whether to go on waiting.
-
-    Returns
-    -------
-    str
-        How long was waited in vain; empty where that was not too long.
-    """
+    """Wait until a process of one session is ready, or is lost."""
     deadline_s = time.monotonic() + _PREPARING_S
     while not settled() and meanwhile():
         listen(_POLL_S)

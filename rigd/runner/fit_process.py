@@ -39,14 +39,14 @@ _PROGRAM: Final = "analysis.online"
 _BLOCK: Final = 500
 _IDLE_S: Final = 0.005
 _EVERY_S: Final = 1.0
-"""Time between two fits of a session that is only watched."""
+"""Time between two fits of a session with a given reference."""
 _GRACE_S: Final = 1.0
 _FIRST_REQUEST: Final = 1_000_000_000
-"""Numbers of the estimates that are asked for; those made unasked count from 0 on."""
+"""First id of requested estimates; the ids of periodic estimates start at 0."""
 
 
 class FitProgramError(Exception):
-    """The fit program ended; the message says how."""
+    """The fit program ended; the message states how."""
 
 
 def main() -> None:
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 class FitProgram:
-    """The analyser's program that fits; leaving its context ends it."""
+    """The analyser's fit program; leaving the context ends it."""
 
     def __init__(self) -> None:
         try:
@@ -84,18 +84,12 @@ class FitProgram:
                 f"The fit program cannot be started ({error.strerror})."
             ) from None
         self.input = cast("BinaryIO", self._process.stdin)
-        """Takes a stream as `rigd.session` writes it."""
+        """Input stream, in the format of `rigd.session.online_fit`."""
         self._answers: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._read, daemon=True).start()
 
     def answer(self) -> dict[str, Any] | None:
-        """Return an answer, or None if none has come.
-
-        Raises
-        ------
-        FitProgramError
-            If the program has ended.
-        """
+        """Return the next answer, or None if there is none; raise if the program has ended."""
         try:
             answer = self._answers.get_nowait()
         except queue.Empty:
@@ -105,14 +99,14 @@ class FitProgram:
         return answer
 
     def ended(self) -> FitProgramError:
-        """Return how the program has ended."""
+        """Return an error that states how the program ended."""
         code = self._process.wait()
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return FitProgramError(f"The fit program {how}.")
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        with contextlib.suppress(ValueError):  # not whole: it ended while it wrote
+        with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
             for line in self._process.stdout:
                 self._answers.put(json.loads(line))
         self._answers.put(None)
@@ -131,7 +125,7 @@ class FitProgram:
 
 
 class _Follower:
-    """Follows one session from its first sample to the fit of the whole record."""
+    """Fit one session, from its first sample to the fit of the whole record."""
 
     def __init__(
         self, job: FitJob, parent: Parent, program: FitProgram, channels: Channels
@@ -149,7 +143,7 @@ class _Follower:
         self._ended_after: int | None = None
 
     def follow(self) -> None:
-        """Serve until the whole record is fitted, or the supervisor is gone."""
+        """Run until the whole record is fitted, or the supervisor has ended."""
         self._parent.send(FitReady())
         while True:
             self._shared_state.beat(Word.FIT_BEAT)
@@ -175,7 +169,7 @@ class _Follower:
                         self._parent.send(self._search.ended(ticks, before, begun))
 
     def _begin(self, header: FileHeader) -> None:
-        """Begin with what the file says of the session."""
+        """Start the fits with the header of the session file."""
         job = self._job
         if job.search is not None:
             writer = PieceWriter(job.reference, self._shared_state)
@@ -186,7 +180,7 @@ class _Follower:
         write_start(self._program.input, start)
 
     def _feed(self) -> bool:
-        """Hand on what was recorded; say whether there was anything."""
+        """Pass recorded samples to the fit program; return whether there were any."""
         block = self._reader.take(_BLOCK)
         if not block:
             return False
@@ -195,7 +189,7 @@ class _Follower:
         return True
 
     def _ask(self, *, drained: bool) -> None:
-        """Ask for the next estimate once the samples that it rests on are there."""
+        """Request the next estimate as soon as its samples are available."""
         if self._pending is not None:
             return
         search = self._search
@@ -207,7 +201,7 @@ class _Follower:
             and search.due is not None
             and search.is_begun(self._shared_state[Word.BEGUN])
         ):
-            # Read after the samples: the loop counts what it holds before it gives the sample.
+            # Read after the samples: the loop counts a held tick before it publishes the sample.
             tick = search.due + self._shared_state[Word.HELD]
             if self._ticks >= tick:
                 self._request(tick, whole=search.may_be_last, from_last=True)
@@ -218,11 +212,11 @@ class _Follower:
         write_request(self._program.input, self._pending)
 
     def _answered(self, answer: dict[str, Any]) -> bool:
-        """Tell of an estimate, and plan by it; say whether it is of the whole record."""
+        """Report an estimate and plan with it; return whether it is of the whole record."""
         request, search = self._pending, self._search
         if request is not None and request.id != answer["id"]:
             request = None
-        # The last estimate alone is asked for from nothing.
+        # Only the last estimate is requested without start values from the previous one.
         final = request is not None and request.tick == self._ended_after and not request.from_last
         ahead = self._ahead
         if request is not None:
@@ -242,13 +236,12 @@ class _Follower:
     def _decide(
         self, search: ExcitationPlanner, request: EstimateRequest, answer: dict[str, Any]
     ) -> None:
-        """Plan by an estimate."""
+        """Plan the next segment from an estimate."""
         held, before = self._shared_state[Word.HELD], self._shared_state[Word.HELD_BEFORE]
         for message in search.decide(answer, held, before):
             self._parent.send(message)
         if search.needs_early_fit:
-            # Nobody waits yet: the judgement of all of it starts from what all structures make of
-            # the samples before.
+            # This fit of all structures gives start values for the check of the whole record.
             self._request(request.tick, whole=True, from_last=True)
             self._ahead = True
 
