@@ -95,7 +95,7 @@ def run_in_foreground(
     folder
         Folder of the session files; created if it does not exist.
     repeat, seed, notes, fast, live, force, accept, hardware
-        As on the command line. The sessions of a series share one connection. Each session waits
+        As on the command line. The sessions of a series use one connection. Each session waits
         until the beam is at rest.
     quiet_stdout
         Print all text on standard error, because standard output is reserved for a document.

@@ -86,7 +86,7 @@ def target_estimates(
 ) -> list[TargetEstimate]:
     """Return the estimates of all requested quantities from an answer of the fit program.
 
-    The answer is described in docs/online_fit.md. A modal target without a number stands for each
+    The answer is described in docs/online_fit.md. A modal target without a number applies to each
     mode in the band.
     """
     return [each for target in targets for each in _estimates_of(document, target)]

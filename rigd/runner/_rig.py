@@ -1,4 +1,4 @@
-"""The rig on which sessions are run: connect, run, tare, zero, status, disconnect."""
+"""The rig: connect, run sessions, tare, zero, status, disconnect."""
 
 import contextlib
 import gc
@@ -27,22 +27,22 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
 _SLOW_PATIENCE_S = 30.0
-"""Time for a heartbeat under the virtual clock, whose ticks may wait for replies."""
+"""Longest time between heartbeats under the virtual clock, whose ticks may wait for replies."""
 _ENABLE_PATIENCE_S = 5.0
 """Time for enabling a drive, during which there is no heartbeat."""
 _PROBE_PATIENCE_S = 60.0
 _ANSWER_PATIENCE_S = 10.0
-"""Time to wait for an answer, beyond the time that is measured."""
+"""Time to wait for an answer, in addition to the measuring time."""
 
 
 class RigError(FailureError):
-    """The rig cannot do what is asked, or is lost; the message is for the operator."""
+    """The rig cannot carry out a request, or is lost; the message is for the operator."""
 
 
 class Rig:
     """The devices of one profile, in separate processes.
 
-    All but :meth:`status` is called from one thread.
+    All methods except :meth:`status` and :meth:`signals` are called from one thread.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ class Rig:
     live
         Show each session in a live view.
     group
-        Processes that have been started already, for the first connection.
+        Processes that are already started, for the first connection.
 
     Attributes
     ----------
     connected
-        The control process owns the devices.
+        Whether the control process owns the devices.
     zero_lost
-        The operator set a zero, and the connection that it belonged to is gone.
+        Whether a zero set by the operator was lost with its connection.
     """
 
     def __init__(
@@ -88,12 +88,12 @@ class Rig:
 
     @property
     def simulated(self) -> bool:
-        """Whether no motor moves; known once connected."""
+        """Whether the rig is simulated; False before the first connection."""
         return self._connection is not None and self._connection.simulated
 
     @property
     def angle_rad(self) -> float:
-        """Where the motor stands, from the rig's zero.
+        """Motor angle from the rig's zero.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class Rig:
 
     @property
     def drive_statement(self) -> Mapping[str, str]:
-        """What the connected drive states of itself; empty while not connected."""
+        """Metadata that the connected drive states; empty while not connected."""
         return {} if self._connection is None or not self.connected else self._connection.drive
 
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
@@ -120,22 +120,22 @@ class Rig:
         Parameters
         ----------
         moving
-            What the operator was told would move: anything else is refused.
+            Actuation target that was announced to the operator; any other is refused.
         reset_fault
-            Reset a fault of the drive first: the operator's decision.
+            Reset a fault of the drive first, by decision of the operator.
 
         Raises
         ------
         RigError
-            If that fails; everything is closed again then. Nothing is connected while a value of
-            the profile is unknown.
+            If the connection fails, or a value of the profile is unknown. Everything is closed
+            then.
         """
         if unknown := describe_unknown_values(self._profile.rig):
             raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
         if self.connected:
             self.disconnect()
         try:
-            # Nobody knows yet what sessions the processes that it starts itself will run.
+            # The sessions of the processes started here are not yet known.
             any_session = self._group is None
             group = self._group = self._group or ProcessGroup(live=self._live)
             granted = self._take_precedence(group)
@@ -170,7 +170,7 @@ class Rig:
         order
             Session to run.
         stop
-            The operator's, which ends it.
+            Stop request of the operator, which ends the session.
         watcher, listens
             See :class:`rigd.runner.session.SessionRun`.
 
@@ -207,12 +207,12 @@ class Rig:
                 self._view.finish(outcome, reason)
             if session.device_failed:
                 self._await_end()
-            # Between sessions: what a session leaves behind would lie scattered among what stays,
-            # and a long series would take 4 kB more for each.
+            # Between sessions: objects of a session would fragment the memory, and a long series
+            # would take 4 kB more for each session.
             gc.collect()
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Show a session that is about to be run in the live view.
+        """Show the next session in the live view.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ class Rig:
         Returns
         -------
         str
-            Its address, or why there is none, for the operator.
+            Address of the view, or why there is none, for the operator.
         """
         group = self._require()
         if self._view is None:
@@ -236,22 +236,22 @@ class Rig:
         Returns
         -------
         dict
-            ``mean`` and ``std``: a number an axis (N, N·m); ``torque_std_nm``.
+            ``mean`` and ``std`` by axis (N, N·m), and ``torque_std_nm``.
 
         Raises
         ------
         RigError
-            If it cannot be done.
+            If the tare fails.
         """
         return self._order(Tare(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
-        """Make the motor's present angle the zero to which the limits are relative.
+        """Set the present motor angle as zero; the limits are relative to it.
 
         Returns
         -------
         dict
-            ``moved_rad``: the angle that became 0.
+            ``moved_rad``: the angle before the reset to zero.
 
         Raises
         ------
@@ -268,20 +268,20 @@ class Rig:
         Parameters
         ----------
         profile
-            The rig's; its beam may be another.
+            Profile of the rig, possibly with another beam.
         stop
-            The operator's, which ends it.
+            Stop request of the operator, which ends the move.
 
         Returns
         -------
         dict
-            ``end``: name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
+            ``end``, the name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
             `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------
         RigError
-            If it is stopped, an interlock ends it, or the rig is lost.
+            If the move is stopped, an interlock ends it, or the rig is lost.
         """
         group = self._require()
         shared_state = group.channels.board
@@ -310,7 +310,7 @@ class Rig:
         return answer.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
-        """Wait for the result of a probing move, and watch over the control process meanwhile."""
+        """Wait for the result of a probing move while monitoring the control process."""
         shared_state, pulse = group.channels.board, Pulse()
         assert CONTROL.hung_after_s is not None
         hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
@@ -332,12 +332,12 @@ class Rig:
                 )
 
     def watch(self) -> None:
-        """Check whether the control process is well; call it some times a second between sessions.
+        """Check the control process; call this several times a second between sessions.
 
         Raises
         ------
         RigError
-            If it reported a fault, died or hangs; everything is closed then.
+            If the process reported a fault, died or hangs. Everything is closed then.
         """
         group = self._require()
         if self._view is not None:
@@ -358,7 +358,7 @@ class Rig:
         if message is not None:
             self.disconnect()
             reason = message.reason if isinstance(message, Ended) else ""
-            raise RigError(reason or "The control process was asked to end.")
+            raise RigError(reason or "The control process was requested to end.")
 
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
@@ -370,9 +370,9 @@ class Rig:
             return replace(self._statuses.look(group), live_view=address)
 
     def signals(self) -> list[SignalBlock]:
-        """Return what has come of the record since the last call, from any thread.
+        """Return the signals of the record since the last call, from any thread.
 
-        It begins with the first call, and again if the last one is more than 1 s ago.
+        Reading starts with the first call, and again if the last call was more than 1 s ago.
         """
         with self._looking:
             group = self._group
@@ -381,7 +381,7 @@ class Rig:
             return self._signals.take(group.channels)
 
     def disconnect(self) -> None:
-        """Disable the drive, close the devices, end the processes; harmless when repeated."""
+        """Disable the drive, close the devices, end the processes; repeated calls do nothing."""
         with self._looking:
             group, self._group = self._group, None
             self._view = None
@@ -393,7 +393,7 @@ class Rig:
             self._precedence = None
 
     def _take_precedence(self, group: ProcessGroup) -> dict[str, str]:
-        """Put this process before the ordinary ones; say what was granted."""
+        """Raise the priority of this process; return what the system granted."""
         if self._fast:
             return {}
         realtime = self._profile.realtime
@@ -403,7 +403,7 @@ class Rig:
 
     def _reset_fault(self, moving: WhatMoves | None) -> None:
         try:
-            from rigd.devices import reset_drive  # loads the drivers, which no other order needs
+            from rigd.devices import reset_drive  # late: loads the drivers, needed only here
 
             reset_drive(self._profile.rig, moving)
         except (DeviceError, OSError) as error:
@@ -415,7 +415,7 @@ class Rig:
         return self._group
 
     def _order(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
-        """Have the control process measure something between sessions."""
+        """Send a measuring order to the control process between sessions, and return the result."""
         group = self._require()
         try:
             group.control.send(order)
@@ -429,7 +429,7 @@ class Rig:
         return answer.values
 
     def _ask(self, patience_s: float) -> object:
-        """Wait for what the control process answers.
+        """Wait for an answer of the control process.
 
         Raises
         ------
@@ -450,7 +450,7 @@ class Rig:
         return answer
 
     def _await_end(self) -> None:
-        """Let a control process whose device failed close what can be closed."""
+        """Wait until a control process with a failed device has closed the others."""
         assert self._group is not None
         with contextlib.suppress(ChildError):
             self._group.control.poll(_ANSWER_PATIENCE_S)
@@ -458,11 +458,11 @@ class Rig:
 
 
 def _nothing() -> None:
-    """Leave a stop request to whoever polls it."""
+    """Do nothing: the stop request is polled."""
 
 
 def _wipe(shared_state: SharedState) -> None:
-    """Clear the words of the board that belong to one session."""
+    """Clear the fields of the shared state that belong to one session."""
     shared_state[Word.STOP] = Stop.NO
     shared_state[Word.GO] = 0
     shared_state[Word.LIVE_DROPPED] = 0
