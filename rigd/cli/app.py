@@ -1,4 +1,4 @@
-"""The command line ``rigd``, put together from its commands."""
+"""The command line ``rigd``, assembled from its commands."""
 
 from typing import Annotated, Any, Final
 
@@ -34,7 +34,7 @@ def before_a_command(
         ),
     ] = False,
 ) -> None:
-    """Take the options that stand before a command; they have done their work by then."""
+    """Accept the options before a command; their callbacks have already run."""
 
 
 _SECTIONS: Final = {
@@ -44,12 +44,12 @@ _SECTIONS: Final = {
     "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
-"""Commands by what they are for, as the help lists them."""
+"""Commands by section of the help."""
 _OTHERS: Final = "Other commands"
 
 
 class RigdGroup(TyperGroup):
-    """All commands: what an error says, and its exit code, are told here for each of them."""
+    """Group of all commands; reports the message and the exit code of their errors."""
 
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -65,12 +65,12 @@ class RigdGroup(TyperGroup):
                     formatter.write_dl(rows)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
-        """Parse what stands before the command."""
+        """Parse the options before the command."""
         with readable_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the command that was asked for."""
+        """Run the requested command."""
         with readable_errors(), exit_on_errors():
             return super().invoke(ctx)
 
@@ -111,5 +111,5 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
-    # All as long as Ctrl-C only has to say that nothing began.
+    # Until a command starts, Ctrl-C only reports that nothing has begun.
     run_command(typer.main.get_command(app))

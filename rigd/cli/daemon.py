@@ -107,12 +107,12 @@ def _socket_of(profile: str | None) -> "Path":
 
 
 def rig_name(profile: str | None) -> str | None:
-    """Return the name by which the daemon of a profile is found."""
+    """Return the name of the rig of a profile, which identifies its daemon."""
     if profile is None:
         return None
     from rigd.daemon.address import running, socket_path
 
-    # Reading a profile takes a while, and is of no use where its daemon is known by that name.
+    # Reading a profile is slow, and unnecessary if a daemon of that name is running.
     if any(path.name == socket_path(profile).name for path in running()):
         return profile
     from rigd.cli.options import profile_named
@@ -161,7 +161,7 @@ def stop(
         bool, typer.Option("--no-wait", help="Do not wait until the sessions have ended.")
     ] = False,
 ) -> None:
-    """Stop all your running sessions safely; their files are kept. Not an emergency stop.
+    """Stop all your running sessions safely; their files are preserved. Not an emergency stop.
 
     Finds daemons and sessions in the foreground, whatever the runtime folder; as root those of all
     users. Daemons go on. Waits up to 10 s for the sessions to end. Exit code 0 only if no session
@@ -208,7 +208,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Have the daemon of a profile, or the only one there is, reset its rig; False if none is."""
+    """Reset a rig through the daemon of its profile, or the only daemon; False without a daemon."""
     from rigd.daemon.address import running, socket_path
 
     sockets = running()
@@ -232,7 +232,7 @@ def _measured(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def _watch(profile: str | None) -> None:
-    """Show the status over and over; a daemon that ends may come back."""
+    """Show the status repeatedly, also after a restart of the daemon."""
     from rich.console import Console
     from rich.live import Live
 

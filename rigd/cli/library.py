@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from rigd.library.trend import ModeChange, ModeTrend, Quantity, TrendPoint
 
 _WIDEST: Final = 24
-"""Characters of a text in a table."""
+"""Largest width of a text in a table, characters."""
 _PLOT: Final = 25
-"""Characters of the plot of a trend."""
+"""Width of the plot of a trend, characters."""
 
 
 def list_sessions(
@@ -63,8 +63,8 @@ def list_sessions(
     """List recorded sessions with their modes, or a specimen's trend.
 
     The newest come first, with modes from the report or else from the quick look. Dates are local
-    (2026-11-20 or 2026-11-20T14:30). Incomplete and foreign files are listed with the reason. The
-    index library.sqlite in each folder only saves time, and may be removed.
+    (2026-11-20 or 2026-11-20T14:30). Incomplete and third-party files are listed with the reason.
+    The index library.sqlite in each folder only speeds up the list, and may be removed.
 
     Example: rigd list --specimen "antenna 3" --trend
     """
@@ -125,7 +125,7 @@ def specimens() -> None:
 
 
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
-    """Return the sessions with modes; those of several specimens have no trend."""
+    """Return the sessions with modes; raise if they are of several specimens."""
     found = [row for row in rows if row.modes]
     specimens = sorted({row.specimen for row in found})
     if len(specimens) > 1:
@@ -140,12 +140,12 @@ def _local(row: "SessionRow") -> str:
         return ""
     try:
         return f"{datetime.fromtimestamp(row.start_utc_ns / 1e9):%Y-%m-%d %H:%M}"
-    except (ValueError, OverflowError, OSError):  # a year beyond those of calendars
+    except (ValueError, OverflowError, OSError):  # a year out of the range of datetime
         return ""
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Set a table in columns; those that are empty are left out."""
+    """Yield the lines of a table in columns, without empty columns."""
     used = [column for column in range(len(heads)) if any(row[column] for row in rows)]
     widths = {column: max(len(row[column]) for row in (heads, *rows)) for column in used}
     for row in (heads, *rows):
@@ -241,7 +241,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
 
 
 def _ends(trend: "ModeTrend") -> tuple[float, float]:
-    """Return lowest and highest end of the frequency's intervals."""
+    """Return the lower and upper limit of all intervals of the frequency."""
     ends = [
         end
         for point in trend.points
@@ -251,7 +251,7 @@ def _ends(trend: "ModeTrend") -> tuple[float, float]:
 
 
 def _interval(point: "TrendPoint", low: float, high: float) -> str:
-    """Draw the interval of the frequency between the ends of the plot."""
+    """Draw the interval of the frequency between the limits of the plot."""
     if high <= low:
         return ""
 
@@ -322,8 +322,8 @@ def recover(
 ) -> None:
     """Recover the intact part of incomplete or damaged session files.
 
-    Writes X.mcap beside X.mcap.part, and X.recovered.mcap beside a damaged X.mcap: every sample up
-    to the damage, marked as recovered. Nothing is overwritten or removed.
+    Writes X.mcap next to X.mcap.part, and X.recovered.mcap next to a damaged X.mcap, with every
+    sample up to the damage, marked as recovered. Nothing is overwritten or removed.
 
     Example: rigd recover sessions/20261120-101500-chirp.mcap.part
     """

@@ -1,4 +1,4 @@
-"""``rigd start``: sessions that the daemon runs; and starting the processes of a rig."""
+"""``rigd start``: sessions run by the daemon; also the start of the processes of a rig."""
 
 import contextlib
 import json
@@ -46,18 +46,18 @@ _QUICK_LOOK_PATIENCE_S = 10.0
 
 
 class SessionCommands(TyperGroup):
-    """Commands that run sessions; Ctrl-C before they catch it themselves is told of.
+    """Commands that run sessions; reports a Ctrl-C before they handle it themselves.
 
-    From :func:`start_processes` on it is a stop of the session, which says so.
+    After :func:`start_processes` Ctrl-C stops the session, which reports it.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the command that was asked for."""
+        """Run the requested command."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            with contextlib.suppress(OSError):  # its terminal is gone
+            with contextlib.suppress(OSError):  # the terminal is gone
                 typer.echo("Stopped before anything began.", err=True)
             raise
 
@@ -67,7 +67,7 @@ def start_processes(
 ) -> "tuple[StopRequest, ProcessGroup]":
     """Catch the operator's stop, and start the processes of the first session.
 
-    They import what they need while the command line imports the rest, and while it plans.
+    The processes import their modules while the command line imports others and plans.
     """
     from rigd.engine.processes import FIT, TOUCH
     from rigd.runner import ProcessGroup
@@ -155,7 +155,7 @@ def start_sessions(
                     )
                 return
             _print_plan(reply["plan"], err=as_json)
-            # A daemon of before an update makes none, or does not tell at which sessions.
+            # An older daemon makes no quick looks, or does not report for which sessions.
             quick_looks = daemon.get("quick_looks", False)
             series = _follow(
                 client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
@@ -170,7 +170,7 @@ def start_sessions(
 
 
 class _Interrupts:
-    """Counts Ctrl-C: the first asks for a stop, the second leaves."""
+    """Counter of Ctrl-C: the first requests a stop, the second leaves."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -178,7 +178,7 @@ class _Interrupts:
     @classmethod
     @contextmanager
     def caught(cls) -> Iterator["_Interrupts"]:
-        """Count from here on."""
+        """Count interrupts within the context."""
         interrupts = cls()
         before = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
         try:
@@ -187,14 +187,14 @@ class _Interrupts:
             signal.signal(signal.SIGINT, before)
 
     def note(self) -> None:
-        """Take note of one."""
+        """Count one interrupt."""
         self.count += 1
 
 
 def _follow(
     client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, quick_looks: bool
 ) -> dict[str, Any]:
-    """Show the progress of a series to its end, and return what the daemon says of it."""
+    """Show the progress of a series to its end, and return its final event."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
@@ -219,7 +219,7 @@ def _follow(
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}
             match event.get("event"):
-                # Between two sessions there is nothing to show: the bar would stand by the path.
+                # No bar between two sessions, where it would mix with the printed path.
                 case "progress" if event["session"] > done:
                     line.update(
                         Phase[event["phase"].upper()],
@@ -232,7 +232,7 @@ def _follow(
                         else "",
                     )
                 case "message" if "session" in event:
-                    pass  # how a session ended: the event of that name tells more
+                    pass  # the end of a session is reported by the event of that name
                 case "message" if event["level"] != "info":
                     line.say(f"{event['level'].capitalize()}: {event['text']}")
                 case "message" if event.get("notable") or event["text"].startswith("Live view"):

@@ -358,7 +358,7 @@ class Rig:
         if message is not None:
             self.disconnect()
             reason = message.reason if isinstance(message, Ended) else ""
-            raise RigError(reason or "The control process was requested to end.")
+            raise RigError(reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
