@@ -21,29 +21,29 @@ from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
 HEAD_LINES: Final = 500
-"""Lines in which the first line of numbers must come."""
+"""Largest line number of the first line of numbers."""
 
 BLANKS: Final = " "
 _SEPARATORS: Final = ("\t", ";", ",", "|")
 _NAMES: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", BLANKS: "blanks"}
 _EXCEL: Final = "sep="
 _BETWEEN: Final = 6
-"""Most lines between the titles and the first line of numbers."""
+"""Largest number of lines between the titles and the first line of numbers."""
 _NUMBERING_LINES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class TextRow:
-    """A line of the file, or several where a quoted cell has ends of lines.
+    """A row of cells: one line of the file, or several with line breaks in a quoted cell.
 
     Attributes
     ----------
     line : int
-        Number of its first line, from 1 on.
+        Number of its first line, from 1.
     cells : list of str
-        Without blanks around them.
+        Cells without surrounding blanks.
     index : int
-        Rows before it, empty ones included.
+        Number of rows before it, including empty ones.
     """
 
     line: int
@@ -53,32 +53,32 @@ class TextRow:
 
 @dataclass(frozen=True, slots=True)
 class TableLayout:
-    """Where in a text the numbers are.
+    """Layout of a table in a text.
 
     Attributes
     ----------
     separator : str
-        Character between cells; a blank for any number of blanks.
+        Character between cells; a blank means any number of blanks.
     titles : tuple of str
-        One for each column, empty without titles.
+        Title of each column, empty without titles.
     titles_line : int
-        Their line, 0 without titles.
+        Line of the titles, 0 without titles.
     units : tuple of str
-        The row of units below the titles, "" where a cell is empty.
+        Units of the row below the titles, "" for an empty cell.
     width : int
-        Cells of each line.
+        Number of cells of each line.
     optional : int
-        Columns at the end that a line may lack: the comment of LabVIEW's text files.
+        Number of optional columns at the end: the comment of LabVIEW's text files.
     skip : int
-        Rows before the first row of numbers.
+        Number of rows before the first row of numbers.
     columns : tuple of int
-        Places of the columns asked for, in their order.
+        Indices of the requested columns, in their order.
     first : tuple of str
         Cells of the first row of numbers.
     labview : LabviewHead or None
         Head of a LabVIEW measurement file.
     rate_hz : float or None
-        Rate that another head states.
+        Sampling rate in another head.
     """
 
     separator: str
@@ -95,7 +95,7 @@ class TableLayout:
 
 
 def stated_separator(first_line: str) -> str | None:
-    """Return the separator of Excel's line ``sep=;``, None if it is another line."""
+    """Return the separator of Excel's line ``sep=;``, None for another line."""
     text = first_line.rstrip("\r\n").strip('"')
     is_statement = text[: len(_EXCEL)].lower() == _EXCEL and len(text) == len(_EXCEL) + 1
     return text[-1] if is_statement else None
@@ -115,7 +115,7 @@ def rows_of(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[st
 
 
 def fitted(row: Sequence[str], width: int) -> list[str]:
-    """Return a row without the empty cells behind the last column."""
+    """Return a row without the empty cells after the last column."""
     cells = list(row)
     while len(cells) > width and not cells[-1].strip():
         cells.pop()
@@ -123,7 +123,7 @@ def fitted(row: Sequence[str], width: int) -> list[str]:
 
 
 def wrong_width(line: int, cells: int, layout_width: int, titles_line: int, separator: str) -> str:
-    """Say that a line has too many or too few cells, and what to do."""
+    """Return the message for a line with too many or too few cells."""
     table = (
         f"line {titles_line} has {_counted(layout_width, 'title')}"
         if titles_line
@@ -159,7 +159,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     lines : sequence of str
         At most `HEAD_LINES`, with their ends.
     names : sequence of str
-        Titles of the columns asked for, or ``#3`` for the third.
+        Titles of the requested columns, or ``#3`` for the third.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
         if found is None or layout.skip < found.skip:
             found = layout
     worst = max(failures, key=lambda failure: failure.rank, default=None)
-    # What is a table from a late line on only, though an earlier one nearly was one, is none.
+    # A table that starts late does not count if earlier lines nearly form a table.
     early = any(
         each.rank == _TITLES and found and each.index < found.skip and each.separator != BLANKS
         for each in failures
@@ -215,7 +215,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
 
 
 class _UnlikelyError(Exception):
-    """A separator with which the text is not the table asked for, and how near it comes."""
+    """Separator with which the text is not the requested table; `rank`: how near it is."""
 
     def __init__(self, rank: int, error: TableError, index: int = HEAD_LINES) -> None:
         super().__init__()
@@ -226,7 +226,7 @@ class _UnlikelyError(Exception):
 
 
 _NO_ROWS, _NO_TITLES, _SOME_TITLES, _TITLES = range(4)
-"""How near a failure comes: the message of the nearest is shown."""
+"""Ranks of failures: the message of the highest rank is shown."""
 
 
 def _layout(
@@ -272,9 +272,9 @@ def _number(name: str) -> int | None:
 
 
 def _plain_titles(row: TextRow) -> list[str]:
-    """Return the titles of a row without the mark of a comment, and without empty ones behind."""
+    """Return the titles of a row without comment mark and without empty titles at the end."""
     cells = fitted(row.cells, 0)
-    if cells and cells[0] in ("#", "%"):  # between blanks, the mark is a cell of its own
+    if cells and cells[0] in ("#", "%"):  # with blanks as separator the mark is a separate cell
         return cells[1:]
     return [without_comment_mark(cell) if not index else cell for index, cell in enumerate(cells)]
 
@@ -294,7 +294,7 @@ def _below_titles(
     head = rows[index]
     raw, plain = fitted(head.cells, 0), _plain_titles(head)
     titles = raw if all(name in raw for name in names if _number(name) is None) else plain
-    if len(plain) < len(raw):  # a mark by itself may be one of a comment, or the title of an index
+    if len(plain) < len(raw):  # a single mark may be that of a comment or the title of an index
         below = _next(rows, head)
         titles = raw if below is None or len(below.cells) == len(raw) else plain
     width = len(titles)
@@ -356,7 +356,7 @@ def _check_single(line: int, cells: Sequence[str]) -> None:
 
 
 def comma_in_single(line: int) -> str:
-    """Say why a column by itself has no decimal commas."""
+    """Return the message for a single column with decimal commas."""
     return (
         f"line {line} has a comma, which separates two cells, and the table has one column; save "
         "the file with decimal points."
@@ -368,7 +368,7 @@ def _next(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
 
 
 def _is_data(cells: Sequence[str], columns: Sequence[int], below: TextRow | None) -> bool:
-    """Whether a row has numbers in the columns asked for, and no text where the next has none."""
+    """Return whether a row has numbers in the requested columns and no text unlike the next row."""
     if max(columns) >= len(cells):
         return False
     own = [cells[column] for column in columns if cells[column]]
@@ -391,7 +391,7 @@ def _not_data(
     width: int,
     separator: str,
 ) -> TableError:
-    """Make the error for the first row below the titles that is not one of numbers."""
+    """Return the error for a first row below the titles without numbers."""
     if len(cells) != width:
         return TableError(wrong_width(row.line, len(cells), width, head.line, separator))
     for name, column in zip(names, columns, strict=True):
@@ -404,7 +404,7 @@ def _not_data(
 
 
 def not_a_number(line: int, name: str, cell: str) -> TableError:
-    """Make the error for a cell that is not a number."""
+    """Return the error for a cell that is not a number."""
     if is_date(cell):
         return TableError(
             f"line {line}: '{name}' is a date or a time of day{{cell}} that is not understood; "
@@ -426,7 +426,7 @@ def _with_numbers(
     numbers: Sequence[int],
     labview: "_labview.LabviewHead | None",
 ) -> TableLayout | None:
-    """Return the layout if this row is the first of numbers, by the columns' numbers alone."""
+    """Return the layout if this row is the first row of numbers, for columns given by number."""
     row, above = rows[index], list(takewhile(lambda each: each.index < rows[index].index, rows))
     columns = [number - 1 for number in numbers]
     if is_comment(row.cells):
@@ -466,7 +466,7 @@ def _with_numbers(
                 _TITLES,
                 TableError(wrong_width(row.line, len(cells), len(titles), titles_line, separator)),
             )
-        titles, titles_line = (), 0  # several words each: nothing says which belong together
+        titles, titles_line = (), 0  # titles of several words cannot be separated
     width = len(titles) if titles else len(cells)
     _check_single(row.line, cells)
     return TableLayout(
@@ -486,7 +486,7 @@ def _with_numbers(
 
 
 def _numbers_the_columns(rows: Sequence[TextRow], index: int) -> bool:
-    """Whether the first row numbers the columns: no row below has whole numbers only."""
+    """Return whether the first row numbers the columns: no row below has only integers."""
     cells = [cell for cell in rows[index].cells if cell]
     if index or len(cells) < 2:
         return False
@@ -502,7 +502,7 @@ def _numbers_the_columns(rows: Sequence[TextRow], index: int) -> bool:
 
 
 def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
-    """Say which title is missing, from the line that has most of them or seems to have titles."""
+    """Return the error for a missing title, with the most probable line of titles."""
 
     def found(row: TextRow) -> int:
         return sum(name in row.cells or name in _plain_titles(row) for name in names)
@@ -541,7 +541,7 @@ def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
 
 
 def _no_numbers(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
-    """Say that no row has numbers in the columns asked for."""
+    """Return the error for a table without numbers in the requested columns."""
     width = max(len(row.cells) for row in rows)
     for name in names:
         if (_number(name) or 0) > width:
