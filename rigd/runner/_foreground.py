@@ -285,7 +285,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
             f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
             err=True,
         )
-    stop.requested = before  # this Ctrl-C skipped a quick look, not a session
+    stop.requested = before  # this Ctrl-C skipped the quick look only
 
 
 def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:

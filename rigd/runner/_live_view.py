@@ -69,7 +69,7 @@ class LiveView:
             return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Check whether the publisher is running; restart it if it died or hangs."""
         if not self._lost:
             self._listen(0.0)
@@ -78,7 +78,7 @@ class LiveView:
 
     def poll(self) -> list[Event]:
         """Check the publisher, and return the events for the operator."""
-        self.look()
+        self.check()
         events, self._unreported = self._unreported, []
         return events
 

@@ -80,7 +80,7 @@ class Rig:
         self._zero_set = False
         self._pulse = Pulse()
         self._precedence: Precedence | None = None
-        self._looking = threading.Lock()
+        self._status_lock = threading.Lock()
         self._statuses = StatusWatch(profile.rig.rate_hz)
         self._signals = SignalReader(profile)
         self.connected = False
@@ -341,7 +341,7 @@ class Rig:
         """
         group = self._require()
         if self._view is not None:
-            self._view.look()
+            self._view.check()
         try:
             message = group.control.poll(0.0)
         except ChildError as error:
@@ -362,19 +362,19 @@ class Rig:
 
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
-        with self._looking:
+        with self._status_lock:
             group, view = self._group, self._view
             if group is None or not group.laid_out:
                 return None
             address = None if view is None else view.address
-            return replace(self._statuses.look(group), live_view=address)
+            return replace(self._statuses.read(group), live_view=address)
 
     def signals(self) -> list[SignalBlock]:
         """Return the signals of the record since the last call, from any thread.
 
         Reading starts with the first call, and again if the last call was more than 1 s ago.
         """
-        with self._looking:
+        with self._status_lock:
             group = self._group
             if group is None or not group.laid_out:
                 return []
@@ -382,7 +382,7 @@ class Rig:
 
     def disconnect(self) -> None:
         """Disable the drive, close the devices, end the processes; repeated calls do nothing."""
-        with self._looking:
+        with self._status_lock:
             group, self._group = self._group, None
             self._view = None
             self.connected = False

@@ -40,7 +40,7 @@ class QuickLook:
     """Path of the session file."""
     path: Path | None
     """Path of the file of the quick look; None if it failed."""
-    look: dict[str, Any] | None
+    content: dict[str, Any] | None
     """Content of that file; None if it failed."""
     error: str
     """Why it failed, a sentence; else empty."""
@@ -61,25 +61,27 @@ class QuickLook:
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return the quick look of an event of the daemon."""
-        session, look = Path(event["path"]), event["look"]
-        return cls(session, None if look is None else look_path(session), look, event["error"])
+        session, content = Path(event["path"]), event["look"]
+        return cls(
+            session, None if content is None else look_path(session), content, event["error"]
+        )
 
     @property
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""
-        if self.look is None:
+        if self.content is None:
             return [f"No quick look at {self.session.name}: {self.error}"]
-        return [printable(str(line)) for line in self.look["text"]]
+        return [printable(str(line)) for line in self.content["text"]]
 
     def note(self, results: list[SessionResult]) -> None:
         """Add the path of the file to the result of its session, if it is in the list."""
         for index, result in enumerate(results):
             if result.path == self.session:
-                results[index] = replace(result, look=self.path)
+                results[index] = replace(result, quick_look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the event of the daemon."""
-        return {"path": str(self.session), "look": self.look, "error": self.error}
+        return {"path": str(self.session), "look": self.content, "error": self.error}
 
 
 class QuickLooks:
@@ -215,10 +217,10 @@ class QuickLooks:
 
     def _done(self) -> QuickLook:
         path = look_path(self._session)
-        look = read_look(path)
-        if look is None:
+        content = read_look(path)
+        if content is None:
             return QuickLook.failed(self._session, f"{path} cannot be read.")
-        return QuickLook(self._session, path, look, "")
+        return QuickLook(self._session, path, content, "")
 
     def _signal(self, number: signal.Signals) -> None:
         if self._process is not None:

@@ -99,7 +99,7 @@ class SessionFailedError(FailureError):
             fault=True,
             part=part,
             hardware=self.hardware,
-            look=None,
+            quick_look=None,
             touches=None,
             fit=None,
             **self.counts,
@@ -142,7 +142,7 @@ class SessionResult:
     """Path of an incomplete file that could not be completed."""
     hardware: bool | None = None
     """Whether the hardware moved and nothing was simulated; None: not known."""
-    look: Path | None = None
+    quick_look: Path | None = None
     """Path of the quick look at the session; None: there is none yet."""
     touches: tuple[Mapping[str, Any], ...] | None = None
     """Touches in the order of their times; None if the session had no touch search."""
@@ -171,7 +171,7 @@ class SessionResult:
             "stale_angles": self.stale_angles,
             "stale_wrenches": self.stale_wrenches,
             "hardware": self.hardware,
-            "look": None if self.look is None else str(self.look),
+            "look": None if self.quick_look is None else str(self.quick_look),
             **touches,
             **fit,
         }

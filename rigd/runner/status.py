@@ -60,7 +60,7 @@ class SignalWatch:
         self._recent: deque[npt.NDArray[Any]] = deque()
         self._peaks = np.zeros(3)
 
-    def look(self, ring: Ring) -> Callable[[], SignalStatus] | None:
+    def poll(self, ring: Ring) -> Callable[[], SignalStatus] | None:
         """Read the samples since the last call; return a function for the statistics, or None.
 
         The statistics are computed on request, which is less frequent than the calls.
@@ -203,7 +203,7 @@ class StatusWatch:
         self._written: tuple[float, tuple[int, ...]] | None = None
         self._signals = SignalWatch(rate_hz)
 
-    def look(self, group: ProcessGroup) -> RigStatus:
+    def read(self, group: ProcessGroup) -> RigStatus:
         """Return the present status."""
         shared_state = group.channels.board
         load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
@@ -222,7 +222,7 @@ class StatusWatch:
             sensor_status=shared_state.known(Word.SENSOR_STATUS),
             disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
             view_dropped=shared_state[Word.LIVE_DROPPED],
-            signals=self._signals.look(group.channels.samples),
+            signals=self._signals.poll(group.channels.samples),
             processes=tuple(self._processes(group)),
             topics=tuple(self._topics(group)),
         )
