@@ -22,8 +22,8 @@ from rigd.runner.session import SessionProgress, SessionResult, always
 from rigd.runtime import StopRequest
 
 _QUICK_LOOK_PATIENCE_S: Final = 8.0
-"""Longest pause between two sessions of a series for the quick look at the first one. Most quick
-looks take two or three seconds; an unfinished one is suspended."""
+"""Longest pause between two sessions for the quick look at the first one, which mostly takes two or
+three seconds. If it is unfinished, it is suspended."""
 _POLL_S: Final = 0.05
 
 
