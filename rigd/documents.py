@@ -1,8 +1,8 @@
-"""Documents that users write or name, TOML and JSON, read within bounds.
+"""TOML and JSON documents of users, read with limits of their size.
 
-A document of a few kilobytes can be nested deeper than the interpreter's stack, state a number of
-thousands of digits, or grow to twenty times its size in memory. Such documents are refused in one
-sentence.
+A document of a few kilobytes can be nested deeper than the interpreter's stack, contain a number
+with thousands of digits, or take twenty times its size in memory. Such documents are refused with
+one sentence.
 """
 
 import json
@@ -16,16 +16,16 @@ from rigd.text_table import decode_text
 
 MOST_TOML_BYTES: Final = 250_000
 MOST_JSON_BYTES: Final = 12_000_000
-"""As objects, the most unfavourable document takes thirty times as much."""
+"""Largest size of JSON; the worst document takes thirty times as much memory."""
 _MOST_ENTRIES: Final = 3000
-"""Keys and elements of a TOML document; a profile has 150."""
+"""Largest number of keys and elements of a TOML document; a profile has 150."""
 _LONGEST_LINE: Final = 4096
-"""Characters of a line of TOML: the memory for a dotted key grows with the square of its length."""
+"""Longest line of TOML, characters: the memory for a dotted key grows quadratically."""
 _DEEPEST: Final = 16
 
 
 class DocumentError(ValueError):
-    """A document cannot be read; the message is what stands behind the file's name."""
+    """A document cannot be read; the message completes a sentence after the file name."""
 
 
 def read_text(path: Path, most_bytes: int = MOST_TOML_BYTES) -> str:
@@ -41,7 +41,7 @@ def read_text(path: Path, most_bytes: int = MOST_TOML_BYTES) -> str:
     Raises
     ------
     DocumentError
-        If it cannot be read, is not an ordinary file, is too large, or is not text.
+        If the file cannot be read, is not a regular file, is too large, or is not text.
     """
     try:
         with open_plain_file(path, most_bytes) as file:
@@ -63,7 +63,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises
     ------
     DocumentError
-        If it is not TOML, is nested too deeply, or has more in it than people write.
+        If it is not TOML, is nested too deeply, or is larger than a document written by a person.
     """
     if len(text) > MOST_TOML_BYTES:
         raise DocumentError(f"has more than {MOST_TOML_BYTES} characters; shorten it")
@@ -94,7 +94,7 @@ def read_json(path: Path, most_bytes: int = MOST_JSON_BYTES) -> Any:  # noqa: AN
     Raises
     ------
     DocumentError
-        If it cannot be read, is not an ordinary file, is too large, or is not JSON.
+        If the file cannot be read, is not a regular file, is too large, or is not JSON.
     """
     text = read_text(path, most_bytes)
     try:

@@ -1,9 +1,9 @@
-"""Errors of the rig: the classes from which every error that an operator may be told derives.
+"""Errors of the rig: the base classes of all errors that are reported to an operator.
 
 ::
 
     RigdError
-     +-- UserError             the request has to be another: exit code 2
+     +-- UserError             the request must be changed: exit code 2
      |    +-- ProfileError          a key of the profile is missing, or its value is out of range
      |    +-- UnknownValueError     motor.peak_torque_nm has source = "unknown" in the profile
      |    +-- UnknownRowError       --accept names no row of rigd check
@@ -26,23 +26,23 @@
      |    +-- ProbeFailedError      the probing move contradicts a scale of the profile
      |    +-- ChildError            the control process was killed
      |    +-- RigError              the rig is not connected, or its zero is lost
-     |    +-- SessionFailedError    the recorder died; part of the record is kept
-     |    +-- SeriesFailedError     either of the two, after some sessions of a series
+     |    +-- SessionFailedError    the recorder died; part of the record is stored
+     |    +-- SeriesFailedError     one of the two, after some sessions of a series
      |    +-- RigBusyError          another program runs the rig
      |    +-- UnsafeFolderError     others can write to the runtime folder
      |    +-- AddressError          no daemon is running, or its socket cannot be made
-     |    +-- DaemonGoneError       the daemon was killed while it was asked
+     |    +-- DaemonGoneError       the daemon was killed during a request
      |    +-- SessionError          a session file is damaged, or the disk is full
      |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run
-     |    +-- EdsError, UnusableDriveError    the file of a drive is none, or lacks what is needed
+     |    +-- EdsError, UnusableDriveError    the EDS file of a drive is invalid or insufficient
      |    +-- EstimateError         the sessions do not determine the motor's data
      |    +-- LoopError, CyclictestError      rigd bench could not measure
-     +-- CommandError, RefusedByDaemonError   of either kind, as the daemon says
+     +-- CommandError, RefusedByDaemonError   of either kind, as reported by the daemon
 
-The command line translates them in one place (`rigd.cli.options.errors_told`). What is no
-`RigdError` is a mistake in the program, and ends with a traceback; the control process ends with
-the torque off whatever it was.
+`rigd.cli.options.exit_on_errors` handles them for all commands. Any other exception is a mistake in
+the program and ends with a traceback. The control process switches the torque off after any
+exception.
 """
 
 
@@ -50,18 +50,18 @@ class RigdError(Exception):
     """An error whose message is for the operator."""
 
     wrong_use = False
-    """The request itself has to be another; otherwise the same one may succeed later."""
+    """Whether the request must be changed; otherwise the same request may succeed later."""
 
     def told(self) -> str:
-        """Return the message for the operator; it may take some seconds to find out more."""
+        """Return the message for the operator; this may take some seconds for further checks."""
         return str(self)
 
 
 class UserError(RigdError):
-    """A request that cannot be met as it is."""
+    """A request that must be changed."""
 
     wrong_use = True
 
 
 class FailureError(RigdError):
-    """Something failed that was asked for rightly."""
+    """A valid request that failed."""

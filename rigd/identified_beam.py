@@ -1,7 +1,7 @@
-"""The beam as an analysis identified it: read from the document of ``analyze --json``.
+"""Identified beam of an analysis, read from the document of ``analyze --json``.
 
-Every parameter and every finding of the document is either taken into account by who reads it, or
-refused by name: nothing is dropped.
+Every parameter and every finding of the document is either taken into account or refused by name;
+none is ignored.
 """
 
 import json
@@ -23,15 +23,15 @@ _REMEDY: Final = "write it with analyze session.mcap --json model.json"
 
 @dataclass(frozen=True, slots=True)
 class _Parameter:
-    """A parameter of the document: its unit and its range."""
+    """Unit and range of a parameter of the document."""
 
     unit: str = ""
     least: float = 0.0
     below: float = inf
     words: str = ""
-    """What it is, where it is no property of a uniform beam and ideal channels; else empty."""
+    """Description of an effect beyond a uniform beam with ideal channels; else empty."""
     remedy: str = ""
-    """How to get a document without it."""
+    """How to obtain a document without the effect."""
 
 
 _OFFSET: Final = "stiffness_offset_"
@@ -81,43 +81,41 @@ _PARAMETERS: Final[Mapping[str, _Parameter]] = {
         remedy="leave --model out, and expect more vibration than stated",
     ),
 }
-"""All parameters that a document may have, of this version or an older one: offsets of modes, the
-compliance of the clamp and the difference of clocks are no longer estimated. A document with
-another parameter is refused, for nobody here knows what it changes."""
+"""All parameters of documents of this version or an older one. Offsets of modes, the compliance of
+the clamp and the difference of clocks are no longer estimated. A document with an unknown parameter
+is refused, because its effect is unknown."""
 
 _WITHOUT_EFFECT: Final = frozenset(
     {"hum", "sensor drift", "ringing start", "knock", "clipping", "stop"}
 )
-"""Findings on one record, which the numbers were estimated with; where they make them doubtful,
-the numbers are flagged."""
+"""Findings on one record, which the estimates take into account; doubtful numbers are flagged."""
 
 _IN_PARAMETERS: Final = frozenset(
     {
         *("delay", "tool inertia", "beam data", "air drag", "rival explanations"),
-        # Of analyses that fitted other rigs than the uniform beam:
+        # From analyses with model variants other than the uniform beam:
         *("not uniform", "elastic clamp", "tip mass", "torque filter"),
     }
 )
-"""Findings whose size is among the parameters."""
+"""Findings whose magnitude is among the parameters."""
 
 
 class IdentifiedBeamError(UserError, ValueError):
-    """A document holds no beam that can be used; the message names file, key and remedy."""
+    """A document has no usable beam; the message names file, key and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """What a use of an identified beam takes into account, and which numbers it relies on."""
+    """Purpose of an identified beam: effects taken into account and required parameters."""
 
     name: str
-    """As messages call it, such as "a move"."""
+    """Name in messages, such as "a move"."""
     effects: frozenset[str]
-    """Parameters beyond the uniform beam and its channels that are taken into account."""
+    """Additional parameters that are taken into account."""
     certain: frozenset[str]
-    """Parameters that must not be flagged, unless another standard deviation covers the doubt."""
+    """Parameters that must not be flagged, unless their standard deviation covers the doubt."""
     modes: bool = False
-    """Whether the modes that the record shows will do where they are not those of a uniform beam:
-    each then has a stiffness of its own."""
+    """Whether observed modes can replace those of a uniform beam, with one stiffness per mode."""
 
 
 MOVE: Final = Use(
@@ -126,7 +124,7 @@ MOVE: Final = Use(
     frozenset({*_NEEDED, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
     modes=True,
 )
-"""A move without vibration depends on the modes, hardly on how their damping is made up."""
+"""A vibration-free move depends on the modes and hardly on the composition of their damping."""
 
 TOUCH: Final = Use(
     "a search for touches",
@@ -141,27 +139,27 @@ class IdentifiedBeam:
     """Parameters of the exact model from an analysis."""
 
     beam: Beam
-    """Length as given, stiffness and density as identified."""
+    """Beam with the given length and the identified stiffness and density."""
     damping: Damping
-    """Damping as identified; a coefficient of 0 means that the structure has no such damping."""
+    """Identified damping; a coefficient of 0 means that the structure has no such damping."""
     tool_inertia_kg_m2: float | None
-    """Inertia between sensor and beam; None: it was not identified."""
+    """Inertia between sensor and beam; None: not identified."""
     delay_s: float | None
-    """Torque's age less the angle's; None: it was not identified."""
+    """Delay of the torque less that of the angle; None: not identified."""
     std: Mapping[str, float]
-    """Standard deviations by the parameters' names in the document, those that are known."""
+    """Known standard deviations by parameter name in the document."""
     tip_mass_kg: float = 0.0
     """Point mass at the tip."""
     root_compliance_rad_per_nm: float = 0.0
-    """By how much the clamp turns for a torque on the beam's root."""
+    """Rotational compliance of the clamp."""
     stiffness_offsets: tuple[float, ...] = ()
     """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
     mode_uncertainty: tuple[float, ...] = ()
-    """Relative standard uncertainty of the pole of each mode that the document lists."""
+    """Relative standard uncertainty of the pole of each mode in the document."""
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """The beam with its damping and what is at its ends."""
+        """Beam with its damping and end conditions."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -176,8 +174,8 @@ class IdentifiedBeam:
         Parameters
         ----------
         modes
-            Number of modes, from the first on. One that the document does not list is taken to be
-            as uncertain as the most uncertain one that it does.
+            Number of modes, from the first. A mode that is not in the document gets the largest
+            uncertainty of those in it.
         """
         of_beam = 0.5 * self.std.get(_NEEDED[0], 0.0) / self.beam.density_over_stiffness
         further = max(self.mode_uncertainty, default=of_beam)
@@ -185,11 +183,11 @@ class IdentifiedBeam:
 
 
 def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
-    """Read the beam that an analysis headlines: of a campaign the pooled one.
+    """Return the beam of the headline of an analysis; for a campaign, the pooled one.
 
-    Where a uniform beam predicts the modes, its parameters are those of an exactly uniform one,
-    which predict the record best. Where it does not, no parameter of it describes the rig: the
-    modes themselves are taken, if the use admits that.
+    If a uniform beam predicts the modes, the parameters are those of an exactly uniform beam, which
+    predict the record best. Otherwise no uniform beam describes the rig, and the modes themselves
+    are used if the purpose permits it.
 
     Parameters
     ----------
@@ -197,15 +195,15 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     length_m
-        Length of the beam, which no session shows.
+        Length of the beam, which is not observable in a session.
     use
-        What the beam is for: `MOVE` or `TOUCH`.
+        Purpose of the beam: `MOVE` or `TOUCH`.
 
     Raises
     ------
     IdentifiedBeamError
-        If the file cannot be read or has no such parameters, if it has an effect or a finding that
-        this use does not take into account, or if a number that it relies on is flagged.
+        If the file cannot be read or lacks parameters, if it has an effect or a finding that this
+        use does not take into account, or if a required number is flagged.
     """
     path = Path(path)
     where, headline, refused = _headline(path)
@@ -224,7 +222,7 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         raise IdentifiedBeamError(f"{where}.parameters is missing; {_REMEDY}.")
     values = parameter_values(where, parameters)
     if refused:
-        # Effective values of a beam that the rig has not: the modes take their place.
+        # Effective values of a uniform beam do not describe the rig: the modes replace them.
         values = {n: v for n, v in values.items() if _of(n) not in (_OFFSET, *_AT_ENDS)}
     _refuse_effects(where, values, use)
     std = {}
@@ -257,16 +255,17 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
 
 
 def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) -> IdentifiedBeam:
-    """Give a beam the modes that a record shows: frequencies and the size of the first."""
+    """Return a beam with observed mode frequencies and participation of the first mode."""
     shown: list[tuple[float, float, float | None]] = []
     for entry in modes if isinstance(modes, list) else []:
         if not isinstance(entry, dict) or not entry.get("shown", True):
             break
-        told = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
+        quantities = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
         hz, ratio, inertia = (
-            finite_number(each.get("value")) if isinstance(each, dict) else None for each in told
+            finite_number(each.get("value")) if isinstance(each, dict) else None
+            for each in quantities
         )
-        flags = [each.get("flag") for each in told if isinstance(each, dict)]
+        flags = [each.get("flag") for each in quantities if isinstance(each, dict)]
         if not hz or not ratio or hz < 0 or any(flags):
             break
         shown.append((hz, ratio, inertia))
@@ -289,7 +288,7 @@ def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) 
         )
     found = replace(found, beam=beam, stiffness_offsets=like.stiffness_offsets)
     poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(shown)))[:, 0]
-    # What the damping of the beam found differs by from that of the modes counts as uncertainty.
+    # The difference between the damping of the beam and of the modes counts as uncertainty.
     uncertainty = (
         hypot(own, abs(ratio + pole.real / abs(pole)))
         for own, (_, ratio, _), pole in zip(found.mode_uncertainty, shown, poles, strict=False)
@@ -298,17 +297,17 @@ def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) 
 
 
 def _headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
-    """Return the headline of a document, what messages call it, and why no uniform beam is it."""
+    """Return a headline after its name in messages, and why it excludes a uniform beam."""
     document: Any = read_document(path)
     where, headline = select_headline(path, document)
-    # Of a campaign one record that refuses it is enough.
+    # One record of a campaign that excludes it is enough.
     pooled = headline.get("file", "") is None
     counting = filter(_is_object, document["headlines"]) if pooled else [headline]
     return where, headline, next(filter(None, map(_refusal, counting)), "")
 
 
 def _is_object(entry: object) -> bool:
-    """Whether a value of a document is an object."""
+    """Return whether a value of a document is an object."""
     return isinstance(entry, dict)
 
 
@@ -322,7 +321,7 @@ def read_document(path: Path) -> object:
     Raises
     ------
     IdentifiedBeamError
-        If it cannot be read, or is not JSON.
+        If the file cannot be read, or is not JSON.
     """
     try:
         return read_json(path)
@@ -331,7 +330,7 @@ def read_document(path: Path) -> object:
 
 
 def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any]]:
-    """Return a document's first headline, of a campaign the pooled one, and its name in messages.
+    """Return the name in messages and the first headline of a document, pooled for a campaign.
 
     Parameters
     ----------
@@ -357,7 +356,7 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
 
 
 def _refusal(headline: Mapping[str, Any]) -> str:
-    """Say that a uniform beam does not predict the modes of a record; empty if it may."""
+    """Return why a uniform beam does not predict the modes of a record; empty if it may."""
     validity = headline.get("validity")
     test = validity.get("uniform_beam") if isinstance(validity, dict) else None
     if not isinstance(test, dict) or test.get("status") != "refused":
@@ -380,7 +379,7 @@ def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, flo
     Raises
     ------
     IdentifiedBeamError
-        If a parameter is not known, out of its range, or one that every beam has is missing.
+        If a parameter is unknown or out of range, or a required parameter is missing.
     """
     values = {name: _value(where, name, entry) for name, entry in parameters.items()}
     for name in _NEEDED:
@@ -395,7 +394,7 @@ def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, flo
 def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     """Return index, kind and sentence of the findings whose effect no parameter describes.
 
-    Findings on the one record, which do not concern the antenna, are left out.
+    Findings on one record only, which do not concern the antenna, are omitted.
 
     Parameters
     ----------
@@ -412,12 +411,12 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
 
 
 def _of(name: str) -> str:
-    """Return the name in `_PARAMETERS` of a parameter: that of a mode's offset without its mode."""
+    """Return the name of a parameter in `_PARAMETERS`, for a mode's offset without the mode."""
     return _OFFSET if name.startswith(_OFFSET) and name[len(_OFFSET) :].isdecimal() else name
 
 
 def _value(where: str, name: str, entry: object) -> float:
-    """Return the value of a parameter, of a size that the exact model takes."""
+    """Return the value of a parameter in the valid range of the exact model."""
     known = _PARAMETERS.get(_of(name))
     if known is None or name == _OFFSET:
         raise IdentifiedBeamError(
@@ -442,7 +441,7 @@ def _value(where: str, name: str, entry: object) -> float:
 
 
 def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
-    """Refuse what the record shows with a uniform beam and the use does not take into account."""
+    """Raise for effects in addition to a uniform beam that the use does not take into account."""
     for name, value in values.items():
         known = _PARAMETERS[_of(name)]
         if not known.words or not value or _of(name) in use.effects:
@@ -464,7 +463,7 @@ def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
 
 
 def _refuse_findings(where: str, named: object, use: Use) -> None:
-    """Refuse findings that no parameter carries and that change the beam or doubt the record."""
+    """Raise for findings without a parameter that change the beam or make the record doubtful."""
     for number, what, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
             f"{where}.named[{number}]: {what}, which {use.name} does not take into "
@@ -474,16 +473,16 @@ def _refuse_findings(where: str, named: object, use: Use) -> None:
 
 
 def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
-    """Return the standard deviation of a parameter, which covers the doubt that a flag says."""
+    """Return the standard deviation of a parameter, including the doubt of a flag."""
     flag = entry.get("flag")
     if flag is None:
         return _deviation(entry)
-    # Of analyses that fitted other rigs: the deviation whichever of them is the true one.
+    # From analyses with other model variants: the deviation over all of them.
     any_rig = finite_number(entry.get("std_any_rig"))
     if any_rig is not None and any_rig > 0:
         return any_rig
     deviation = _deviation(entry)
-    # Of a move the damping is in the uncertainty of the modes.
+    # For a move the uncertainty of the modes includes the damping.
     in_modes = use is MOVE and not _PARAMETERS[_of(name)].words
     if _of(name) not in use.certain and (deviation is not None or in_modes):
         return deviation
@@ -494,7 +493,7 @@ def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) ->
 
 
 def _deviation(entry: Mapping[str, Any]) -> float | None:
-    """Half of the 95 % interval over 1.96, which holds over all structures; else the std."""
+    """Return the 95 % half-width over 1.96, valid for all structures; else the std."""
     ends, std = entry.get("interval_95"), finite_number(entry.get("std"))
     if isinstance(ends, list) and len(ends) == 2:
         low, high = map(finite_number, ends)
@@ -504,7 +503,7 @@ def _deviation(entry: Mapping[str, Any]) -> float | None:
 
 
 def _offsets(where: str, values: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the offsets of modes 2, 3, …, which a document has for each of them up to the last."""
+    """Return the offsets of modes 2, 3, … up to the last one in the document."""
     found = {int(n[len(_OFFSET) :]): value for n, value in values.items() if _of(n) == _OFFSET}
     modes = range(2, 2 + len(found))
     if sorted(found) != list(modes):

@@ -1,4 +1,4 @@
-"""What terminals show: text from outside made harmless, counts, progress with the time left."""
+"""Text for terminals: harmless text from outside, counts, progress with the remaining time."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,29 +11,29 @@ UNPRINTABLE: Final = "?"
 """Replacement of a character that cannot be printed."""
 
 _FROM: Final = 10_000
-"""Numbers of four digits are read without help."""
+"""Smallest number with separated thousands."""
 
 _MOST_LINES: Final = 40
 _LONGEST_LINE: Final = 2000
 _LINE_ENDING: Final = 500
-"""Characters of its end that a line which is cut keeps: the remedy is there."""
+"""Characters at the end of a truncated line that remain, because they state the remedy."""
 
 _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
-"""Theme of rich for a progress bar: its own is red, which on a rig is for alarms."""
+"""Styles of a progress bar; the default red is reserved for alarms."""
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """Return a text as a message can show it, whatever somebody has put into it.
+    """Return a text without characters that a terminal would interpret.
 
-    Control characters, which a terminal obeys, ends of lines and everything else that has no shape
-    of its own are each replaced by :data:`UNPRINTABLE`.
+    Control characters, line breaks and all other unprintable characters are each replaced by
+    :data:`UNPRINTABLE`.
 
     Parameters
     ----------
     text
         Text from a file, a device, or a path.
     most
-        Characters of it that are shown; an ellipsis stands for the rest. All if it is not given.
+        Largest number of characters; an ellipsis replaces the others. None: all characters.
     """
     shown = text[:most]
     if not shown.isprintable():
@@ -42,10 +42,10 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def readable_message(message: str) -> str:
-    r"""Return an error message of harmless text and readable length, whatever it quotes.
+    r"""Return an error message as harmless text of readable length.
 
-    Lines beyond the fortieth are counted, and the middle of a line of more than 2000 characters is
-    left out.
+    Lines after the fortieth are only counted, and the middle of a line of more than 2000 characters
+    is omitted.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def readable_message(message: str) -> str:
     >>> print(readable_message("a.toml: x = \x1b[2J is unknown."))
     a.toml: x = ?[2J is unknown.
     """
-    # An end of line in a quotation is not told from one of the message; either is harmless.
+    # A line break of a quotation and one of the message are indistinguishable and both harmless.
     lines = message.split("\n", _MOST_LINES)
     shown = [_readable_line(line) for line in lines[:_MOST_LINES]]
     if len(lines) > _MOST_LINES:
@@ -74,7 +74,7 @@ def _readable_line(line: str) -> str:
 
 @contextlib.contextmanager
 def readable_errors() -> Iterator[None]:
-    """Make the message of a command line's usage error readable, whatever value it quotes."""
+    """Make the message of a usage error readable, whatever value it quotes."""
     try:
         yield
     except Exception as error:
@@ -85,7 +85,7 @@ def readable_errors() -> Iterator[None]:
 
 
 def grouped(count: int) -> str:
-    """Return a whole number with its thousands set apart.
+    """Return a whole number with separated thousands.
 
     Examples
     --------
@@ -97,12 +97,12 @@ def grouped(count: int) -> str:
 
 
 def listed(parts: Sequence[str]) -> str:
-    """Return the parts of a list as a sentence has them.
+    """Return the parts of a list joined with commas and "and".
 
     Parameters
     ----------
     parts
-        One at least.
+        At least one part.
 
     Examples
     --------
@@ -115,14 +115,14 @@ def listed(parts: Sequence[str]) -> str:
 
 
 def counts_text(counts: Mapping[str, Any]) -> str:
-    """Say how many samples of a session were recorded, and what became of the others.
+    """Return the counts of recorded, missed, late and lost samples of a session as text.
 
     Parameters
     ----------
     counts
         ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
-        ``stale_wrenches``, as numbers or as texts; of the last three only what occurred, or may
-        have, is told. None: it is not known, as of a file that could not be read.
+        ``stale_wrenches``, as numbers or as texts. The last three are reported only if they are not
+        0. None: not known, as for a file that could not be read.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     11 998 of 12 000 samples, 2 missed, 5 late
     """
     rare = ("lost", "stale_angles", "stale_wrenches")
-    told = [
+    counted = [
         f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
         *(f"{_count_text(counts[name])} {name}" for name in ("missed", "late")),
         *(
@@ -140,7 +140,7 @@ def counts_text(counts: Mapping[str, Any]) -> str:
             if name in counts and (counts[name] is None or int(counts[name]))
         ),
     ]
-    return ", ".join(told)
+    return ", ".join(counted)
 
 
 def _count_text(count: int | str | None) -> str:
@@ -148,16 +148,16 @@ def _count_text(count: int | str | None) -> str:
 
 
 def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
-    """Return a line of progress on standard error, which goes away when the work is done.
+    """Return a progress line on standard error, which is removed after the work.
 
-    It is shown on a terminal only. Its `console` writes messages above it.
+    The line is shown on a terminal only. Its `console` writes messages above it.
 
     Parameters
     ----------
     *texts
-        What stands between the bar and the time left, as rich formats the columns of a task.
+        Texts between the bar and the remaining time, in the format of rich's task columns.
     auto_refresh
-        Let a thread of rich draw it, or draw it by its `refresh` only.
+        Draw the line in a thread of rich; otherwise only by its `refresh`.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn

@@ -1,4 +1,4 @@
-"""Units and numbers: the unit that a key's ending names, numbers of documents, digits shown."""
+"""Units and numbers: units from the suffixes of keys, numbers of documents, displayed digits."""
 
 from collections.abc import Sequence
 from math import floor, inf, isfinite, log10
@@ -36,14 +36,14 @@ UNITS: Final = MappingProxyType(
         "_c": "°C",
     }
 )
-"""Ending of a key → its unit, the longer endings first: the first that fits is the key's."""
+"""Units by suffix of a key, the longer suffixes first; the first match applies."""
 
 
 _MOST_DECIMALS: Final = 9
 
 
 def suffix_of(key: str) -> str:
-    """Return the ending of a key that names its unit; empty if there is none.
+    """Return the suffix of a key that names its unit; empty if there is none.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def suffix_of(key: str) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit that a key's ending names; empty if there is none.
+    """Return the unit named by the suffix of a key; empty if there is none.
 
     Examples
     --------
@@ -65,14 +65,14 @@ def unit_of(key: str) -> str:
 
 
 def with_half_width(value: float, interval: Sequence[float] | None, scale: float = 1.0) -> str:
-    """Write a number with half the width of its interval, to the second digit of that.
+    """Return a number and the half-width of its interval as text, to two digits of the half-width.
 
     Parameters
     ----------
     value
         The number.
     interval
-        Its low and its high end; None if they are not known.
+        Lower and upper limit; None if they are not known.
     scale
         Factor of the unit in which it is written.
 
@@ -90,19 +90,19 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
 def to_uncertainty(
     values: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
 ) -> tuple[str, ...]:
-    """Write numbers to the second digit of their uncertainty.
+    """Return numbers as text, rounded to two digits of their uncertainty.
 
     Parameters
     ----------
     values
         The numbers.
     uncertainty
-        Standard deviation or half-width of an interval; with 0 or what is not finite, five
-        significant digits are written.
+        Standard deviation or half-width of an interval. If it is 0 or not finite, five significant
+        digits are written.
     scale
         Factor of the unit in which they are written.
     sign
-        "+" to write the sign of positive numbers as well.
+        "+" to write the sign of positive numbers too.
 
     Examples
     --------
@@ -123,16 +123,16 @@ def to_uncertainty(
 
 
 def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
-    """Write an interval, to the second digit of half its width.
+    """Return an interval as text, rounded to two digits of its half-width.
 
     Parameters
     ----------
     interval
-        Its low and its high end.
+        Lower and upper limit.
     scale
         Factor of the unit in which it is written.
     sign
-        "+" to write the sign of positive ends as well.
+        "+" to write the sign of positive limits too.
 
     Examples
     --------
@@ -144,12 +144,12 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
 
 
 def with_share(std: float, value: float) -> str:
-    """Write a standard deviation, with its share of the value unless that is 0.
+    """Return a standard deviation as text, with its percentage of the value unless that is 0.
 
     Parameters
     ----------
     std, value
-        In one unit.
+        Both in the same unit.
 
     Examples
     --------
@@ -160,7 +160,7 @@ def with_share(std: float, value: float) -> str:
 
 
 def decimals(uncertainty: float) -> int:
-    """Return how many decimals show a number to the second digit of its uncertainty.
+    """Return the number of decimals for two digits of an uncertainty.
 
     Examples
     --------
@@ -174,9 +174,9 @@ _SMALLEST, _LARGEST = 1e-12, 1e12
 
 
 def is_usable_size(value: float) -> bool:
-    """Whether a number in the unit of its key is 0, or of a size that some rig can have.
+    """Return whether a number in the unit of its key is 0 or of a plausible size for a rig.
 
-    Beyond it the powers and products of a model overflow, or vanish.
+    Outside this range powers and products of a model overflow or underflow.
 
     Examples
     --------
@@ -188,7 +188,7 @@ def is_usable_size(value: float) -> bool:
 
 
 def finite_number(value: object) -> float | None:
-    """Return a number that a document holds; None of anything else, and if it is not finite.
+    """Return a value of a document as a finite number; None if it is not one.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""``rigd bench``: how punctual the loop is on this computer, and which rate it can hold.
+"""``rigd bench``: latency of the loop on this computer, and the highest rate that it can hold.
 
-Offers the programme of measurements (`Bench`), their results (`Results`), one measurement and its
-figures (module `measure`), and the report (`report_lines`, `as_json`). Real sessions are run on a
-simulated rig, with cyclictest as the peer; no hardware is touched, and nothing is changed on this
-computer.
+The package offers the series of measurements (`Bench`), their results (`Results`), one measurement
+and its percentiles (module `measure`), and the report (`report_lines`, `as_json`). Sessions run on
+a simulated rig, with cyclictest as the reference. No hardware is used, and no setting of the
+computer is changed.
 """
 
 import lazy_loader as lazy

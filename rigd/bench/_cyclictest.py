@@ -1,4 +1,4 @@
-"""Peer of the loop: cyclictest of rt-tests, the least latency of a program on this computer."""
+"""Reference of the loop: cyclictest of rt-tests, the lowest latency on this computer."""
 
 import os
 import re
@@ -21,7 +21,7 @@ _LARGEST = re.compile(r"^# Max Latencies:\s*(\d+)", re.MULTILINE)
 
 
 class CyclictestError(FailureError):
-    """It could not be run, or tells something else than expected; the message says why."""
+    """cyclictest could not be run, or its output is unexpected; the message states the reason."""
 
 
 def installed() -> bool:
@@ -30,23 +30,9 @@ def installed() -> bool:
 
 
 def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measurement:
-    """Run it as the loop runs: the same core, policy, priority and interval.
+    """Run cyclictest on the core of the loop, with its policy, priority and interval.
 
-    Parameters
-    ----------
-    rate_hz
-        Wake-ups a second.
-    seconds
-        Duration of the measurement.
-    cpu
-        The core.
-    priority
-        Priority under SCHED_FIFO; 0 for the ordinary policy.
-
-    Raises
-    ------
-    CyclictestError
-        If that fails.
+    `priority` is that of SCHED_FIFO; 0 means the ordinary policy.
     """
     command = [
         *(NAME, "--quiet", "--threads=1", f"--affinity={cpu}", "--mlockall"),
@@ -64,29 +50,16 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
             env=os.environ | {"LC_ALL": "C"},
         )
     except (OSError, subprocess.SubprocessError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        raise CyclictestError(said[-1] if said else "it failed without a message") from error
+        message = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        raise CyclictestError(message[-1] if message else "it failed without a message") from error
     return measured(done.stdout, rate_hz)
 
 
 def measured(output: str, rate_hz: float) -> Measurement:
-    """Return the measurement in its histogram.
+    """Return the measurement from the output of ``cyclictest --histogram`` with one thread.
 
-    A wake-up that comes a period late or later stands for as many ticks that a loop would have
-    missed: cyclictest, too, goes on with the next deadline that is still ahead.
-
-    Parameters
-    ----------
-    output
-        Printed by ``cyclictest --histogram`` with one thread: lines of a delay in whole µs and
-        how often it came; what is beyond the histogram is counted as the largest delay of all.
-    rate_hz
-        Wake-ups a second.
-
-    Raises
-    ------
-    CyclictestError
-        If there is no histogram in it.
+    A wake-up one period or more late counts as missed ticks, because cyclictest also continues with
+    the next deadline in the future. Delays beyond the histogram count as the largest delay.
     """
     delays_us = np.array(list(_delays(output)), dtype=np.float64)
     if not delays_us.size:

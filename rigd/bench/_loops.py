@@ -1,4 +1,4 @@
-"""Loops to measure: real sessions of the real processes on a simulated rig."""
+"""Loops to measure: sessions of the real processes on a simulated rig."""
 
 import os
 import subprocess
@@ -28,37 +28,28 @@ from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.session.layout import decode_samples
 
-LOOK_S = 0.1
+_POLL_S = 0.1
 AROUND_S = 3.5
-"""Time that a measurement takes beyond its record."""
+"""Duration of a measurement in addition to its record."""
 _BLOCK = 10_000
 _TARE_S = 0.2
 _NO_LIMIT = 1_000_000_000
 
-OnLook = Callable[[], None]
+OnPoll = Callable[[], None]
 
 
 class LoopError(FailureError):
-    """The loop could not be measured; the message says why."""
+    """The loop could not be measured; the message states the reason."""
 
 
 def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
-    """Return a profile with the same real-time settings and no hardware.
+    """Return a profile without hardware, with the rate and spin time to measure.
 
-    Everything is simulated in the control process. What ends a session because of late ticks is
-    measured here and ends nothing.
-
-    Parameters
-    ----------
-    profile
-        Profile whose settings count.
-    rate_hz
-        Rate of the loop.
-    spin_us
-        Last part of each wait that is spent polling the clock.
+    Everything is simulated in the control process. Late ticks are measured and do not end the
+    session. Only the real-time settings of the given profile are used.
     """
     rig = profile.rig
-    if unknown_values(rig):  # none of them counts here
+    if unknown_values(rig):  # these values are irrelevant here
         sim = load_profile("sim").rig
         rig = replace(rig, motor=sim.motor, encoder=sim.encoder)
     return replace(
@@ -97,63 +88,40 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
 
 @contextmanager
 def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
-    """Start the processes of a rig and end them.
-
-    Raises
-    ------
-    LoopError
-        If they do not start.
-    """
+    """Start the processes of a rig; leaving the context ends them."""
     try:
         with ProcessGroup(live=live) as group, ExitStack() as connection:
             rig = Rig(profile, group=group)
             rig.connect()
-            # It also gives back the precedence that supervision has, of which what is measured
-            # next, such as cyclictest, would inherit the cores.
+            # This also releases the priority and cores of the supervisor, which the next
+            # measurement, such as cyclictest, would inherit.
             connection.callback(rig.disconnect)
             yield rig, group
     except (FailureError, OSError) as error:
         raise LoopError(str(error)) from error
 
 
-def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Measurement:
-    """Run the loop with only a reader that empties the ring from time to time.
-
-    Parameters
-    ----------
-    name
-        Name of the measurement.
-    profile
-        From :func:`rig_for`.
-    seconds
-        Length of the record.
-    look
-        Called some ten times a second.
-
-    Raises
-    ------
-    LoopError
-        If the session does not go well.
-    """
+def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> Measurement:
+    """Measure the loop alone, with only a reader that empties the ring; raise LoopError."""
     rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
     with connected(profile) as (_, group):
-        channels, board = group.channels, group.channels.board
+        channels, shared_state = group.channels, group.channels.board
         meter = UsageMeter(group.control.pid)
-        board[Word.STOP] = Stop.NO
-        board[Word.GO] = 1
+        shared_state[Word.STOP] = Stop.NO
+        shared_state[Word.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
         group.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
         while not isinstance(finished, Finished):
-            finished = group.control.poll(LOOK_S)
-            board.beat(Word.SUPERVISOR_BEAT)
-            meter.look(Phase(board[Word.PHASE]))
+            finished = group.control.poll(_POLL_S)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
+            meter.look(Phase(shared_state[Word.PHASE]))
             while block := channels.samples.take(_BLOCK):
                 blocks.append(block)
             channels.controls.discard()
             channels.timings.discard()
-            look()
+            on_poll()
     _require(finished.outcome, finished.reason)
     return measurement(
         name,
@@ -166,22 +134,9 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
 
 
 def run_session(
-    name: str, profile: Profile, seconds: float, look: OnLook, *, live: bool = False
+    name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
 ) -> Measurement:
-    """Run a whole session, as ``rigd run`` does, into a temporary file.
-
-    Parameters
-    ----------
-    name, profile, seconds, look
-        As for :func:`run_alone`.
-    live
-        Run it with a live view.
-
-    Raises
-    ------
-    LoopError
-        If the session does not go well.
-    """
+    """Measure a whole session, as ``rigd run``, with a temporary file; raise LoopError."""
     excitation = _excitation(profile, seconds)
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
@@ -195,7 +150,7 @@ def run_session(
 
         def watch(progress: SessionProgress, _: object) -> None:
             meter.look(progress.phase)
-            look()
+            on_poll()
 
         result = rig.run(order, stop, watch)
         _require(result.outcome, result.reason)
@@ -213,7 +168,7 @@ def run_session(
 
 @contextmanager
 def busy_stranger(cores: set[int]) -> Iterator[int]:
-    """Have another program compute without end on some cores; gives its process id."""
+    """Run a busy program on some cores; yield its process id."""
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as stranger:
         try:
             os.sched_setaffinity(stranger.pid, cores)

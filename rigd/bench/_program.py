@@ -1,4 +1,4 @@
-"""Programme of the measurements: which, in which order, and the time left."""
+"""Series of measurements: their order, and the remaining time."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from rigd.engine.realtime import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3
-"""Rounds of loop and cyclictest in turn: the computer changes from one second to the next."""
+"""Alternating rounds of loop and cyclictest, because the load of the computer varies."""
 ALONE = "loop alone"
 RECORDED = "with recorder"
 SHOWN = "with recorder and live view"
@@ -22,60 +22,60 @@ LOADED = "… and load on other cores"
 HIGHEST_HZ = 16_000.0
 LOWEST_HZ = 100.0
 
-Tell = Callable[[str, float], None]
-"""Told what is measured and for how many seconds the whole will still take, about."""
+OnProgress = Callable[[str, float], None]
+"""Receives the name of the present measurement and the approximate remaining time in s."""
 
 
 @dataclass(slots=True)
 class Results:
-    """All measurements."""
+    """Results of all measurements."""
 
     profile: str
     """Name of the profile."""
     rate_hz: float
-    """Rate that was asked for."""
+    """Requested rate."""
     seconds: float
     """Length of each measurement."""
     spin_us: float
-    """Last part of each wait that was spent polling."""
+    """Last part of each wait, spent polling the clock."""
     granted: dict[str, str]
-    """Real-time setting → what the system granted."""
+    """Value granted by the system for each real-time setting."""
     load_average: tuple[float, float, float]
     """Load average of this computer before the measurements."""
     rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
-    """The loop alone, and cyclictest right after it."""
+    """The loop alone, each followed by cyclictest."""
     sessions: list[Measurement] = field(default_factory=list)
-    """Sessions with the recorder, and with each further load."""
+    """Sessions with the recorder and increasing load."""
     search: list[Measurement] = field(default_factory=list)
-    """Sessions at other rates, and the best at this."""
+    """Sessions at other rates, and the best one at this rate."""
     no_peer: str = ""
     """Why there is no cyclictest."""
 
     @property
     def alone(self) -> Measurement:
-        """The rounds of the loop together."""
+        """Pooled rounds of the loop."""
         return pooled(ALONE, [ours for ours, _ in self.rounds])
 
     @property
     def peer(self) -> Measurement | None:
-        """The rounds of cyclictest together."""
+        """Pooled rounds of cyclictest."""
         theirs = [their for _, their in self.rounds if their is not None]
         return pooled(cyclictest.NAME, theirs) if theirs else None
 
     @property
     def highest_rate_hz(self) -> float | None:
-        """The highest rate of those tried that held."""
+        """Highest measured rate that held."""
         held = [one.rate_hz for one in self.search if one.held >= HELD]
         return max(held, default=None)
 
     @property
     def highest_rate_between_stalls_hz(self) -> float | None:
-        """The highest that held but for the ticks while the computer stood still."""
+        """Highest measured rate that held without the ticks during stalls."""
         held = [one.rate_hz for one in self.search if _holds(one)]
         return max(held, default=None)
 
     def ratios(self) -> tuple[float, float] | None:
-        """Return the loop's lateness over cyclictest's, p50 and p99: medians over the rounds."""
+        """Return the ratio of loop to cyclictest latency, p50 and p99: medians over the rounds."""
         pairs = [
             (figures(ours.lateness_us), figures(their.lateness_us))
             for ours, their in self.rounds
@@ -90,36 +90,42 @@ class Results:
 
 
 class Bench:
-    """The measurements for one profile.
+    """Series of measurements for one profile.
 
     Parameters
     ----------
     profile
-        Its real-time settings count; nothing of its hardware is touched.
+        Profile with the real-time settings. Its hardware is not used.
     rate_hz
         Rate of the loop.
     seconds
         Duration of each measurement.
     spin_us
-        Last part of each wait that is spent polling the clock.
-    tell
-        Told of the progress, some ten times a second.
+        Last part of each wait, spent polling the clock.
+    on_progress
+        Receives the progress about ten times a second.
     """
 
     def __init__(
-        self, profile: Profile, *, rate_hz: float, seconds: float, spin_us: float, tell: Tell
+        self,
+        profile: Profile,
+        *,
+        rate_hz: float,
+        seconds: float,
+        spin_us: float,
+        on_progress: OnProgress,
     ) -> None:
         self._profile = profile
         self._rate_hz = rate_hz
         self._seconds = seconds
         self._spin_us = spin_us
-        self._tell = tell
+        self._on_progress = on_progress
         self._left_s = (2 * ROUNDS + 5) * (seconds + loops.AROUND_S)
         self._what = ""
         self._ends_s = 0.0
 
     def run(self) -> Results:
-        """Measure everything.
+        """Run all measurements.
 
         Raises
         ------
@@ -146,17 +152,17 @@ class Bench:
             results.rounds.append((ours, self._peer(results)))
 
     def run_sessions(self, results: Results) -> None:
-        """Measure whole sessions, with more and more beside the loop."""
+        """Measure whole sessions, with increasing load in addition to the loop."""
         results.sessions.append(self.session(RECORDED))
         results.sessions.append(self.session(SHOWN, live=True))
         with loops.busy_stranger(cores_beside(results.granted)):
             results.sessions.append(self.session(LOADED, live=True))
 
     def search(self, results: Results) -> None:
-        """Look for the highest rate that holds: up by factors of 2, or down if this one does not.
+        """Search the highest rate that holds, in factors of 2 upwards or downwards.
 
-        Stalls do not count: no rate escapes them. The best of several tries does: what others do to
-        this computer only ever makes it worse.
+        Stalls are ignored, because they affect every rate. The best of several attempts counts,
+        because other programs only degrade the result.
         """
         results.search.append(max(results.sessions, key=_merit))
         up = _holds(results.search[0])
@@ -175,30 +181,30 @@ class Bench:
     def session(
         self, name: str, *, rate_hz: float | None = None, live: bool = False
     ) -> Measurement:
-        """Measure a whole session, at the usual rate unless told otherwise.
+        """Measure a whole session, by default at the rate of the bench.
 
         Parameters
         ----------
         name
-            What the results call it.
+            Name in the results.
         rate_hz
             Rate of the loop, by default the bench's.
         live
-            With the live view.
+            Run with the live view.
         """
         rate_hz = rate_hz or self._rate_hz
         self._begin(name)
         profile = loops.rig_for(self._profile, rate_hz, self._spin_us)
-        return loops.run_session(name, profile, self._seconds, self._look, live=live)
+        return loops.run_session(name, profile, self._seconds, self._show_progress, live=live)
 
     def _alone(self) -> Measurement:
         self._begin(ALONE)
         profile = loops.rig_for(self._profile, self._rate_hz, self._spin_us)
-        return loops.run_alone(ALONE, profile, self._seconds, self._look)
+        return loops.run_alone(ALONE, profile, self._seconds, self._show_progress)
 
     def _peer(self, results: Results) -> Measurement | None:
         self._begin(cyclictest.NAME)
-        self._look()
+        self._show_progress()
         if not cyclictest.installed():
             results.no_peer = "not installed (package rt-tests)"
             return None
@@ -226,18 +232,18 @@ class Bench:
         self._left_s = max(0.0, self._left_s - duration_s)
         self._ends_s = time.monotonic() + duration_s
 
-    def _look(self) -> None:
-        self._tell(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
+    def _show_progress(self) -> None:
+        self._on_progress(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
 
 
 def core_of(granted: dict[str, str]) -> int:
-    """Return the core that the loop runs on."""
+    """Return the core of the loop."""
     text = granted["cpu"]
     return max(os.sched_getaffinity(0)) if text.startswith(REFUSED) else int(text.split(",")[0])
 
 
 def cores_beside(granted: dict[str, str]) -> set[int]:
-    """Return the cores that the loop does not run on; all where there is only one."""
+    """Return the cores without the loop; all cores if there is only one."""
     allowed = os.sched_getaffinity(0)
     return allowed - {core_of(granted)} or allowed
 

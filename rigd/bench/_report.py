@@ -15,12 +15,12 @@ _NAME = 28
 
 
 def report_lines(results: Results) -> Iterator[str]:
-    """Return the report, line by line.
+    """Yield the lines of the report.
 
     Parameters
     ----------
     results
-        With at least one round, one session, and a search.
+        Results with at least one round, one session, and a search.
     """
     spin = f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
     yield (
@@ -49,7 +49,7 @@ def report_lines(results: Results) -> Iterator[str]:
 
 
 def verdict(results: Results) -> str:
-    """Say which rate this computer can hold, and what is in the way."""
+    """Return a sentence on the rate that this computer can hold, and its limitation."""
     highest_hz, between_hz = results.highest_rate_hz, results.highest_rate_between_stalls_hz
     enough = f"{100 * HELD:g} % of the ticks or more"
     if highest_hz is not None:
@@ -188,27 +188,22 @@ _FULL = "█"
 
 
 def edges_us() -> list[float]:
-    """Return the bins' edges: 0, 1, 2, 5, 10, … µs; the last bin has no end."""
+    """Return the edges of the bins: 0, 1, 2, 5, 10, … µs; the last bin is open."""
     decades = round(log10(_LAST_US / _FIRST_US))
     return [0.0, *(s * 10.0**d for d in range(decades) for s in _STEPS), _LAST_US]
 
 
 def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
-    """Return how many delays lie in each bin."""
+    """Return the number of delays in each bin."""
     found = np.searchsorted(edges_us(), delays_us, side="right") - 1
     counts: list[int] = np.bincount(found, minlength=len(edges_us())).tolist()
     return counts
 
 
 def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
-    """Return a histogram for each of some series of delays in µs, side by side.
+    """Return the lines of histograms of several series of delays in µs, side by side.
 
-    A bar is as long as the logarithm of its count, so that what is rare shows.
-
-    Parameters
-    ----------
-    columns
-        Name and delays.
+    The length of a bar is the logarithm of its count, so that rare delays are visible.
     """
     counted = [counts_of(delays_us) for _, delays_us in columns]
     used = [index for index in range(len(edges_us())) if any(counts[index] for counts in counted)]

@@ -1,4 +1,4 @@
-"""One measurement of the loop: its figures, and the processor time it takes."""
+"""One measurement of the loop: latency percentiles and processor time."""
 
 import time
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ import numpy.typing as npt
 from rigd.engine.shared_state import Phase
 
 HELD = 0.999
-"""Share of its ticks that a computer has to run in their periods to hold a rate."""
+"""Fraction of ticks that must run within their periods for a rate to hold."""
 STALL_US = 2000.0
-"""A wake-up that is as late as this was held up by no loop and no rate: the host of a virtual
-machine took the processor away, or firmware did."""
+"""Latency above which neither the loop nor the rate is the cause, but firmware or the host of a
+virtual machine."""
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Processor time and page faults since a process began."""
+    """Processor time and page faults since the start of a process."""
 
     cpu_s: float
     """Processor time, s."""
     page_faults: int
-    """Page faults, those that wait for a disk included."""
+    """Page faults, including those that wait for a disk."""
 
 
 def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
-    """Return what a process of one thread has taken so far.
+    """Return the usage of a process with one thread so far.
 
-    The scheduler's own account counts nanoseconds; the usual one looks who runs at each of its
-    ticks, which a loop in step with them can miss altogether.
+    The statistics of the scheduler count nanoseconds. The usual ones sample the running process at
+    each scheduler tick, and can miss a loop that is synchronous with these ticks.
 
     Parameters
     ----------
@@ -42,16 +42,16 @@ def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
     Raises
     ------
     OSError
-        If it has ended.
+        If the process has ended.
     """
-    # The name, in brackets, may hold anything.
+    # The name, in brackets, may contain any character.
     fields = (proc / str(pid) / "stat").read_text().rpartition(")")[2].split()
     cpu_ns = int((proc / str(pid) / "schedstat").read_text().split()[0])
     return Usage(cpu_ns * 1e-9, int(fields[7]) + int(fields[9]))
 
 
 class UsageMeter:
-    """Takes the usage of the control process from the first to the last look at a running record.
+    """Meter of the usage of the control process during a running record.
 
     Parameters
     ----------
@@ -61,31 +61,31 @@ class UsageMeter:
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._looks: list[tuple[float, Usage]] = []
+        self._readings: list[tuple[float, Usage]] = []
 
     def look(self, phase: Phase) -> None:
-        """Take a look, if the record is running."""
+        """Read the usage if the record is running."""
         if phase == Phase.RUNNING:
             try:
                 usage = usage_of(self._pid)
             except OSError:
-                return  # this kernel keeps no such account
-            self._looks = [*self._looks[:1], (time.monotonic(), usage)]
+                return  # this kernel has no such statistics
+            self._readings = [*self._readings[:1], (time.monotonic(), usage)]
 
     @property
     def cpu_percent(self) -> float | None:
-        """Share of a core; None if there were not two looks."""
-        if len(self._looks) < 2:
+        """Load of a core in percent; None with fewer than two readings."""
+        if len(self._readings) < 2:
             return None
-        (begin_s, first), (end_s, last) = self._looks
+        (begin_s, first), (end_s, last) = self._readings
         return 100.0 * (last.cpu_s - first.cpu_s) / (end_s - begin_s)
 
     @property
     def page_faults(self) -> int | None:
-        """Page faults between them."""
-        if len(self._looks) < 2:
+        """Page faults between the first and the last reading; None with fewer than two."""
+        if len(self._readings) < 2:
             return None
-        return self._looks[1][1].page_faults - self._looks[0][1].page_faults
+        return self._readings[1][1].page_faults - self._readings[0][1].page_faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +106,16 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """One loop, run for some seconds."""
+    """Measurement of one loop for some seconds."""
 
     name: str
-    """What ran, and beside what."""
+    """Name of the measurement, with the load."""
     rate_hz: float
     """Rate of the loop."""
     lateness_us: npt.NDArray[np.float64]
-    """(n,) of every tick that was run: wake-up after the deadline that was waited for."""
+    """Wake-up latency of every tick that was run, (n,)."""
     work_us: npt.NDArray[np.float64]
-    """(n,) from the wake-up to the end of its work; empty where none was done."""
+    """Execution time from the wake-up to the end of the work, (n,); empty without work."""
     scheduled: int
     """Ticks that were due."""
     missed: int
@@ -127,12 +127,12 @@ class Measurement:
 
     @property
     def held(self) -> float:
-        """Share of the scheduled ticks that were run in their periods."""
+        """Fraction of scheduled ticks that were run within their periods."""
         return 1.0 - self.missed / self.scheduled
 
     @property
     def held_between_stalls(self) -> float:
-        """The same, leaving out the ticks that passed while the computer stood still."""
+        """The same fraction without the ticks during stalls."""
         stalls_us = self.lateness_us[self.lateness_us >= STALL_US]
         passed = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
         return 1.0 - (self.missed - passed) / (self.scheduled - passed)
@@ -158,15 +158,15 @@ def figures(values_us: npt.NDArray[np.float64]) -> Figures:
 
 
 def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
-    """Return by how much each wake-up missed the deadline that was waited for.
+    """Return the wake-up latency of each sample in µs, relative to the awaited deadline.
 
-    The lateness of a sample counts from the tick that was run, which after missed ticks is a later
-    one than that which was waited for.
+    The lateness in a sample is relative to the tick that was run. After missed ticks this tick is
+    later than the awaited one.
 
     Parameters
     ----------
     samples
-        As recorded, with none lost.
+        Recorded samples, without lost ones.
     rate_hz
         Ticks a second.
     """
@@ -213,7 +213,7 @@ def measurement(
 
 
 def pooled(name: str, parts: list[Measurement]) -> Measurement:
-    """Return several measurements of the same as one.
+    """Return the pooled measurement of several measurements of the same loop.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The command line ``rigd``, put together from its commands."""
+"""The command line ``rigd``, assembled from its commands."""
 
 from typing import Annotated, Any, Final
 
@@ -12,7 +12,7 @@ from rigd.cli.entry import run_command
 from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
-from rigd.cli.options import errors_told
+from rigd.cli.options import exit_on_errors
 from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
@@ -20,8 +20,8 @@ from rigd.cli.simulate import inject, simulate
 from rigd.printable import readable_errors
 
 
-def _tell(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"rigd {rigd.__version__}")
         raise typer.Exit
 
@@ -29,10 +29,12 @@ def _tell(asked: bool) -> None:
 def before_a_command(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
-    """Take the options that stand before a command; they have done their work by then."""
+    """Accept the options before a command; their callbacks have already run."""
 
 
 _SECTIONS: Final = {
@@ -42,12 +44,12 @@ _SECTIONS: Final = {
     "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
-"""Commands by what they are for, as the help lists them."""
+"""Commands by section of the help."""
 _OTHERS: Final = "Other commands"
 
 
 class RigdGroup(TyperGroup):
-    """All commands: what an error says, and its exit code, are told here for each of them."""
+    """Group of all commands; reports the message and the exit code of their errors."""
 
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -63,13 +65,13 @@ class RigdGroup(TyperGroup):
                     formatter.write_dl(rows)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
-        """Parse what stands before the command."""
+        """Parse the options before the command."""
         with readable_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the command that was asked for."""
-        with readable_errors(), errors_told():
+        """Run the requested command."""
+        with readable_errors(), exit_on_errors():
             return super().invoke(ctx)
 
 
@@ -109,5 +111,5 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
-    # All as long as Ctrl-C only has to say that nothing began.
+    # Until a command starts, Ctrl-C only reports that nothing has begun.
     run_command(typer.main.get_command(app))

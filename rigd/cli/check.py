@@ -121,7 +121,7 @@ def _openable_profile(name: str) -> "Profile":
 
 
 def _end_as_by_ctrl_c() -> None:
-    """Let go of the devices when asked to end by whatever means."""
+    """Make every signal that requests an end act as Ctrl-C, so that the devices are closed."""
     raise_on(signal.SIGTERM, signal.SIGHUP)
 
 
@@ -173,14 +173,16 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
 
     hardware = reality(profile.rig) is WhatMoves.HARDWARE
     console = Console(stderr=True)
-    # Beside a session of this rig, the loops of both would be late.
+    # A simultaneous session of this rig would make both loops late.
     with (
         RigLock(profile.name, "rigd bench", hardware=hardware),
         Status("preparing", console=console) as status,
     ):
 
-        def tell(what: str, left_s: float) -> None:
+        def on_progress(what: str, left_s: float) -> None:
             status.update(f"{what}; {left_s // 60:.0f}:{left_s % 60:02.0f} left")
 
-        bench = Bench(profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, tell=tell)
+        bench = Bench(
+            profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress
+        )
         return bench.run()

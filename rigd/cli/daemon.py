@@ -17,7 +17,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Hardware,
-    NoLook,
+    NoQuickLook,
     Output,
     ProfileName,
     fail,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rigd.daemon.client import Client
 
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def serve(
@@ -58,7 +58,7 @@ def serve(
     ] = None,
     fast: Fast = False,
     hardware: Hardware = False,
-    no_look: NoLook = False,
+    no_quick_look: NoQuickLook = False,
 ) -> None:
     """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
 
@@ -79,7 +79,7 @@ def serve(
         fast=fast,
         page=web or web_port is not None,
         page_port=web_port,
-        look=not no_look,
+        look=not no_quick_look,
     )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -107,12 +107,12 @@ def _socket_of(profile: str | None) -> "Path":
 
 
 def rig_name(profile: str | None) -> str | None:
-    """Return the name by which the daemon of a profile is found."""
+    """Return the name of the rig of a profile, which identifies its daemon."""
     if profile is None:
         return None
     from rigd.daemon.address import running, socket_path
 
-    # Reading a profile takes a while, and is of no use where its daemon is known by that name.
+    # Reading a profile is slow, and unnecessary if a daemon of that name is running.
     if any(path.name == socket_path(profile).name for path in running()):
         return profile
     from rigd.cli.options import profile_named
@@ -143,14 +143,14 @@ def status(
         _watch(profile)
         return
     with daemon_of(profile) as client:
-        told = client.ask("status")
+        reply = client.ask("status")
     if as_json:
-        del told["reply"], told["ok"]
-        typer.echo(json.dumps(told))
+        del reply["reply"], reply["ok"]
+        typer.echo(json.dumps(reply))
         return
     from rigd.cli.status_view import print_status
 
-    print_status(told)
+    print_status(reply)
 
 
 def stop(
@@ -161,7 +161,7 @@ def stop(
         bool, typer.Option("--no-wait", help="Do not wait until the sessions have ended.")
     ] = False,
 ) -> None:
-    """Stop all your running sessions safely; their files are kept. Not an emergency stop.
+    """Stop all your running sessions safely; their files are preserved. Not an emergency stop.
 
     Finds daemons and sessions in the foreground, whatever the runtime folder; as root those of all
     users. Daemons go on. Waits up to 10 s for the sessions to end. Exit code 0 only if no session
@@ -182,14 +182,14 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd tare
     """
     with daemon_of(profile) as client:
-        told = client.ask("tare")
+        reply = client.ask("tare")
     if as_json:
-        typer.echo(json.dumps(_measured(told)))
+        typer.echo(json.dumps(_measured(reply)))
         return
-    for axis, mean in told["mean"].items():
+    for axis, mean in reply["mean"].items():
         name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
-        typer.echo(f"{name}: mean {mean:.3f} {unit}, s.d. {told['std'][axis]:.3f} {unit}")
-    typer.echo(f"coupling torque: s.d. {told['torque_std_nm']:.3f} N·m")
+        typer.echo(f"{name}: mean {mean:.3f} {unit}, s.d. {reply['std'][axis]:.3f} {unit}")
+    typer.echo(f"coupling torque: s.d. {reply['torque_std_nm']:.3f} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
@@ -200,15 +200,15 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd zero
     """
     with daemon_of(profile) as client:
-        told = client.ask("zero")
+        reply = client.ask("zero")
     if as_json:
-        typer.echo(json.dumps(_measured(told)))
+        typer.echo(json.dumps(_measured(reply)))
     else:
-        typer.echo(f"Zero set (shift {told['moved_rad']:.5f} rad).")
+        typer.echo(f"Zero set (shift {reply['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Have the daemon of a profile, or the only one there is, reset its rig; False if none is."""
+    """Reset a rig through the daemon of its profile, or the only daemon; False without a daemon."""
     from rigd.daemon.address import running, socket_path
 
     sockets = running()
@@ -220,19 +220,19 @@ def reset_by_daemon(profile: str | None) -> bool:
         if name is None or socket_path(name).name not in {path.name for path in sockets}:
             return False
     with daemon_of(profile) as client:
-        told = client.ask("reset")
+        reply = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
-    if told["zero_lost"]:
+    if reply["zero_lost"]:
         typer.echo("The zero of the angle was lost: move the motor to mid-travel; run rigd zero.")
     return True
 
 
-def _measured(told: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in told.items() if name not in ("reply", "ok")}
+def _measured(reply: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in reply.items() if name not in ("reply", "ok")}
 
 
 def _watch(profile: str | None) -> None:
-    """Show the status over and over; a daemon that ends may come back."""
+    """Show the status repeatedly, also after a restart of the daemon."""
     from rich.console import Console
     from rich.live import Live
 
@@ -246,12 +246,12 @@ def _watch(profile: str | None) -> None:
         while True:
             try:
                 link = link or Client(find(name))
-                told = link.ask("status")
-                name = name or told["daemon"]["profile"]
-                live.update(status_table(told), refresh=True)
+                reply = link.ask("status")
+                name = name or reply["daemon"]["profile"]
+                live.update(status_table(reply), refresh=True)
             except RigdError as error:
                 if link is not None:
                     link.close()
                     link = None
                 live.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)

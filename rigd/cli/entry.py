@@ -1,4 +1,4 @@
-"""What every command of ``rigd`` begins and ends with; quick to import, for a stop."""
+"""Start and end of every command of ``rigd``; quick to import, for a stop."""
 
 import contextlib
 import errno
@@ -17,10 +17,10 @@ EXIT_INTERRUPTED = 130
 
 
 def run_command(command: Callable[[], object]) -> None:
-    """Run a command, and end the process as it ends."""
+    """Run a command, and end the process with its exit code or signal."""
     raise_on(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
-        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
+        # A terminal that cannot encode "·" or "²" gets a "?" instead of an error.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
@@ -36,7 +36,7 @@ def run_command(command: Callable[[], object]) -> None:
 
 
 def _explained(error: OSError) -> str:
-    """Say what the system refused, where no command has."""
+    """Return the message for a system error that no command has handled."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return (
             f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "
@@ -44,5 +44,5 @@ def _explained(error: OSError) -> str:
         )
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}."
-    # The output of a command is not read, or the disk behind it is full.
+    # Nobody reads the output, or the disk of the output file is full.
     return f"the output cannot be written ({error.strerror})."

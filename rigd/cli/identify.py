@@ -1,4 +1,4 @@
-"""``rigd identify``: data of the rig from sessions made for it."""
+"""``rigd identify``: parameters of the rig from dedicated sessions."""
 
 import json
 from pathlib import Path
@@ -130,9 +130,10 @@ def _run_sessions(
     hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
-    """Run the trial and both sessions; ends the command if one does not go well.
+    """Run the trial and both sessions, and return the files of the two sessions.
 
-    Returns the files of the two: the trial's controller is too slow for its passes to count.
+    An incomplete session ends the command. The file of the trial is not returned, because its
+    controller is too slow for the estimate.
     """
     stop, group = start_processes(live=False)
     from rigd.identification import cautious, tuned
@@ -180,7 +181,7 @@ def _run_sessions(
             for number, session in enumerate((multisine_session, speeds_session), start=1)
         ]
     finally:
-        ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
+        ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":

@@ -22,12 +22,12 @@ from rigd.units import with_half_width
 
 if TYPE_CHECKING:
     from rigd.library import SessionRow
-    from rigd.library.trend import Change, ModeTrend, Quantity, TrendPoint
+    from rigd.library.trend import ModeChange, ModeTrend, Quantity, TrendPoint
 
 _WIDEST: Final = 24
-"""Characters of a text in a table."""
+"""Largest width of a text in a table, characters."""
 _PLOT: Final = 25
-"""Characters of the plot of a trend."""
+"""Width of the plot of a trend, characters."""
 
 
 def list_sessions(
@@ -63,8 +63,8 @@ def list_sessions(
     """List recorded sessions with their modes, or a specimen's trend.
 
     The newest come first, with modes from the report or else from the quick look. Dates are local
-    (2026-11-20 or 2026-11-20T14:30). Incomplete and foreign files are listed with the reason. The
-    index library.sqlite in each folder only saves time, and may be removed.
+    (2026-11-20 or 2026-11-20T14:30). Incomplete and third-party files are listed with the reason.
+    The index library.sqlite in each folder only speeds up the list, and may be removed.
 
     Example: rigd list --specimen "antenna 3" --trend
     """
@@ -114,18 +114,18 @@ def specimens() -> None:
         try:
             found = load_specimen(path)
         except ProfileError as error:
-            told = f"cannot be used: {str(error).splitlines()[0]}"
+            text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
             beam = found.beam
-            told = (
+            text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
                 f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
             )
-        typer.echo(readable_message(f"{name}: {told}"))
+        typer.echo(readable_message(f"{name}: {text}"))
 
 
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
-    """Return the sessions with modes; those of several specimens have no trend."""
+    """Return the sessions with modes; raise if they are of several specimens."""
     found = [row for row in rows if row.modes]
     specimens = sorted({row.specimen for row in found})
     if len(specimens) > 1:
@@ -140,12 +140,12 @@ def _local(row: "SessionRow") -> str:
         return ""
     try:
         return f"{datetime.fromtimestamp(row.start_utc_ns / 1e9):%Y-%m-%d %H:%M}"
-    except (ValueError, OverflowError, OSError):  # a year beyond those of calendars
+    except (ValueError, OverflowError, OSError):  # a year out of the range of datetime
         return ""
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Set a table in columns; those that are empty are left out."""
+    """Yield the lines of a table in columns, without empty columns."""
     used = [column for column in range(len(heads)) if any(row[column] for row in rows)]
     widths = {column: max(len(row[column]) for row in (heads, *rows)) for column in used}
     for row in (heads, *rows):
@@ -241,7 +241,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
 
 
 def _ends(trend: "ModeTrend") -> tuple[float, float]:
-    """Return lowest and highest end of the frequency's intervals."""
+    """Return the lower and upper limit of all intervals of the frequency."""
     ends = [
         end
         for point in trend.points
@@ -251,17 +251,17 @@ def _ends(trend: "ModeTrend") -> tuple[float, float]:
 
 
 def _interval(point: "TrendPoint", low: float, high: float) -> str:
-    """Draw the interval of the frequency between the ends of the plot."""
+    """Draw the interval of the frequency between the limits of the plot."""
     if high <= low:
         return ""
 
-    def place(frequency_hz: float) -> int:
+    def column_of(frequency_hz: float) -> int:
         return min(max(round((frequency_hz - low) / (high - low) * (_PLOT - 1)), 0), _PLOT - 1)
 
     value = point.frequency_hz["value"]
-    first, last = map(place, point.frequency_hz["interval_95"] or (value, value))
+    first, last = map(column_of, point.frequency_hz["interval_95"] or (value, value))
     drawn = ["─" if first <= column <= last else " " for column in range(_PLOT)]
-    drawn[place(value)] = "●"
+    drawn[column_of(value)] = "●"
     return "".join(drawn)
 
 
@@ -270,7 +270,7 @@ def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
     return f"{text} ?" if quantity["flag"] else text
 
 
-def _relative(change: "Change | None", first: float) -> str:
+def _relative(change: "ModeChange | None", first: float) -> str:
     if change is None or first == 0:
         return ""
     percent = 100 * change.difference / first
@@ -322,8 +322,8 @@ def recover(
 ) -> None:
     """Recover the intact part of incomplete or damaged session files.
 
-    Writes X.mcap beside X.mcap.part, and X.recovered.mcap beside a damaged X.mcap: every sample up
-    to the damage, marked as recovered. Nothing is overwritten or removed.
+    Writes X.mcap next to X.mcap.part, and X.recovered.mcap next to a damaged X.mcap, with every
+    sample up to the damage, marked as recovered. Nothing is overwritten or removed.
 
     Example: rigd recover sessions/20261120-101500-chirp.mcap.part
     """

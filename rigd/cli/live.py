@@ -1,4 +1,4 @@
-"""``rigd live`` and ``rigd replay``: the operator's window on a rig, or on a recorded session."""
+"""``rigd live`` and ``rigd replay``: window with a running or a recorded session."""
 
 import contextlib
 import os
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
 
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def has_screen() -> bool:
-    """Whether there is a screen for a window."""
+    """Return whether there is a display for a window."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def tunnel_advice(view: "LiveAddress") -> str:
-    """Return what to type on another computer, to look on from there."""
+    """Return the command that opens the live view from another computer."""
     page, grpc = view.page_port, view.grpc_port
     return (
         f"From another computer: ssh -L {page}:127.0.0.1:{page} -L {grpc}:127.0.0.1:{grpc} "
@@ -40,7 +40,7 @@ def tunnel_advice(view: "LiveAddress") -> str:
 
 @contextlib.contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Give a temporary folder: the viewer leaves files behind when it is ended."""
+    """Yield a temporary folder for files that the viewer leaves."""
     try:
         folder = tempfile.TemporaryDirectory(prefix="rigd-view-", ignore_cleanup_errors=True)
     except OSError as error:
@@ -54,14 +54,14 @@ def scratch_folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def ended_gently() -> Iterator[None]:
-    """Have every way of being asked to end mean Ctrl-C, so that temporary files go too."""
-    asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in asked]
-    raise_on(*asked)
+    """Make SIGTERM and SIGHUP act as Ctrl-C, so that temporary files are removed."""
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    raise_on(*numbers)
     try:
         yield
     finally:
-        for number, handler in zip(asked, before, strict=True):
+        for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 
 
@@ -110,7 +110,7 @@ def live(
 
 
 def _rig_name(profile: str) -> str:
-    """Return the name of a profile's rig; a profile that cannot be used ends the command."""
+    """Return the name of a profile's rig; an invalid profile ends the command."""
     from rigd.daemon.client import find_views
 
     if find_views(profile):
@@ -121,7 +121,7 @@ def _rig_name(profile: str) -> str:
 
 
 def _only_one(rig: str | None) -> "LiveAddress | None":
-    """Return the live view of a rig, if there is one; several end the command."""
+    """Return the only live view of a rig, or None; several live views end the command."""
     from rigd.daemon.client import find_views
 
     views = find_views(rig)
@@ -134,7 +134,7 @@ def _only_one(rig: str | None) -> "LiveAddress | None":
 def _await(rig: str | None) -> "LiveAddress":
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
     while (view := _only_one(rig)) is None:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     return view
 
 
@@ -162,7 +162,7 @@ def _how_to_start(profile: str | None) -> str:
 
 
 def _show(view: "LiveAddress") -> None:
-    """Keep a window open, on the live view that there is, until it is closed."""
+    """Show the present live view in a window until the window is closed."""
     from rigd.live import Viewer
 
     with ended_gently(), scratch_folder() as scratch:
@@ -180,22 +180,16 @@ def _show(view: "LiveAddress") -> None:
 
 
 def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
-    """Connect the window to each server that takes the place of the one before.
-
-    Returns
-    -------
-    int
-        The viewer's exit code, once the window is closed.
-    """
+    """Reconnect the window to each new server; return the exit code of the closed viewer."""
     from rigd.daemon.client import find_views
 
     there = True
     while (code := viewer.exit_code) is None:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
         view = next(iter(find_views(shown.rig)), None)
         if view is not None and view.server != shown.server:
             if not viewer.connect(view):
-                continue  # it is tried again
+                continue  # tried again in the next round
             typer.echo(f"The live view of {view.rig} has restarted.", err=True)
             shown = view
         elif view is None and there:
@@ -239,7 +233,7 @@ def replay(
             _save(path, save, web=web)
         return
     if not web and not has_screen():
-        _check_shown(path)  # what is not a file for a window is not one elsewhere either
+        _check_shown(path)  # the same files are valid for a window and for other outputs
         elsewhere = (
             "the file can be opened elsewhere"
             if path.suffix == SUFFIX
@@ -275,7 +269,7 @@ def _save(path: Path, out: Path, *, web: bool) -> None:
 
 
 def _check_shown(path: Path) -> None:
-    """Raise an error if a file is not of a kind that is shown, as far as its beginning tells."""
+    """Raise if the beginning of a file shows that it cannot be displayed."""
     from rigd.session import check_beginning
 
     if path.suffix == SUFFIX:
@@ -295,7 +289,7 @@ def _convert(path: Path, out: Path) -> None:
 
 
 def _as_recording(path: Path, scratch: Path) -> Path:
-    """Return a file that Rerun's viewer shows in our layout, made in a folder if need be."""
+    """Return the file for Rerun's viewer, converted into the scratch folder if necessary."""
     if path.suffix == SUFFIX:
         check_rrd_file(path)
         return path

@@ -1,4 +1,4 @@
-"""Options, exit codes and progress that several commands share."""
+"""Common options, exit codes and progress of the commands."""
 
 import contextlib
 import time
@@ -21,7 +21,7 @@ EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Tell what is wrong on standard error and leave with an exit code."""
+    """Write an error to standard error and end the command with an exit code."""
     complain(message)
     raise typer.Exit(code)
 
@@ -32,8 +32,8 @@ def complain(message: str) -> None:
 
 
 @contextlib.contextmanager
-def errors_told() -> Iterator[None]:
-    """End the command with what an error of the rig says: 2 for a usage error, else 1."""
+def exit_on_errors() -> Iterator[None]:
+    """End the command with the message of an error of the rig and exit code 2 (usage) or 1."""
     try:
         yield
     except RigdError as error:
@@ -43,25 +43,25 @@ def errors_told() -> Iterator[None]:
 # Progress
 
 _QUIET_S = 2.0
-"""What takes no longer than this shows no progress."""
+"""Work up to this duration shows no progress."""
 
 
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[Callable[[float], None]]:
-    """Give a function that is told the share that is done.
+    """Yield a function that receives the completed fraction of the work.
 
-    A line appears as soon as the work has taken `_QUIET_S`, on a terminal only.
+    A progress line appears after `_QUIET_S`, on a terminal only.
     """
     started = time.monotonic()
     with contextlib.ExitStack() as stack:
         show: Callable[[float], None] | None = None
 
-        def on_progress(share: float) -> None:
+        def on_progress(fraction: float) -> None:
             nonlocal show
             if show is None and time.monotonic() - started > _QUIET_S:
                 show = stack.enter_context(_bar(name))
             if show is not None:
-                show(share)
+                show(fraction)
 
         yield on_progress
 
@@ -70,7 +70,7 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 def _bar(name: str) -> Iterator[Callable[[float], None]]:
     with progress_bar() as bar:
         task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        yield lambda fraction: bar.update(task, completed=fraction)
 
 
 # Options
@@ -83,7 +83,7 @@ EdsFile = Annotated[
 ]
 Output = Annotated[Path, typer.Option("--output", help="Folder for the session files.")]
 SESSIONS = Path("sessions")
-"""Where session files go unless told otherwise."""
+"""Default folder of session files."""
 Seed = Annotated[
     int | None,
     typer.Option(
@@ -148,7 +148,7 @@ TipSlope = Annotated[
     ),
 ]
 
-NoLook = Annotated[
+NoQuickLook = Annotated[
     bool,
     typer.Option(
         "--no-look", envvar="RIGD_NO_LOOK", help="Skip the quick look after each session."
@@ -156,14 +156,14 @@ NoLook = Annotated[
 ]
 
 WatchFit = Annotated[
-    bool, typer.Option("--watch-fit", help="Fit the record while it is recorded, and tell.")
+    bool, typer.Option("--watch-fit", help="Fit the record during the session and show the fits.")
 ]
 
 
 def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None
 ) -> dict[str, str]:
-    """Return what is to go into the file, by its keys there; what cannot ends the command."""
+    """Return the metadata of a session by their keys in the file; invalid ones end the command."""
     from rigd.session.user_metadata import metadata_keys
 
     notes = {"operator": operator, "specimen": specimen, "note": note}
@@ -181,7 +181,7 @@ def session_notes(
 
 
 def profile_named(name: str) -> "Profile":
-    """Load a profile: imported only now, because it takes its time."""
+    """Load a profile, with a late import because it is slow."""
     from rigd.profile import load_profile
 
     return load_profile(name)

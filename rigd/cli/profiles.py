@@ -1,4 +1,4 @@
-"""``rigd profiles``: the profiles there are, copies of them, and a new one from a drive's EDS."""
+"""``rigd profiles``: list, show and copy profiles, and write a new one from a drive's EDS file."""
 
 import sys
 from pathlib import Path
@@ -54,10 +54,10 @@ def list_profiles() -> None:
 
     for name, (used, *hidden) in profile_files().items():
         try:
-            told = load_profile(used.path).description
+            description = load_profile(used.path).description
         except ProfileError as error:
-            told = f"cannot be used: {str(error).splitlines()[0]}"
-        typer.echo(printable(f"{name}: {told} ({used.path}, {used.origin})"))
+            description = f"cannot be used: {str(error).splitlines()[0]}"
+        typer.echo(printable(f"{name}: {description} ({used.path}, {used.origin})"))
         for other in hidden:
             typer.echo(printable(f"  hides {other.path} ({other.origin})"))
 
@@ -106,10 +106,10 @@ def copy(
     path = folder / f"{stem}.toml"
     copy_profile(profile, path, new_name)
     files = profile_files()[stem]
-    place = [file.path.resolve() for file in files].index(path.resolve())
-    if place:
+    position = [file.path.resolve() for file in files].index(path.resolve())
+    if position:
         typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
-    for other in files[place + 1 :]:
+    for other in files[position + 1 :]:
         typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
     typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {stem}")
 
@@ -128,10 +128,10 @@ def new(
     """Write a profile for a drive from its EDS file and from answers.
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
-    motor are asked for on the terminal; Enter keeps what is shown. Torques, inertia, gear ratio and
-    encoder step that are not given stay "unknown", and rigd moves nothing before they are filled
-    in. What the drive lacks needs your confirmation. Without a terminal nothing is asked or
-    accepted, and what has to be filled in is listed. No file is ever overwritten.
+    motor are entered on the terminal; Enter accepts the displayed value. Torques, inertia, gear
+    ratio and encoder step that are not given stay "unknown", and rigd moves nothing before they are
+    filled in. Missing features of the drive need your confirmation. Without a terminal there are no
+    questions and confirmations, and the missing values are listed. No file is ever overwritten.
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
@@ -141,7 +141,7 @@ def new(
     base = profile_named(start_from)
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
-    write_new(output, _asked(draft) if is_terminal() else draft.text())
+    write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
     for doubt in draft.doubts:
         typer.echo(f"Note: {doubt}", err=True)
     missing = draft.unanswered()
@@ -160,15 +160,17 @@ def new(
 
 
 def is_terminal() -> bool:
-    """Whether somebody can be asked."""
+    """Return whether the command can ask the user."""
     return sys.stdin.isatty()
 
 
-def _asked(draft: "Draft") -> str:
-    """Ask for what no file tells, until the answers make a profile; returns its text."""
+def _ask_for_values(draft: "Draft") -> str:
+    """Ask for the values that no file states until the profile is valid; return its text."""
     from rigd.profile import ProfileError
 
-    typer.echo("From data sheets; Enter keeps what is in brackets: assumed, or unknown.", err=True)
+    typer.echo(
+        "From data sheets; Enter accepts the value in brackets: assumed, or unknown.", err=True
+    )
     try:
         while True:
             for question in draft.questions():
@@ -186,9 +188,9 @@ def _asked(draft: "Draft") -> str:
 
 
 def _ask_for_acceptance(draft: "Draft") -> None:
-    """Ask of each thing that the drive lacks whether it may be missing; Enter is no."""
+    """Ask for each missing feature of the drive whether it is accepted; Enter means no."""
     declined: set[str] = set()
-    # An answer may settle another: without a watchdog nothing acts on a silent computer anyway.
+    # One answer may imply another: without a watchdog its reaction is irrelevant.
     while lacks := [each for each in draft.unaccepted() if each.accept not in declined]:
         typer.echo(lacks[0].sentence, err=True)
         name = lacks[0].accept
@@ -199,7 +201,7 @@ def _ask_for_acceptance(draft: "Draft") -> None:
 
 
 def _ask(draft: "Draft", key: str, text: str) -> None:
-    """Ask until the answer is one that the key takes."""
+    """Ask until the answer is a valid value of the key."""
     while True:
         given = typer.prompt(text, default=draft.shown(key), err=True)
         try:

@@ -1,7 +1,7 @@
-"""``rigd run`` and ``rigd start``: sessions, one command an excitation.
+"""``rigd run`` and ``rigd start``: sessions, with one command for each excitation.
 
-What an excitation is asked for stands here once; ``rigd run`` runs it in the foreground,
-``rigd start`` has the daemon run it.
+The options of each excitation are defined here once. ``rigd run`` runs the session in the
+foreground, ``rigd start`` has the daemon run it.
 """
 
 import inspect
@@ -23,7 +23,7 @@ from rigd.cli.options import (
     Force,
     Hardware,
     Meta,
-    NoLook,
+    NoQuickLook,
     Note,
     Obstacles,
     Operator,
@@ -79,13 +79,13 @@ Model = Annotated[
 
 
 Parameters = Callable[..., "Mapping[str, Value | None]"]
-"""Makes an excitation's parameters from its options, which have their names wherever they can."""
+"""Returns the parameters of an excitation from its options, with the same names if possible."""
 
 
 def excitation_command(parameters: Parameters) -> Parameters:
     """Register ``rigd run NAME`` and ``rigd start NAME``.
 
-    Either takes the excitation's own options, then those of every session.
+    Both have the excitation's own options and those of every session.
     """
     _register(run_app, run_sessions, parameters)
     _register(start_app, start_sessions, parameters)
@@ -107,7 +107,7 @@ def _register(app: typer.Typer, perform: Callable[..., None], parameters: Parame
     )
     command.__annotations__ = {p.name: p.annotation for p in (*own, *common)}
     text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
-    # Else the angle -0.3 would be taken for an option.
+    # Otherwise the angle -0.3 would be read as an option.
     settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
     app.command(kind, help=text, context_settings=settings)(command)
 
@@ -130,7 +130,7 @@ def run_sessions(
     tip_slope_rad: TipSlope = None,
     hardware: Hardware = False,
     obstacle: Obstacles = None,
-    no_look: NoLook = False,
+    no_quick_look: NoQuickLook = False,
     watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
@@ -159,7 +159,7 @@ def run_sessions(
             tip_slope_rad=tip_slope_rad,
             quiet_stdout=as_json,
             hardware=hardware,
-            look=not no_look,
+            quick_look=not no_quick_look,
             obstacles=obstacle or (),
             from_angle=kind in ("move", "touch"),
             watch_fit=watch_fit,
@@ -169,7 +169,7 @@ def run_sessions(
             _write_json(error.results)
         raise
     finally:
-        ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
+        ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
     if as_json:
         _write_json(results)
     if any(result.fault for result in results):
@@ -352,7 +352,7 @@ def move(
         float | None, typer.Argument(metavar="ANGLE", help="Angle from the rig's zero (rad).")
     ] = None,
     by_rad: Annotated[
-        float | None, typer.Option("--by", help="Angle from where the motor stands (rad).")
+        float | None, typer.Option("--by", help="Angle from the present motor angle (rad).")
     ] = None,
     robust: Annotated[
         bool,
@@ -425,19 +425,19 @@ def until(
         ),
     ] = None,
 ) -> "dict[str, Value | None]":
-    """Excite what tells most until a precision is reached.
+    """Choose the most informative excitation until a precision is reached.
 
-    A quick scan finds the modes; then each piece is planned by what the record has told so far.
+    A quick scan finds the modes. Each further segment is planned from the record so far.
 
     Example: rigd run until --damping 1% --at-most 60
     """
-    asked = [
+    precisions = [
         *(("damping", text) for text in damping or ()),
         *(("frequency", text) for text in frequency or ()),
         *(("zeta", zeta), ("alpha", alpha), ("gamma", gamma), ("lambda", lambda_)),
     ]
     return {
-        "targets": "; ".join(f"{name} {text}" for name, text in asked if text is not None),
+        "targets": "; ".join(f"{name} {text}" for name, text in precisions if text is not None),
         "at_most_s": at_most_s,
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,

@@ -1,4 +1,4 @@
-"""``rigd simulate`` and ``rigd inject``: the simulated rig on the wire, and its faults."""
+"""``rigd simulate`` and ``rigd inject``: simulated devices on the bus, and their faults."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``rigd start``: sessions that the daemon runs; and starting the processes of a rig."""
+"""``rigd start``: sessions run by the daemon; also the start of the processes of a rig."""
 
 import contextlib
 import json
@@ -41,23 +41,23 @@ if TYPE_CHECKING:
 
 
 _POLL_S = 0.2
-_LOOK_PATIENCE_S = 10.0
+_QUICK_LOOK_PATIENCE_S = 10.0
 """Longest wait for the last quick look at the end."""
 
 
 class SessionCommands(TyperGroup):
-    """Commands that run sessions; Ctrl-C before they catch it themselves is told of.
+    """Commands that run sessions; reports a Ctrl-C before they handle it themselves.
 
-    From :func:`start_processes` on it is a stop of the session, which says so.
+    After :func:`start_processes` Ctrl-C stops the session, which reports it.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the command that was asked for."""
+        """Run the requested command."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            with contextlib.suppress(OSError):  # its terminal is gone
+            with contextlib.suppress(OSError):  # the terminal is gone
                 typer.echo("Stopped before anything began.", err=True)
             raise
 
@@ -67,7 +67,7 @@ def start_processes(
 ) -> "tuple[StopRequest, ProcessGroup]":
     """Catch the operator's stop, and start the processes of the first session.
 
-    They import what they need while the command line imports the rest, and while it plans.
+    The processes import their modules while the command line imports others and plans.
     """
     from rigd.engine.processes import FIT, TOUCH
     from rigd.runner import ProcessGroup
@@ -138,8 +138,8 @@ def start_sessions(
         if not detach:
             client.ask("watch")
         with _Interrupts.caught() as interrupts:
-            told = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
-            if told["reply"] == "stop":
+            reply = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
+            if reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach and interrupts.count:
@@ -147,17 +147,19 @@ def start_sessions(
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach:
                 if as_json:
-                    typer.echo(json.dumps({"series": told["series"]}))
+                    typer.echo(json.dumps({"series": reply["series"]}))
                 else:
-                    _tell_plan(told["plan"], err=False)
+                    _print_plan(reply["plan"], err=False)
                     typer.echo(
                         "Running; rigd status shows the progress, rigd stop ends the session."
                     )
                 return
-            _tell_plan(told["plan"], err=as_json)
-            # A daemon of before an update makes none, or does not tell at which sessions.
-            looks = daemon.get("quick_looks", False)
-            series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
+            _print_plan(reply["plan"], err=as_json)
+            # An older daemon makes no quick looks, or does not report for which sessions.
+            quick_looks = daemon.get("quick_looks", False)
+            series = _follow(
+                client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
+            )
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
@@ -168,7 +170,7 @@ def start_sessions(
 
 
 class _Interrupts:
-    """Counts Ctrl-C: the first asks for a stop, the second leaves."""
+    """Counter of Ctrl-C: the first requests a stop, the second leaves."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -176,7 +178,7 @@ class _Interrupts:
     @classmethod
     @contextmanager
     def caught(cls) -> Iterator["_Interrupts"]:
-        """Count from here on."""
+        """Count interrupts within the context."""
         interrupts = cls()
         before = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
         try:
@@ -185,39 +187,39 @@ class _Interrupts:
             signal.signal(signal.SIGINT, before)
 
     def note(self) -> None:
-        """Take note of one."""
+        """Count one interrupt."""
         self.count += 1
 
 
 def _follow(
-    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, looks: bool
+    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, quick_looks: bool
 ) -> dict[str, Any]:
-    """Show the progress of a series to its end, and return what the daemon says of it."""
+    """Show the progress of a series to its end, and return its final event."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
 
-    asked = False
+    stop_sent = False
     done = 0
     awaited: set[str] = set()
     made: dict[str, str] = {}
     fits: dict[str, Any] = {}
     ended: dict[str, Any] | None = None
-    heard, deadline_s = 0, 0.0
+    interrupts_before, deadline_s = 0, 0.0
     line = ProgressLine()
     try:
         while ended is None or (awaited and time.monotonic() < deadline_s):
-            if ended is not None and interrupts.count > heard:
+            if ended is not None and interrupts.count > interrupts_before:
                 break
-            if interrupts.count and not asked:
-                asked = True
+            if interrupts.count and not stop_sent:
+                stop_sent = True
                 client.send("stop")
                 line.say("Stopping; press Ctrl-C again to leave while the daemon finishes.")
             if ended is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}
             match event.get("event"):
-                # Between two sessions there is nothing to show: the bar would stand by the path.
+                # No bar between two sessions, where it would mix with the printed path.
                 case "progress" if event["session"] > done:
                     line.update(
                         Phase[event["phase"].upper()],
@@ -230,7 +232,7 @@ def _follow(
                         else "",
                     )
                 case "message" if "session" in event:
-                    pass  # how a session ended: the event of that name tells more
+                    pass  # the end of a session is reported by the event of that name
                 case "message" if event["level"] != "info":
                     line.say(f"{event['level'].capitalize()}: {event['text']}")
                 case "message" if event.get("notable") or event["text"].startswith("Live view"):
@@ -241,21 +243,21 @@ def _follow(
                     if event["path"] is not None:
                         if not as_json:
                             typer.echo(event["path"])
-                        if event.get("look_follows", looks):
+                        if event.get("look_follows", quick_looks):
                             awaited.add(event["path"])
                         if "fit" in event:
                             fits[event["path"]] = event["fit"]
                     line, done = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited:
                     awaited.discard(event["path"])
-                    look = QuickLook.of_event(event)
-                    if look.path is not None:
-                        made[event["path"]] = str(look.path)
-                    for text in look.lines:
+                    quick_look = QuickLook.of_event(event)
+                    if quick_look.path is not None:
+                        made[event["path"]] = str(quick_look.path)
+                    for text in quick_look.lines:
                         line.say(text)
                 case "series" if event["series"] == number:
-                    ended, heard = event, interrupts.count
-                    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+                    ended, interrupts_before = event, interrupts.count
+                    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
                     if awaited:
                         line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
@@ -269,7 +271,7 @@ def _follow(
     return ended | {"sessions": sessions}
 
 
-def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
+def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
     from rigd.runner import plan_lines
 
     for line in plan_lines(plan):

@@ -1,4 +1,4 @@
-"""The daemon's status as a text for the operator."""
+"""Status of the daemon as text for the operator."""
 
 from collections.abc import Iterator
 from datetime import datetime
@@ -23,53 +23,47 @@ _SHOWN_TRANSITIONS = 4
 _BUSY_PERCENT = 80.0
 
 
-def print_status(told: dict[str, Any]) -> None:
-    """Write it to standard output."""
-    Console(highlight=False).print(status_table(told))
+def print_status(status: dict[str, Any]) -> None:
+    """Print the status of the daemon."""
+    Console(highlight=False).print(status_table(status))
 
 
-def status_table(told: dict[str, Any]) -> RenderableType:
-    """Return it as something that rich can show.
-
-    Parameters
-    ----------
-    told
-        The daemon's reply to ``status``.
-    """
+def status_table(status: dict[str, Any]) -> RenderableType:
+    """Return the daemon's reply to ``status`` as a rich table."""
     head = Table(box=None, pad_edge=False, show_header=False)
     head.add_column(style="dim", no_wrap=True)
     head.add_column(overflow="fold")
-    for name, value in _rows(told):
+    for name, value in _rows(status):
         head.add_row(name, value)
     parts: list[RenderableType] = [head]
-    rig = told["rig"]
+    rig = status["rig"]
     if rig is not None:
-        recording = told["state"] in ("running", "stopping")
-        beside = Table.grid(padding=(0, 2, 0, 0))
-        beside.add_row(
+        recording = status["state"] in ("running", "stopping")
+        side_by_side = Table.grid(padding=(0, 2, 0, 0))
+        side_by_side.add_row(
             Group("", _signals(rig), "", _health(rig)),
             Group(
                 "", _processes(rig["processes"]), "", _topics(rig["topics"], recording=recording)
             ),
         )
-        parts.append(beside)
-    parts.append(_history(told["history"]))
+        parts.append(side_by_side)
+    parts.append(_history(status["history"]))
     return Group(*parts)
 
 
-def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
-    daemon, series, progress = (told[name] for name in ("daemon", "series", "progress"))
+def _rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
+    daemon, series, progress = (status[name] for name in ("daemon", "series", "progress"))
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
-    doing = f" ({told['doing']})" if told["doing"] else ""
-    word = told["state"]
+    doing = f" ({status['doing']})" if status["doing"] else ""
+    word = status["state"]
     if word == "running" and progress is not None:
-        word = progress.get("activity", word)  # a daemon of before an update has none
-    state = Text(f"{word}{doing}", style=_STYLES.get(told["state"], ""))
-    state.append(f" since {_clock(told['since_utc_ns'])}: {told['reason']}", style="default")
+        word = progress.get("activity", word)  # an older daemon has none
+    state = Text(f"{word}{doing}", style=_STYLES.get(status["state"], ""))
+    state.append(f" since {_clock(status['since_utc_ns'])}: {status['reason']}", style="default")
     yield "state", state
-    if told["zero_lost"]:
+    if status["zero_lost"]:
         yield "zero", Text("lost with the connection: run rigd zero", style="bold yellow")
-    controller = told["controller"]
+    controller = status["controller"]
     yield (
         "control",
         Text(
@@ -80,10 +74,10 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
         yield "series", Text(_series(series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
-    # A daemon of before an update tells none; one without lines is of a record that was lost.
+    # An older daemon reports no fit; a fit without lines belongs to a lost record.
     if series is not None and (lines := (series.get("fit") or {}).get("text")):
         yield "fit", Text("\n".join(lines))
-    rig = told["rig"]
+    rig = status["rig"]
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])
     if daemon.get("web") is not None:
@@ -92,7 +86,7 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
 
 
 def progress_text(progress: dict[str, Any]) -> str:
-    """Say in one line how far a session is."""
+    """Return the progress of a session as one line."""
     left = progress["time_left_s"]
     time_left = "" if left is None else f", {left:.0f} s left"
     return (
@@ -120,7 +114,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _signals(rig: dict[str, Any]) -> Table:
-    """Tell what is measured now, and the largest magnitudes of the record."""
+    """Return the table of present signals and of the peaks of the record."""
     table = _table("signal", "now", "peak")
     known = rig["signals"] or {}
     for name, unit, digits, now, peak in (
@@ -156,7 +150,7 @@ def _signals(rig: dict[str, Any]) -> Table:
 
 
 def _health(rig: dict[str, Any]) -> Table:
-    """Tell how well loop, recorder, bus and view are doing, in colour what is not well."""
+    """Return the table of the health of loop, recorder, bus and view; problems are in colour."""
     table = _table("health", "")
     for name, text, style in _health_rows(rig):
         table.add_row(name, Text(text, style=style))
@@ -166,7 +160,7 @@ def _health(rig: dict[str, Any]) -> Table:
 def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     health, signals = rig["health"], rig["signals"]
     if signals is not None:
-        # What is expected of the samples is the loop's rate.
+        # The expected rate of the samples is that of the loop.
         expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
         slow = signals["rate_hz"] < 0.999 * expected_hz
         yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""

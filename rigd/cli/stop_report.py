@@ -1,4 +1,4 @@
-"""What ``rigd stop`` does and prints; quick to import, without reading options."""
+"""Action and output of ``rigd stop``; quick to import."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Entry point of ``rigd stop`` without options: reading them takes longer than the stop."""
+    """Run ``rigd stop`` without options, whose parser is slower than the stop itself."""
     run_command(lambda: sys.exit(stop_and_report(None, wait=True)))
 
 
 def stop_and_report(profile: str | None, *, wait: bool) -> int:
-    """Stop what runs, print what became of it, and return the exit code.
+    """Stop the running sessions, print the result, and return the exit code.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Library of session files: what a folder holds, who recorded it, and the modes that were found.
+"""Library of session files: the sessions of a folder with their metadata and modes.
 
-Offers the sessions of a folder, filtered (`list_sessions`), and in its public module `trend` the
-course of a specimen's modes over time. The files are the truth. In the same folder is an index
-(`library.sqlite`), which spares reading what has not changed; it may be removed at any time.
+The package offers the filtered list of the sessions of a folder (`list_sessions`) and, in its
+public module `trend`, the course of a specimen's modes over time. The index `library.sqlite` in the
+folder avoids reading unchanged files; it may be removed at any time.
 """
 
 import lazy_loader as lazy

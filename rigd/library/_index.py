@@ -1,9 +1,9 @@
-"""Index of a folder of sessions: an SQLite file beside them, a table of one row per session.
+"""Index of a folder of sessions: an SQLite file in the folder with one row per session.
 
-It is a cache. Each row carries the stamp of the files that it was made from, and is rebuilt when
-that differs; an index that cannot be read, written or understood is done without. Several programs
-may use it at once: each writes in one transaction, and what another one has overwritten or removed
-is noticed by its stamp the next time.
+The index is a cache. Each row has the stamp of its source files, and is rebuilt when the stamp
+differs. An index that cannot be read or written is ignored. Several programs may use it at the same
+time: each writes in one transaction, and the stamps reveal rows that another program overwrote or
+removed.
 """
 
 import contextlib
@@ -21,18 +21,18 @@ from rigd.library._row import SessionRow, usable_modes
 from rigd.session import Validity
 
 INDEX_NAME: Final = "library.sqlite"
-"""Name of the index in its folder."""
+"""File name of the index."""
 
 _APPLICATION: Final = 0x72696764  # "rigd"
 _VERSION: Final = 3
-"""Greater whenever the table, or what a row is made of, is another: older indexes are rebuilt."""
+"""Version of the table and of the content of a row; older indexes are rebuilt."""
 _HEADER: Final = b"SQLite format 3\0"
-_APPLICATION_PLACE: Final = slice(68, 72)
+_APPLICATION_OFFSET: Final = slice(68, 72)
 _PATIENCE_S: Final = 2.0
-"""Longest wait for another program that writes."""
+"""Longest wait for another writing program."""
 
 _DAMAGED: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-"""Codes of errors that mean that the index is not what it should be."""
+"""Error codes of an invalid index."""
 
 _TYPES: Final = {
     "id": "TEXT",
@@ -58,13 +58,13 @@ _TYPES: Final = {
     "meta": "TEXT",
     "problem": "TEXT",
 }
-"""Columns beside ``file`` and ``stamp``; modes, validity and meta are JSON, times
-UTC in ISO 8601."""
+"""Columns in addition to ``file`` and ``stamp``. Modes, validity and meta are JSON; times are UTC
+in ISO 8601."""
 _KINDS: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
 _READ: Final = tuple(name for name in _TYPES if name != "start_utc")
 
 Stamped = tuple[str, SessionRow]
-"""Stamp of the files that a row was made from, and the row."""
+"""A row and the stamp of its source files."""
 
 
 class Index:
@@ -81,7 +81,7 @@ class Index:
         self._path = folder / INDEX_NAME
 
     def read(self) -> dict[str, Stamped]:
-        """Return the rows by the files' names; none if there is no index of use."""
+        """Return the rows by file name; empty without a valid index."""
         if not self._is_ours():
             return {}
         rows: dict[str, Stamped] = {}
@@ -91,14 +91,14 @@ class Index:
                     return {}
                 columns = ", ".join(("file", "stamp", *_READ))
                 for file, stamp, *values in database.execute(f"SELECT {columns} FROM sessions"):
-                    with contextlib.suppress(ValueError, TypeError):  # it is rebuilt
+                    with contextlib.suppress(ValueError, TypeError):  # the row is rebuilt
                         rows[file] = stamp, self._row(file, dict(zip(_READ, values, strict=True)))
         except sqlite3.Error:  # locked for long, or damaged
             return {}
         return rows
 
     def write(self, rows: Mapping[str, Stamped], gone: Collection[str]) -> None:
-        """Store rows by the files' names and drop those of files that are gone, if it can be done.
+        """Store rows by file name and remove those of missing files, if possible.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Index:
             Names of files that are not there any more.
         """
         if self._path.exists() and not self._is_ours():
-            return  # whatever it is, it is somebody else's
+            return  # the file is not an index of this program
         try:
             self._store(rows, gone)
         except sqlite3.Error as error:
@@ -146,7 +146,7 @@ class Index:
 
     @contextmanager
     def _connected(self, mode: str) -> Iterator[sqlite3.Connection]:
-        # Transactions are begun by hand: the module's own would commit before a table is made.
+        # Explicit transactions: the implicit ones would commit before a table is created.
         database = sqlite3.connect(
             f"{self._path.absolute().as_uri()}?mode={mode}",
             uri=True,
@@ -159,23 +159,17 @@ class Index:
             database.close()
 
     def _is_ours(self) -> bool:
-        """Tell whether the file is an index, or one that was begun and is still empty."""
+        """Return whether the file is an index of this program, or empty."""
         try:
             with self._path.open("rb") as file:
-                head = file.read(_APPLICATION_PLACE.stop)
+                head = file.read(_APPLICATION_OFFSET.stop)
         except OSError:
             return False
         mark = _APPLICATION.to_bytes(4, "big")
-        return not head or (head.startswith(_HEADER) and head[_APPLICATION_PLACE] == mark)
+        return not head or (head.startswith(_HEADER) and head[_APPLICATION_OFFSET] == mark)
 
     def _row(self, file: str, values: dict[str, object]) -> SessionRow:
-        """Make a row of the columns.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If they hold what no row does.
-        """
+        """Return the row of the columns; raise ValueError or TypeError if they are invalid."""
         report = values["report"]
         for name, value in values.items():
             if name != "report" and not isinstance(value, _KINDS[_TYPES[name]]):
@@ -207,7 +201,7 @@ def _iso(utc_ns: int) -> str | None:
 
 
 def _storable(file: str) -> bool:
-    """Tell whether a name is text; any other is read again each time."""
+    """Return whether a name is valid text; other files are read each time."""
     try:
         file.encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""One session of the library: what its file, its quick look and its report say of it."""
+"""One session of the library: data from its file, its quick look and its report."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from rigd.session.quick_look import modes_of, read_look
 SUFFIX: Final = ".mcap"
 TORN_SUFFIX: Final = ".mcap.part"
 REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
-"""Name of the folder of a report: of which session, and which of its reports."""
+"""Name of a report folder: session and number of the report."""
 REPORT_PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
@@ -31,14 +31,13 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """A session file of a folder, and what is known of its session.
+    """A session file of a folder, with the data of its session.
 
-    What a file does not tell is an empty text or None. Texts are printable and cut to 1000
-    characters.
+    Unknown values are empty texts or None. Texts are printable and truncated to 1000 characters.
     """
 
     id: str
-    """Name of the file without ``.mcap`` or, as long as it has no end, ``.mcap.part``."""
+    """Name of the file without ``.mcap`` or, for an incomplete file, ``.mcap.part``."""
     path: Path
     """The file."""
     size_bytes: int
@@ -48,7 +47,7 @@ class SessionRow:
     profile: str = ""
     """Name of the rig's profile."""
     specimen: str = ""
-    """Specimen that was named."""
+    """Name of the specimen."""
     operator: str = ""
     """Operator."""
     excitation: str = ""
@@ -56,8 +55,8 @@ class SessionRow:
     note: str = ""
     """Note."""
     outcome: str = "unknown"
-    """``complete``, ``stopped`` or ``fault``; ``unknown`` if the file does not tell; ``recording``
-    and ``incomplete`` of a file without its end; ``unreadable``."""
+    """``complete``, ``stopped`` or ``fault``; ``unknown`` if the file does not state it;
+    ``recording`` or ``incomplete`` for a file without an end; ``unreadable``."""
     reason: str = ""
     """Why the session ended early, or failed."""
     duration_s: float | None = None
@@ -71,36 +70,36 @@ class SessionRow:
     late: int | None = None
     """Ticks that woke late."""
     lost: int | None = None
-    """Samples that were taken and not recorded."""
+    """Samples that were taken but not recorded."""
     modes: tuple[Mode, ...] = ()
-    """Modes of the last report, or without one of the quick look: objects ``frequency_hz`` and
+    """Modes of the last report, or else of the quick look: objects ``frequency_hz`` and
     ``damping_ratio`` and ``participation`` (or None), each with ``value``, ``std``, ``interval_95``
     and ``flag``, and ``source``."""
     validity: Document | None = None
-    """How exact the linear model is for them, as `rigd.session.Validity.as_json` has it; None
-    without modes."""
+    """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None without
+    modes."""
     report: Path | None = None
-    """Page of the last report."""
+    """HTML page of the last report."""
     meta: dict[str, float | str] = field(default_factory=dict)
     """Metadata that users added, by name."""
     problem: str = ""
-    """What is wrong with the file and what to do about it; empty of a sound one."""
+    """Problem of the file and its remedy; else empty."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the row for JSON."""
         document = {each.name: getattr(self, each.name) for each in fields(self)}
         report = None if self.report is None else str(self.report)
         return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
 
 
-def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
-    """Read what is known of a session; what cannot be read is told in the row.
+def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
+    """Return the row of a session; unreadable parts are reported in the row.
 
     Parameters
     ----------
     path
         Session file.
-    look
+    quick_look
         File of its quick look, if there is one.
     report
         Folder of its last report, if there is one.
@@ -108,27 +107,27 @@ def read_row(path: Path, look: Path | None, report: Path | None) -> tuple[Sessio
     Returns
     -------
     SessionRow
-        What is known.
+        The row.
     bool
-        Whether that holds until the files change: not if the system did not let the file be read.
+        Whether the row is valid until the files change; False after a system error.
 
     Raises
     ------
     FileNotFoundError
-        If the file has gone meanwhile.
+        If the file no longer exists.
     """
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata
 
     size = path.stat().st_size
     name = path.name.removesuffix(TORN_SUFFIX).removesuffix(SUFFIX)
-    results: dict[str, Any] = _modes(look, report)
+    results: dict[str, Any] = _modes(quick_look, report)
     if report is not None and (report / REPORT_PAGE).is_file():
         results["report"] = report / REPORT_PAGE
     try:
         summary = read_summary(path)
     except SessionError as error:
-        path.stat()  # which may have gone
+        path.stat()  # raises if the file no longer exists
         row = SessionRow(
             name, path, size, outcome="unreadable", problem=printable(str(error)), **results
         )
@@ -180,7 +179,7 @@ def _text(values: Mapping[str, str], key: str) -> str:
 
 def _count(values: Mapping[str, str], key: str) -> int | None:
     text = values.get(key, "")
-    # More digits are not a count, and no 64 bits hold them.
+    # More digits are not a count and exceed 64 bits.
     countable = text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS + 1
     return int(text) if countable and int(text) < 2**63 else None
 
@@ -196,13 +195,13 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes(look: Path | None, report: Path | None) -> Document:
+def _modes(quick_look: Path | None, report: Path | None) -> Document:
     """Return modes and validity of the report, or else of the quick look; nothing without them."""
     if report is not None:
         for headline in _list(_document(report / NUMBERS), "headlines"):
             if modes := usable_modes(_list(headline, "modes")):
                 return _with_validity(modes, headline)
-    found = None if look is None else read_look(look)
+    found = None if quick_look is None else read_look(quick_look)
     return {} if found is None else _with_validity(usable_modes(found["modes"]), found)
 
 
@@ -216,7 +215,7 @@ def _with_validity(modes: tuple[Mode, ...], found: object) -> Document:
 def _document(path: Path) -> object:
     try:
         return json.loads(read_plain_file(path, _MOST_JSON_BYTES))
-    except (OSError, ValueError, RecursionError):  # a result less, no session less
+    except (OSError, ValueError, RecursionError):  # the session is listed without this result
         return None
 
 
@@ -226,7 +225,7 @@ def _list(document: object, key: str) -> list[object]:
 
 
 def usable_modes(modes: object) -> tuple[Mode, ...]:
-    """Return the modes of a list that the record shows, if their numbers are finite."""
+    """Return the observed modes of a list whose numbers are finite."""
     return tuple(
         {name: mode[name] for name in ("frequency_hz", "damping_ratio", "participation", "source")}
         for mode in modes_of(modes)

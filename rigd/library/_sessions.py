@@ -1,4 +1,4 @@
-"""Sessions of a folder: found, compared with the index, read where they are new, and filtered."""
+"""Sessions of a folder: search, comparison with the index, reading of new files, and filters."""
 
 import os
 from collections.abc import Callable
@@ -24,7 +24,7 @@ _DATE_CHARACTERS: Final = len("2026-11-20")
 
 
 class LibraryError(UserError, ValueError):
-    """Sessions cannot be listed; the message names the folder or the filter, and the remedy."""
+    """Sessions cannot be listed; the message names the folder or filter, and the remedy."""
 
 
 def list_sessions(
@@ -41,24 +41,24 @@ def list_sessions(
 ) -> list[SessionRow]:
     """List the sessions of a folder, the newest first.
 
-    Files are read where they are new or have changed, by their size and time, and the index of the
-    folder is updated if it can be written. Incomplete and foreign files are listed with the
-    reason. Subfolders are not searched.
+    New or changed files, by size and time, are read, and the index of the folder is updated if it
+    is writable. Incomplete and third-party files are listed with the reason. Subfolders are not
+    searched.
 
     Parameters
     ----------
     folder
         Folder of the session files.
     specimen, operator, excitation, outcome
-        What a session must have, in upper or lower case; None for any.
+        Required values, case-insensitive; None for any.
     since, until
-        First and last moment at which a session may have begun, in ISO 8601, by the local clock
-        unless an offset is given. A date alone as `until` includes its day.
+        First and last permitted start time, in ISO 8601, local unless an offset is given. A date
+        alone as `until` includes its day.
     text
         Text that any of specimen, operator, excitation, note, reason, metadata or name must
-        contain, in upper or lower case.
+        contain, case-insensitive.
     on_progress
-        Called now and then with the share of the new files that have been read.
+        Called from time to time with the fraction of new files that have been read.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def list_sessions(
     Raises
     ------
     LibraryError
-        If there is no such folder, it cannot be read, or a date is none.
+        If the folder does not exist or cannot be read, or a date is invalid.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def _searched(row: SessionRow) -> str:
 
 
 def _moment_ns(given: str | datetime | None, name: str) -> int | None:
-    """Return a moment in ns since the epoch; of a date alone its first or its last moment."""
+    """Return a time in ns since the epoch; for a date alone, the start or end of its day."""
     if given is None or given == "":
         return None
     try:
@@ -128,19 +128,19 @@ def _is_date(given: str) -> bool:
 
 
 class _Found:
-    """Session file as the folder has it, with what was made of it."""
+    """Session file of a folder, with its quick look and report."""
 
     def __init__(self, entry: os.DirEntry[str]) -> None:
         self.path = Path(entry.path)
         self.stamp = _stamp_of(entry.path)
-        self.look: Path | None = None
+        self.quick_look: Path | None = None
         self.report: Path | None = None
 
-    def with_results(self, look: Path | None, report: Path | None) -> None:
-        """Take note of quick look and report, whose stamps become part of this one."""
-        self.look, self.report = look, report
-        if look is not None:
-            self.stamp += f" look {_stamp_of(look)}"
+    def with_results(self, quick_look: Path | None, report: Path | None) -> None:
+        """Add quick look and report, and append their stamps to the stamp of the file."""
+        self.quick_look, self.report = quick_look, report
+        if quick_look is not None:
+            self.stamp += f" look {_stamp_of(quick_look)}"
         if report is not None:
             self.stamp += (
                 f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / REPORT_PAGE)}"
@@ -156,7 +156,7 @@ def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[Ses
     unread = []
     for name, file in found.items():
         stamp, row = known.get(name, ("", None))
-        # Whether a file without its end is being recorded cannot be told by its stamp.
+        # The stamp does not show whether an incomplete file is being recorded.
         if row is not None and stamp == file.stamp and not name.endswith(TORN_SUFFIX):
             rows.append(row)
         else:
@@ -164,8 +164,8 @@ def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[Ses
     for number, name in enumerate(unread, start=1):
         file = found[name]
         try:
-            row, holds = read_row(file.path, file.look, file.report)
-        except OSError:  # it has gone, or has got its final name
+            row, holds = read_row(file.path, file.quick_look, file.report)
+        except OSError:  # the file was removed or received its final name
             continue
         rows.append(row)
         if holds and not name.endswith(TORN_SUFFIX):
@@ -187,7 +187,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
         If it is not a folder, or cannot be read.
     """
     found: dict[str, _Found] = {}
-    looks: dict[str, Path] = {}
+    quick_looks: dict[str, Path] = {}
     reports: dict[str, tuple[int, Path]] = {}
     try:
         with os.scandir(folder) as entries:
@@ -196,7 +196,7 @@ def _scan(folder: Path) -> dict[str, _Found]:
                 if name.endswith((SUFFIX, TORN_SUFFIX)):
                     found[name] = _Found(entry)
                 elif name.endswith(LOOK_SUFFIX):
-                    looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
+                    quick_looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
                 elif match := REPORT_FOLDER.fullmatch(name):
                     number = int((match[2] or "1")[:9])
                     if number >= reports.get(match[1], (0, None))[0]:
@@ -209,12 +209,12 @@ def _scan(folder: Path) -> dict[str, _Found]:
     for name, file in found.items():
         if name.endswith(SUFFIX):
             stem = name.removesuffix(SUFFIX)
-            file.with_results(looks.get(stem), reports.get(stem, (0, None))[1])
+            file.with_results(quick_looks.get(stem), reports.get(stem, (0, None))[1])
     return found
 
 
 def _stamp_of(path: str | os.PathLike[str]) -> str:
-    """Return size and time of a file; empty if it cannot be told."""
+    """Return size and time of a file; empty if they are not known."""
     try:
         status = Path(path).stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Modes of a specimen over time: their course through its sessions, and which changes are real."""
+"""Modes of a specimen over time: their course through its sessions and significant changes."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any, Final
 from rigd.library._row import SessionRow
 
 _SAME_MODE: Final = log(1.25)
-"""Largest ratio of two frequencies that may be one mode's; a beam's modes are further apart."""
+"""Largest frequency ratio of the same mode in two sessions; modes of a beam are further apart."""
 
 _SIGNIFICANT: Final = 3.0 / 1.96
 """Half-widths of a 95 % interval in three standard deviations."""
@@ -18,14 +18,14 @@ Quantity = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ModeChange:
     """Difference of a quantity between two sessions."""
 
     difference: float
     """Later less earlier, in the unit of the quantity."""
     significant: bool | None
-    """Whether it is larger than three standard deviations; None if that cannot be told: an interval
-    is not known, or a quantity is flagged."""
+    """Whether the difference exceeds three standard deviations; None if this is not known: an
+    interval is missing, or a quantity is flagged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +38,10 @@ class TrendPoint:
     """Natural frequency."""
     damping_ratio: Quantity
     """Damping ratio."""
-    frequency_change: Change | None
-    """Change since the mode's first session; None of that one."""
-    damping_change: Change | None
-    """Likewise of the damping ratio."""
+    frequency_change: ModeChange | None
+    """Change since the mode's first session; None for that session."""
+    damping_change: ModeChange | None
+    """Change of the damping ratio, likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,10 @@ class ModeTrend:
     """A mode through the sessions of a specimen."""
 
     points: tuple[TrendPoint, ...]
-    """Its sessions, the oldest first."""
+    """The mode in its sessions, the oldest first."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the trend for JSON."""
         return {
             "points": [
                 {
@@ -70,8 +70,8 @@ class ModeTrend:
         }
 
 
-def change_between(before: Quantity, after: Quantity) -> Change:
-    """Compare a quantity of two sessions.
+def change_between(before: Quantity, after: Quantity) -> ModeChange:
+    """Return the change of a quantity between two sessions.
 
     Parameters
     ----------
@@ -84,10 +84,10 @@ def change_between(before: Quantity, after: Quantity) -> Change:
 
     Notes
     -----
-    Both errors are independent, so that the difference has a 95 % interval whose half-width is
-    the root of the sum of the squared half-widths; of each interval that half counts which faces
-    the other value. A change is significant beyond three standard deviations, 1.53 times that: two
-    sessions have six such changes and a trend many more, and 95 % would call one in twenty real.
+    Both errors are independent. The half-width of the 95 % interval of the difference is the root
+    of the sum of the squared half-widths, each on the side of the other value. A change is
+    significant beyond three standard deviations, 1.53 times this half-width, because a trend has
+    many changes and one in twenty exceeds a 95 % interval by chance.
 
     Examples
     --------
@@ -98,25 +98,25 @@ def change_between(before: Quantity, after: Quantity) -> Change:
     """
     difference = after["value"] - before["value"]
     if any(each.get("interval_95") is None or each.get("flag") for each in (before, after)):
-        return Change(difference, None)
+        return ModeChange(difference, None)
     low, high = (before, after) if difference >= 0 else (after, before)
     allowed = hypot(low["interval_95"][1] - low["value"], high["value"] - high["interval_95"][0])
-    return Change(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
+    return ModeChange(difference, abs(difference) > _SIGNIFICANT * allowed > 0.0)
 
 
 def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
-    """Follow the modes of one specimen through its sessions.
+    """Return the trends of the modes of one specimen through its sessions.
 
     Parameters
     ----------
     rows
-        Sessions of the specimen in any order; those without modes are left out.
+        Sessions of the specimen in any order; those without modes are ignored.
 
     Returns
     -------
     list of ModeTrend
-        By frequency. A mode is that of another session whose frequency is the nearest, by a factor
-        of 1.25 at most; changes are those since the mode's first session.
+        Trends in the order of frequency. Modes of two sessions are the same if their frequencies
+        are the nearest, within a factor of 1.25. Changes are relative to the mode's first session.
     """
     trends: list[list[TrendPoint]] = []
     for row in sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
@@ -134,7 +134,7 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
                 trends.append([])
             taken.add(nearest)
             points = trends[nearest]
-            changes: tuple[Change | None, Change | None] = (None, None)
+            changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
             if points:
                 first = points[0]
                 changes = (
@@ -146,7 +146,7 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
     return [ModeTrend(tuple(points)) for points in trends]
 
 
-def _document(change: Change | None) -> dict[str, Any] | None:
+def _document(change: ModeChange | None) -> dict[str, Any] | None:
     if change is None:
         return None
     return {"difference": change.difference, "significant": change.significant}

@@ -1,9 +1,9 @@
-"""A rig's profile: one TOML file that says everything about the rig, with units and sources.
+"""Profile of a rig: one TOML file with all parameters of the rig, their units and sources.
 
-Offers the loader (`load_profile`), the validated dataclass (`Profile`), writing a profile with
-other values (`write_new`) and a draft from a drive's EDS file (`Draft`). The loader is imported on
-first use: the control process is handed a profile that was validated, and does not pay for the
-validation. Devices are described here, never opened.
+The package offers the loader (`load_profile`), the validated dataclass (`Profile`), writing a
+profile with other values (`write_new`) and a draft from a drive's EDS file (`Draft`). The loader is
+imported on first use, because the control process receives a validated profile. The package
+describes devices and never opens them.
 """
 
 import lazy_loader as lazy

@@ -1,10 +1,10 @@
 from ._from_eds import Draft as Draft
 from ._load import ProfileError as ProfileError
 from ._load import load_profile as load_profile
-from ._places import WORKING_FOLDER as WORKING_FOLDER
-from ._places import profile_files as profile_files
-from ._places import specimen_files as specimen_files
-from ._places import user_folder as user_folder
+from ._locations import WORKING_FOLDER as WORKING_FOLDER
+from ._locations import profile_files as profile_files
+from ._locations import specimen_files as specimen_files
+from ._locations import user_folder as user_folder
 from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
 from ._specimen import load_specimen as load_specimen

@@ -1,7 +1,7 @@
-"""Checks of a profile that go beyond types and ranges, and the texts about its mistakes.
+"""Checks of a profile in addition to types and ranges, and the messages about its mistakes.
 
-Values may contradict each other (`contradictions`), also about the wiring of the devices
-(`wiring_contradictions`); sources, keys and sections may be missing or unknown.
+Values may contradict each other (`contradictions`), also for the wiring of the devices
+(`wiring_contradictions`). Sources, keys and sections may be missing or unknown.
 """
 
 import difflib
@@ -41,32 +41,32 @@ _UNITS_OF_SIX = {
 }
 
 _JUMP_FACTOR = 100.0
-"""Multiple of the motor's own acceleration: a jump of the encoder up to it passes for motion."""
+"""Multiple of the motor's acceleration up to which a jump of the encoder may be motion."""
 
 _NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 
 _FIRST_MODE_HZ = 0.1, 100.0
-"""First mode of the undamped beam: outside it a unit is wrong or the antenna unsuitable."""
+"""Plausible range of the first mode of the undamped beam."""
 
 
 _PER_MILLE_LIMIT = 32.767
-"""Largest torque over rated torque that fits the 16 bits of object 6071."""
+"""Largest ratio of torque to rated torque in the 16 bits of object 6071."""
 _ROUNDING = 1e-9
 _PARALLEL = 1e-6
 _MOST_SHOWN = 200
-"""Characters of a value."""
+"""Largest number of displayed characters of a value."""
 _MOST_ITEMS = 12
 
 
 def no_source(key: str, source: object) -> str:
-    """Complain about a number whose source is absent or made up."""
+    """Return the message for a number with a missing or invalid source."""
     if source is None:
         return f"{key} has no source; add source = {_choice(SOURCES)}."
     return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
 
 
 def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
-    """Complain about a source "unknown" of a key that has a value, or that needs one."""
+    """Return the message for a source "unknown" of a key that has or needs a value."""
     if key in MAY_BE_UNKNOWN:
         return (
             f'{key} = {_show(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
@@ -79,7 +79,7 @@ def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
 
 
 def bare_number(key: str, value: object) -> str:
-    """Complain about a number that stands without a source."""
+    """Return the message for a number without a source."""
     return (
         f"{key} = {_show(value)}{_unit(key)} does not say where it comes from; write "
         f'{{ value = {_show(value)}, source = "…" }} with {_choice(SOURCES)}.'
@@ -98,7 +98,7 @@ def unusable_sizes(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong between values that are each in range."""
+    """Yield messages for contradictions between values that are in range."""
     if not _NAME.fullmatch(values["name"]):
         yield (
             f"name = {_show(values['name'])} is not fit for file names; take letters, digits, "
@@ -116,10 +116,10 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
             f"{peak:g} N·m; continuous torque must not exceed peak torque."
         )
-    asked = values["limits.torque_command_nm"]
-    if asked < peak:
+    limit_nm = values["limits.torque_command_nm"]
+    if limit_nm < peak:
         yield (
-            f"limits.torque_command_nm = {asked:g} N·m is below motor.peak_torque_nm = {peak:g} "
+            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = {peak:g} "
             "N·m, where commands saturate; the controller's command limit must be higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
@@ -129,7 +129,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             "the shaft could not come to rest before it is stopped by force."
         )
     yield from _out_of_reach(values)
-    yield from _not_beside_air(values)
+    yield from _incompatible_with_drag(values)
     yield from _hum(values)
     warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
     if drift < warning:
@@ -159,7 +159,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with a beam whose numbers are each in range: a unit, as a rule."""
+    """Yield messages for an implausible beam whose numbers are in range; often a unit is wrong."""
     first_mode_hz = float(
         undamped_frequencies_rad_s(
             Beam(
@@ -179,8 +179,8 @@ def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the simulated rig cannot have together with drag of the air."""
+def _incompatible_with_drag(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for settings of the simulated rig that are incompatible with air drag."""
     if not values.get("simulation.air_drag_m"):
         return
     for name in NOT_BESIDE_FORCES:
@@ -192,7 +192,7 @@ def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _hum(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with a hum that the simulated sensor picks up."""
+    """Yield messages for the hum of the simulated sensor."""
     rate_hz, hum_hz = values["rig.rate_hz"], values.get("simulation.hum_hz", 0.0)
     per_tick = max(1, round(values.get("ati_serial.stream_hz", rate_hz) / rate_hz))
     if values.get("simulation.hum_nm") and hum_hz >= 0.5 * per_tick * rate_hz:
@@ -204,7 +204,7 @@ def _hum(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _shear(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with the axis of the base shear."""
+    """Yield messages for the axis of the base shear."""
     torque, shear = values["sensor.projection"], values["sensor.shear_projection"]
     across = sum(a * b for a, b in zip(torque, shear, strict=True)) ** 2
     lengths = sum(a * a for a in torque) * sum(b * b for b in shear)
@@ -217,7 +217,7 @@ def _shear(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _obstacles(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with the obstacles of a simulated rig."""
+    """Yield messages for the obstacles of a simulated rig."""
     beam = Beam(
         values["beam.length_m"],
         values["beam.density_kg_per_m"],
@@ -232,7 +232,7 @@ def _obstacles(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield limits that nothing on this rig can leave: they look like a guard, and are none."""
+    """Yield messages for limits that this rig cannot exceed, so that they protect nothing."""
     angle_rad, inertia_kg_m2 = values["limits.angle_rad"], values["motor.inertia_kg_m2"]
     most_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
     room = f"limits.angle_rad = {angle_rad:g} rad to either side"
@@ -266,7 +266,7 @@ def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
-    """Yield one complaint for each key that is absent, or for a whole section."""
+    """Yield one message for each missing key or section."""
     reported = set()
     for key in absent:
         section = key.rpartition(".")[0]
@@ -281,7 +281,7 @@ def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
 
 
 def unknown(key: str, given: Mapping[str, Any]) -> str:
-    """Complain about a key that no profile has: a slip of the pen, or another unit."""
+    """Return the message for an unknown key: a typing error or another unit."""
     if key in SECTIONS:
         return f"{key} = {_show(given[key])} must be a section; write [{key}] and its keys below."
     section = key.rpartition(".")[0]
@@ -326,11 +326,11 @@ _RANGES = {
 
 
 def wrong(detail: ErrorDetails) -> str:
-    """Complain about a value of the wrong type or out of its range."""
-    key, *place = detail["loc"]
+    """Return the message for a value of the wrong type or out of range."""
+    key, *position = detail["loc"]
     if detail["type"] == "missing":  # one of the six
-        place = []
-    where = f"{key}[{place[0]}]" if place else str(key)
+        position = []
+    where = f"{key}[{position[0]}]" if position else str(key)
     what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
     if detail["type"] == "literal_error":
         remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
@@ -347,7 +347,7 @@ def wrong(detail: ErrorDetails) -> str:
 
 
 def _unit(key: str, before: str = "") -> str:
-    """Return the unit of a key as written after its value, or nothing."""
+    """Return the unit of a key for the text after its value, or an empty text."""
     unit = _UNITS_OF_SIX.get(key) or unit_of(key)
     return f"{before} {unit}" if unit else ""
 
@@ -373,7 +373,7 @@ def _choice(words: tuple[str, ...]) -> str:
 
 
 def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong between values that are each in range."""
+    """Yield messages for contradictions between values that are in range."""
     absent = list(_sections(values))
     yield from absent
     if absent:
@@ -388,7 +388,7 @@ def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sections(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sections that the chosen devices lack, and those that none of them uses."""
+    """Yield messages for missing and for unused sections of the selected devices."""
     drive, sensor = values["devices.drive"], values["devices.sensor"]
     needed = {*WIRING.get(drive, ()), *WIRING.get(sensor, ())}
     present = {
@@ -401,7 +401,7 @@ def _sections(values: Mapping[str, Any]) -> Iterator[str]:
             f'section [{section}] is missing, which devices.drive = "{drive}" with '
             f'devices.sensor = "{sensor}" needs.'
         )
-    # Noise and offset of a rig that can also be simulated are welcome in any profile.
+    # Any profile may have the noise and offset of a simulated rig.
     for section in sorted(present - needed - {"simulation"}):
         yield (
             f'section [{section}] belongs to none of devices.drive = "{drive}" and '
@@ -485,7 +485,7 @@ def _serial(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _delays(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield delays that are shorter than what the protocol alone costs."""
+    """Yield messages for delays that are shorter than the delay of the protocol."""
     period_s = 1 / values["rig.rate_hz"]
     reply_s = period_s if values.get("acquisition.mode") == "previous_tick" else 0.0
     wrench_s, wrench_cause = reply_s, "the reply of the previous tick"

@@ -1,4 +1,4 @@
-"""Draft of a profile for a drive not yet connected: from its EDS and another profile."""
+"""Draft of a profile for a new drive, from its EDS file and another profile."""
 
 import math
 import os
@@ -27,12 +27,12 @@ _MOST_NAMED = 4
 
 
 class UnusableDriveError(FailureError, ValueError):
-    """A drive that no profile can make fit; the message names what it lacks."""
+    """The drive is unsuitable with any profile; the message names the missing features."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Setting that no EDS states and a profile needs."""
+    """Question about a required setting that no EDS file states."""
 
     key: str
     text: str
@@ -51,7 +51,7 @@ QUESTIONS = (
     Question("motor.inertia_kg_m2", "Inertia of motor and gear at the output shaft, kg·m²"),
     Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
 )
-"""Friction and delay are not asked for: rigd identify motor measures them."""
+"""Questions about the drive. Friction and delay are measured by rigd identify motor."""
 _OTHER = "The previous value was of another drive."
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
@@ -61,21 +61,21 @@ _OWN_WATCHDOG = Question(
 
 
 class Draft:
-    """A new profile on its way: what the EDS tells, and what is answered.
+    """Draft of a new profile, from the EDS file and the answers of the operator.
 
     Parameters
     ----------
     base
-        The profile whose text and other values it takes.
+        Profile with the initial text and values.
     eds
-        What the drive's file tells.
+        Content of the drive's EDS file.
     path
         Path of the file to write.
 
     Raises
     ------
     UnusableDriveError
-        If no profile makes this drive fit.
+        If the drive is unsuitable with any profile.
     ProfileError
         If the profile to start from has no CiA 402 drive.
     """
@@ -97,14 +97,14 @@ class Draft:
         self._path = path
         self._findings = judgement.findings
         self._accepted: list[str] = []
-        self._settings = {setting.key: setting for setting in self._told()}
-        # The motor, gear and encoder of the profile started from are others: no number of theirs.
+        self._settings = {setting.key: setting for setting in self._eds_settings()}
+        # The base profile has another motor, gear and encoder: none of their values is used.
         for question in self.questions():
             if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
                 self._settings[question.key] = Setting(question.key, math.nan, UNKNOWN)
 
     def _value(self, key: str) -> SettingValue:
-        """Return the value that a key has so far."""
+        """Return the present value of a key."""
         if key in self._settings:
             return self._settings[key].value
         section, _, name = key.rpartition(".")
@@ -113,19 +113,19 @@ class Draft:
         return value
 
     def answer(self, key: str, text: str) -> None:
-        """Take an answer, of the operator from a data sheet.
+        """Set the value of a key from an answer of the operator.
 
         Parameters
         ----------
         key
             Dotted key of the profile.
         text
-            What was typed; ``unknown`` leaves the value to be filled in where that is possible.
+            The answer. With ``unknown`` the value remains to be filled in, if this is possible.
 
         Raises
         ------
         ValueError
-            If the key does not take it; the message says what it takes.
+            If the value is invalid; the message states the valid values.
         """
         if text == UNKNOWN and key in MAY_BE_UNKNOWN:
             self._settings[key] = Setting(key, math.nan, UNKNOWN)
@@ -139,7 +139,7 @@ class Draft:
             self._settings[key] = Setting(key, value, "datasheet")
 
     def shown(self, key: str) -> str:
-        """Return the value that a key has so far as text, or ``unknown``.
+        """Return the present value of a key as text, or ``unknown``.
 
         Parameters
         ----------
@@ -152,12 +152,12 @@ class Draft:
         return key in self._settings and self._settings[key].source == UNKNOWN
 
     def unaccepted(self) -> list[Finding]:
-        """Return what the drive lacks and the profile does not accept, so that rigd refuses it.
+        """Return the missing features of the drive that the profile does not accept.
 
         Raises
         ------
         ProfileError
-            If the values given so far contradict one another.
+            If the present values contradict one another.
         """
         accepted = Setting(_ACCEPT, tuple(self._accepted))
         text = with_settings(self._base.text, [*self._settings.values(), accepted])
@@ -165,7 +165,7 @@ class Draft:
         return [each for each in found if each.accept and each.grade is Grade.REFUSED]
 
     def accept(self, name: str) -> None:
-        """Have the profile accept that something is missing: the operator's decision, never ours.
+        """Accept a missing feature in the profile, by decision of the operator.
 
         Parameters
         ----------
@@ -176,10 +176,10 @@ class Draft:
 
     @property
     def doubts(self) -> list[str]:
-        """Remarks on this drive for the operator, in sentences."""
+        """Return remarks on this drive for the operator, in sentences."""
         findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
-        told = [f.sentence for f in findings if f.sentence]
-        return told + [
+        remarks = [f.sentence for f in findings if f.sentence]
+        return remarks + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
             "rigd check asks the drive."
             for f in findings
@@ -187,13 +187,13 @@ class Draft:
         ]
 
     def questions(self) -> list[Question]:
-        """Return what has to be asked for this drive."""
+        """Return the questions about this drive."""
         more = (_OWN_WATCHDOG,) if WATCHDOG in self._lacks() else ()
         absent = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
         return [each for each in (*QUESTIONS, *more) if each.key not in absent]
 
     def unanswered(self) -> list[Question]:
-        """Return the questions without an answer: unknown, or as in the profile started from."""
+        """Return the questions without an answer: unknown, or as in the base profile."""
         answered = {
             key
             for key, setting in self._settings.items()
@@ -227,7 +227,7 @@ class Draft:
         return with_settings(self._base.text, settings)
 
     def _acceptance(self) -> Iterator[Setting]:
-        """Yield what the operator accepts; what is undecided is written as a comment."""
+        """Yield the acceptances of the operator; undecided ones are written as a comment."""
         left = [finding.accept for finding in self.unaccepted()]
         own = self._own_limits() if TORQUE_LIMIT in (*left, *self._accepted) else ""
         hint = (
@@ -248,20 +248,22 @@ class Draft:
             yield Setting(_ACCEPT, (), reason="The drive has, by its file, all that is needed.")
 
     def _lacks(self) -> list[str]:
-        """Return the names of what a profile has to accept that this drive has not."""
+        """Return the names of the missing features that a profile must accept."""
         return [finding.accept for finding in self._findings if finding.accept]
 
-    def _told(self) -> Iterator[Setting]:
-        """Yield what the file tells, and what follows from what the drive lacks."""
+    def _eds_settings(self) -> Iterator[Setting]:
+        """Yield the settings from the EDS file and those that follow from missing features."""
         eds, path = self._eds, self._path
         product = " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
         yield Setting("name", path.stem)
         yield Setting("description", f"{product}, from {eds.path.name}")
-        place = os.path.relpath(eds.path.resolve(), path.resolve().parent)
-        yield Setting("cia402.eds", place, reason="The file of the drive, from this folder on.")
-        for key, told in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
-            if told:
-                yield Setting(f"cia402.{key}", told, "datasheet", hexadecimal=True)
+        relative_path = os.path.relpath(eds.path.resolve(), path.resolve().parent)
+        yield Setting(
+            "cia402.eds", relative_path, reason="The file of the drive, from this folder on."
+        )
+        for key, number in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
+            if number:
+                yield Setting(f"cia402.{key}", number, "datasheet", hexadecimal=True)
         if eds.commissioned_node_id:
             why = "The node id for which the file configures the drive."
             yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", why)
@@ -273,7 +275,7 @@ class Draft:
         yield from self._absent()
 
     def _of_the_other_drive(self) -> Iterator[Setting]:
-        """Yield what the profile started from says of its own drive alone, taken away."""
+        """Yield the removal of settings that are specific to the drive of the base profile."""
         drive = self._base.rig.cia402
         assert drive is not None
         if drive.set_objects:
@@ -300,7 +302,7 @@ class Draft:
                 yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
 
     def _own_limits(self) -> str:
-        """Name manufacturer-specific objects that may limit the torque."""
+        """Return the manufacturer-specific objects that may limit the torque."""
         found = [
             f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
             for e in self._eds.entries.values()

@@ -1,11 +1,10 @@
-"""A rig's profile: one TOML file, read and validated into frozen dataclasses.
+"""Loader of profiles: reads a TOML file and validates it into frozen dataclasses.
 
-Every number stands as ``{ value = 2.0e-3, source = "assumed" }``, with its unit in the key, so
-that an assumed number is not mistaken for a measured one. Ranges are declared where the number is
-used (``annotated_types`` on the dataclasses) and enforced here. All problems of a file are
-reported at once.
+Every number has the form ``{ value = 2.0e-3, source = "assumed" }``, with its unit in the key, so
+that assumed and measured numbers are distinguishable. The dataclasses declare the ranges with
+``annotated_types``; this module enforces them. All problems of a file are reported at once.
 
-A number that nobody knows yet is ``{ source = "unknown" }``, without a value.
+An unknown number has the form ``{ source = "unknown" }``, without a value.
 """
 
 import math
@@ -22,7 +21,7 @@ from rigd.devices.parameters import RigParameters
 from rigd.documents import DocumentError
 from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
-from rigd.profile._places import profile_files
+from rigd.profile._locations import profile_files
 from rigd.profile._schema import (
     OPTIONAL_SECTIONS,
     SECTIONS,
@@ -37,7 +36,7 @@ from rigd.profile._schema import (
 
 
 class ProfileError(UserError, ValueError):
-    """A profile cannot be used; the message has one line a problem, each with its remedy."""
+    """A profile cannot be used; the message has a line with the remedy for each problem."""
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
@@ -46,9 +45,9 @@ def load_profile(name_or_path: str | Path) -> Profile:
     Parameters
     ----------
     name_or_path
-        The path of a file, or the name of one without its ``.toml``, looked for in ``hw_profiles``
-        of the working folder, then in the user's own folder (``$XDG_CONFIG_HOME/rigd/profiles``),
-        then among the shipped ones.
+        Path of a file, or file name without ``.toml``. The name is searched in ``hw_profiles`` of
+        the working folder, then in the user's own folder (``$XDG_CONFIG_HOME/rigd/profiles``), then
+        among the shipped profiles.
 
     Returns
     -------
@@ -57,8 +56,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
     Raises
     ------
     ProfileError
-        If there is no such file, or anything in it is wrong; every problem is named with its
-        key, value, unit and remedy.
+        If there is no such file, or it has mistakes. Every problem is reported with its key, value,
+        unit and remedy.
 
     Examples
     --------
@@ -86,7 +85,7 @@ def read_text(path: Path) -> str:
 
 
 def profile_of(text: str, path: Path) -> Profile:
-    """Validate the text of a profile; `path` is the file that it stands in, or is to stand in.
+    """Return the validated profile of a text; `path` is its present or future file.
 
     Raises
     ------
@@ -149,7 +148,7 @@ def parse(text: str, path: Path) -> dict[str, Any]:
     Raises
     ------
     ProfileError
-        If it is none.
+        If the text is not valid TOML.
     """
     try:
         return documents.parse_toml(text)
@@ -158,8 +157,8 @@ def parse(text: str, path: Path) -> dict[str, Any]:
 
 
 def complaint(path: Path, problems: Iterable[str]) -> ProfileError:
-    """Return the error with one line a problem of a file."""
-    # An array that is too short is found once for each number it lacks.
+    """Return the error for a file, with one line for each problem."""
+    # An array that is too short has one error for each missing number.
     return ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
 
 
@@ -181,7 +180,7 @@ def _find(name_or_path: str | Path) -> Path:
 
 
 def known_profiles() -> list[str]:
-    """Return the names of the profiles of this folder, of the user, and of those shipped."""
+    """Return the names of all profiles: of the working folder, of the user, and shipped ones."""
     return list(profile_files())
 
 
@@ -191,7 +190,7 @@ def _known_profiles() -> str:
 
 
 def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
-    """Make the path of the drive's EDS file a whole one; complain where there is no such file."""
+    """Make the path of the drive's EDS file absolute; yield a message if the file is missing."""
     given = values.get("cia402.eds")
     if not given:
         return
@@ -207,7 +206,7 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
 def flatten(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Take the document apart into dotted keys, and the sources off the numbers."""
+    """Flatten the document into dotted keys, and separate the sources from the numbers."""
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for key, entry in _entries(document, ""):
@@ -236,12 +235,12 @@ def flatten(
 
 
 def _is_number(key: str) -> bool:
-    """Whether a key takes a number, or six; unknown keys take nothing."""
+    """Return whether the value of a key is a number or six numbers; False for unknown keys."""
     return key in keys() and is_number(keys()[key])
 
 
 def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys; a table that is not a known section and has a value is a number."""
+    """Yield dotted keys with their entries; a table with a value outside a section is a number."""
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (
@@ -258,20 +257,20 @@ def validate(
     absent: frozenset[str],
     unknown: frozenset[str] = frozenset(),
 ) -> dict[str, Any]:
-    """Check types and ranges; returns the values as their dataclasses take them.
+    """Check types and ranges, and return the values for the dataclasses.
 
     Parameters
     ----------
     values
         Values by their dotted keys.
     problems
-        Gets a sentence for each of them.
+        List to which a message for each problem is appended.
     absent
-        Sections that the file does without; the top, with its texts, is an empty name.
+        Sections that the file omits; the top level has an empty name.
     unknown
-        Keys without a value: NaN, which is not checked.
+        Keys without a value; their NaN is not checked.
     """
-    # TOML knows only arrays, and strict validation wants tuples.
+    # TOML has only arrays, and strict validation requires tuples.
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
         known = {key: value for key, value in given.items() if key not in unknown}
@@ -293,7 +292,7 @@ def validate(
 
 @cache
 def _schema(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
-    """One flat model for all keys: building one a section takes longer than all the rest."""
+    """Return one flat model for all keys; one model for each section would be slow to build."""
     definitions: dict[str, Any] = {
         f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
         for index, (key, annotation) in enumerate(keys().items())

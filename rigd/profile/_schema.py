@@ -1,4 +1,4 @@
-"""Schema of a profile: its sections, and the settings that no other module declares."""
+"""Schema of a profile: its sections, and settings that no other module declares."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -32,33 +32,33 @@ from rigd.safety.limits import Limits
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """Settings around a record: taring before it, the way back and the check after it."""
+    """Settings before and after a record: tare, return and final check."""
 
     tare_s: Annotated[float, Ge(0.5), Le(60)]
-    """Time at rest over which the sensor is averaged."""
+    """Averaging time of the sensor at rest."""
     rest_velocity_rad_s: Annotated[float, Gt(0)]
-    """Mean speed over the tare up to which the rig counts as resting."""
+    """Largest mean speed during the tare of a rig at rest."""
     rest_torque_nm: Annotated[float, Gt(0)]
-    """Standard deviation of the coupling torque over the tare up to which the beam counts as
-    resting; more than the sensor's noise alone."""
+    """Largest standard deviation of the coupling torque during the tare of a beam at rest; above
+    the noise of the sensor."""
     rest_timeout_s: Annotated[float, Ge(0), Le(3600)]
-    """How long a session waits for rest before it refuses to start."""
+    """Longest wait for rest before a session refuses to start."""
     tare_drift_nm: Annotated[float, Gt(0)]
-    """Change of the coupling torque's zero over a session above which a warning is given."""
+    """Drift of the coupling torque's zero during a session above which a warning is given."""
     return_s: Annotated[float, Gt(0), Le(60)]
-    """Time of the smooth return to the start angle."""
+    """Duration of the smooth return to the start angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
-    """What the processes of a rig ask of the operating system, where it is granted."""
+    """Real-time settings that the processes of a rig request from the operating system."""
 
     priority: Annotated[int, Ge(0), Le(99)]
-    """SCHED_FIFO priority of the control process; 0 leaves all to the ordinary scheduler."""
+    """SCHED_FIFO priority of the control process; 0: ordinary scheduling."""
     cpu: Annotated[int, Ge(-1)]
-    """Core the process is bound to; -1 takes the last one it may use."""
+    """Core of the control process; -1: the last permitted core."""
     spin_us: Annotated[float, Ge(0), Le(200)]
-    """Last part of each wait that is spent polling the clock instead of sleeping."""
+    """Last part of each wait, spent polling the clock instead of sleeping."""
     late_us: Annotated[float, Gt(0)]
     """Lateness above which a tick is flagged as late."""
 
@@ -66,8 +66,8 @@ class RealtimeSettings:
     def supervision_priority(self) -> int:
         """SCHED_RR priority of supervisor and recorder: a quarter of the loop's.
 
-        That is before every ordinary program, and behind the loop and the kernel's own threads (50
-        for interrupts on a real-time kernel).
+        This is above every ordinary program, and below the loop and the kernel threads (50 for
+        interrupts on a real-time kernel).
         """
         return self.priority // 4
 
@@ -77,20 +77,21 @@ _RelativePercent = Annotated[float, Ge(0), Le(50)]
 
 @dataclass(frozen=True, slots=True)
 class ScaleUncertainty:
-    """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
+    """Relative standard uncertainties (k = 1) that are common to all sessions of a rig.
 
-    They do not average out, and no session shows them: an analysis adds them to its statistical
-    intervals. Zero: not stated, except for the uniformity, where zero is a uniform beam.
+    They do not average out and are not observable in a session, so an analysis adds them to its
+    statistical intervals. Zero means not stated, except for the uniformity, where it means a
+    uniform beam.
     """
 
     torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Scale of the torque over the angle: calibration and mounting of the sensor."""
+    """Scale of the torque relative to the angle: calibration and mounting of the sensor."""
     length_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
     """Length of the beam."""
     density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Mass per length of the beam, such as from weighing it."""
+    """Mass per length of the beam, for example from weighing."""
     tip_mass_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Mass at the tip of the beam: the balance."""
+    """Mass at the tip of the beam, from the balance."""
     uniformity_percent: Annotated[float, Ge(0), Le(10)] = field(default=0.1, metadata=OPTIONAL)
     """Frequency of each mode relative to that of a uniform beam."""
 
@@ -109,7 +110,7 @@ class MetadataSettings:
     """Metadata of the sessions."""
 
     required: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """Names of what a session must be given: metadata, ``operator``, ``specimen`` or ``note``."""
+    """Required metadata of each session: their names, ``operator``, ``specimen`` or ``note``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,7 @@ class RigSection:
     """Settings of the rig as a whole."""
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
-    """Slower loops check the other processes too seldom."""
+    """Rate of the loop; slower loops would check the other processes too seldom."""
     axis_tilt_deg: Annotated[float, Ge(-90), Le(90)] | None = field(default=None, metadata=OPTIONAL)
     """Inclination of the plane of motion along the beam at rest, positive where the tip is lower
     than the motor's axis: gravity acts along the beam with its sine; None: not measured."""
@@ -125,7 +126,7 @@ class RigSection:
 
 @dataclass(frozen=True, slots=True)
 class BeamSection(Beam):
-    """Section of the beam: the uniform beam, and what was weighed at its tip."""
+    """Section of the beam: the uniform beam and the mass at its tip."""
 
     tip_mass_kg: Annotated[float, Ge(0)] | None = field(default=None, metadata=OPTIONAL)
     """Point mass at the tip; None: not known."""
@@ -164,19 +165,19 @@ WIRING = {
     "ati_serial": ("acquisition", "ati_serial"),
     "sim": ("simulation",),
 }
-"""The sections that a device of ``[devices]`` needs and that no other rig needs to have."""
+"""Sections that are required only by certain devices of ``[devices]``."""
 OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for names in WIRING.values() for name in names))
 TEXTS = ("name", "description")
 SOURCES = ("paper", "datasheet", "measured", "assumed")
 UNKNOWN = "unknown"
-"""Source of what has no value yet: in the parameters it is NaN (see `MAY_BE_UNKNOWN`)."""
+"""Source of a number without a value, which is NaN in the parameters (see `MAY_BE_UNKNOWN`)."""
 
 
 @cache
 def keys() -> dict[str, Any]:
-    """Every key of a profile, dotted, and the annotated type of its value.
+    """Return all dotted keys of a profile with the annotated types of their values.
 
-    A profile must have them all but those of :func:`defaults`.
+    A profile must have all keys except those of :func:`defaults`.
     """
     types: dict[str, Any] = dict.fromkeys(TEXTS, Annotated[str, MinLen(1)])
     for section, cls in SECTIONS.items():
@@ -187,10 +188,10 @@ def keys() -> dict[str, Any]:
 
 @cache
 def defaults() -> dict[str, Any]:
-    """Keys that a profile may leave out, and what holds then.
+    """Return the optional keys of a profile with their default values.
 
-    Other defaults of the dataclasses do not count: a delay that nobody states is not known to be
-    zero.
+    Other defaults of the dataclasses are not used: for example, a delay that is not stated is
+    unknown and not zero.
     """
     return {
         f"{section}.{each.name}": each.default
@@ -201,7 +202,7 @@ def defaults() -> dict[str, Any]:
 
 
 def is_number(annotation: Any) -> bool:  # noqa: ANN401
-    """Whether a key of this type takes a number, or six, which have a source; no text has one."""
+    """Return whether a value of this type is a number or six numbers, which need a source."""
     if get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) is tuple:
@@ -210,87 +211,87 @@ def is_number(annotation: Any) -> bool:  # noqa: ANN401
 
 
 def fields_of(section: str) -> list[tuple[str, str]]:
-    """Pairs of dotted key and field of a section's dataclass."""
-    # A trailing underscore only keeps a field's name off a Python keyword.
+    """Return pairs of dotted key and field of a section's dataclass."""
+    # A trailing underscore distinguishes the name of a field from a Python keyword.
     names = [field.name for field in fields(SECTIONS[section])]
     return [(f"{section}.{name.rstrip('_')}", name) for name in names]
 
 
 @dataclass(frozen=True, slots=True)
 class Specimen:
-    """One specimen, as its own file describes it."""
+    """A specimen with its own file."""
 
     name: str
-    """Name of the file without ``.toml``, by which sessions name the specimen."""
+    """File name without ``.toml``, which is the name of the specimen in sessions."""
     path: Path
     """The file."""
     text: str
-    """The file as read, for the session that uses it."""
+    """Content of the file."""
     beam: Beam
-    """Its beam."""
+    """Beam of the specimen."""
     damping: Damping | None
-    """Its nominal damping; None: that of the profile."""
+    """Nominal damping; None: that of the profile."""
     uncertainty: ScaleUncertainty
-    """How well its length and density are known; the torque's scale is the rig's."""
+    """Uncertainties of length and density; that of the torque scale belongs to the rig."""
     note: str
-    """Whatever else is to be known of it."""
+    """Free text."""
     tip_mass_kg: float | None = None
-    """Point mass at its tip; None: not known."""
+    """Point mass at the tip; None: not known."""
 
 
 _BREAKAWAY = 5.0
-"""Breakaway torque over the Coulomb friction stated: a cold gear has several times its friction."""
+"""Assumed ratio of breakaway torque to the stated Coulomb friction, for a cold gear."""
 _LEAST_BREAKAWAY = 0.05
-"""The least of it, as a fraction of the peak torque."""
+"""Smallest breakaway torque, as a fraction of the peak torque."""
 
 
 class UnknownValueError(UserError):
-    """A profile states values as unknown without which nothing can be computed or moved."""
+    """The profile states a required value as unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One rig, as its profile describes it."""
+    """Validated profile of a rig."""
 
     name: str
     """Name of the rig."""
     description: str
-    """One line on it."""
+    """Description in one line."""
     path: Path
     """The file."""
     text: str
-    """The file as read, for the session that uses it."""
+    """Content of the file."""
     rig: RigParameters
-    """Parameters that its drivers need."""
+    """Parameters of the rig and its drivers."""
     control: ControlSettings
     """Settings of the controller."""
     limits: Limits
-    """Levels that end a session."""
+    """Limits that end a session."""
     session: SessionSettings
-    """Settings around a record."""
+    """Settings before and after a record."""
     realtime: RealtimeSettings
-    """What its processes ask of the operating system."""
+    """Real-time settings of the processes."""
     metadata: MetadataSettings
-    """What its sessions must be given."""
+    """Required metadata of the sessions."""
     uncertainty: ScaleUncertainty
-    """How well the scales are known that no session shows."""
+    """Uncertainties of the scales that are not observable in a session."""
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None
-    """The motor that the controller is designed for, where that is not the profile's."""
+    """Motor for the design of the controller, if it differs from that of the rig."""
     tip_mass_kg: float | None = None
-    """Point mass at the beam's tip, as weighed; None: not known."""
+    """Measured point mass at the tip of the beam; None: not known."""
     axis_tilt_deg: float | None = None
     """Inclination of the plane of motion along the beam at rest, positive where the tip is lower;
     None: not measured."""
     specimen: Specimen | None = None
-    """Specimen that is mounted, where a file describes it: the rig's beam is its own then."""
+    """Mounted specimen with its own file, whose beam is then that of the rig; else None."""
     specimen_in_words: str = ""
-    """The same for the operator, with what is otherwise than the profile has it."""
+    """Description of the specimen and its differences from the profile, for the operator."""
 
     @property
     def standstill_torque_nm(self) -> float:
-        """Net torque that no friction of the shaft withstands."""
+        """Net torque above the largest friction of the shaft."""
         motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
         return stated_nm or max(
             _BREAKAWAY * motor.coulomb_nm, _LEAST_BREAKAWAY * motor.peak_torque_nm
@@ -298,16 +299,16 @@ class Profile:
 
     @property
     def control_motor(self) -> Motor:
-        """The motor as the controller takes it."""
+        """Motor for the design of the controller."""
         return self.design_motor or self.rig.motor
 
     def loop_model(self) -> LoopModel:
-        """Return what the closed loop's design and prediction need to know of this rig.
+        """Return the loop model of this rig, for the design and prediction of the closed loop.
 
         Raises
         ------
         UnknownValueError
-            If a value of the profile is unknown: each is named, with the place to find it.
+            If values of the profile are unknown: names each one and where to find it.
         """
         rig = self.rig
         if unknown := describe_unknown_values(rig):

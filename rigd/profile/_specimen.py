@@ -1,4 +1,4 @@
-"""Specimens in their own files: ``specimens/NAME.toml``, with the beam as a profile has it."""
+"""Specimens in their own files ``specimens/NAME.toml``, with the beam section of a profile."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -8,7 +8,7 @@ from rigd.beam import Beam, Damping
 from rigd.devices import WhatMoves, reality
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
-from rigd.profile._places import specimen_files
+from rigd.profile._locations import specimen_files
 from rigd.profile._schema import (
     SECTIONS,
     BeamSection,
@@ -25,14 +25,14 @@ _UNCERTAINTY: Final = "uncertainty"
 _OF_THE_RIG: Final = "uncertainty.torque_scale_percent"
 _NOTE: Final = "note"
 _MOST_BYTES: Final = 16_384
-"""Longest file: it goes with each session through a pipe to the recorder."""
+"""Largest file; each session sends it through a pipe to the recorder."""
 
 
 def load_specimen(path: Path) -> Specimen:
     """Read and validate the file of a specimen.
 
-    It has the section ``[beam]`` of a profile and may have ``[beam.damping]``, of ``[uncertainty]``
-    what concerns the beam, and a text ``note``.
+    The file has the section ``[beam]`` of a profile. It may have ``[beam.damping]``, the keys of
+    the beam in ``[uncertainty]``, and a text ``note``.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ def load_specimen(path: Path) -> Specimen:
     Raises
     ------
     ProfileError
-        If it cannot be read, or anything in it is wrong; every problem is named with its key,
-        value, unit and remedy.
+        If the file cannot be read or has mistakes. Every problem is reported with its key, value,
+        unit and remedy.
     """
     text = read_text(path)
     if len(text.encode()) > _MOST_BYTES:
@@ -82,15 +82,15 @@ def load_specimen(path: Path) -> Specimen:
 
 
 def with_specimen(profile: Profile, name: str) -> Profile:
-    """Mount a specimen on a rig: its beam takes the place of the profile's.
+    """Return a profile with a mounted specimen, whose beam replaces that of the profile.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     name
-        What a session names its specimen. Without a file of that name it is only a label, and the
-        profile stays as it is.
+        Name of the specimen in a session. Without a file of that name it is only a label, and the
+        profile is unchanged.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Writing of a profile in the text of another: new values, each with its source and its reason."""
+"""Writing of a profile from the text of another, with new values, sources and comments."""
 
 import json
 import re
@@ -17,30 +17,30 @@ _WIDTH = 100
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """The value of a key of a profile."""
+    """New value of a key of a profile."""
 
     key: str
-    """Dotted: ``cia402.node_id``."""
+    """Dotted key, such as ``cia402.node_id``."""
     value: SettingValue
     source: str = "assumed"
-    """One of the words that a profile knows; only numbers have one. Unknown: without the value."""
+    """Source of a number, as in a profile. With "unknown" no value is written."""
     reason: str = ""
-    """Becomes a comment above the value."""
+    """Text of a comment above the value."""
     hexadecimal: bool = False
     commented: bool = False
-    """Stands as a comment only, for somebody to decide on; the key keeps its default."""
+    """Write the setting as a comment only, for a later decision; the key has its default."""
 
 
 def with_settings(text: str, settings: Iterable[Setting]) -> str:
-    """Return the text of a profile with other values; all comments stay.
+    """Return the text of a profile with new values and unchanged comments.
 
     Parameters
     ----------
     text
         Text of a valid profile.
     settings
-        What is to stand in it. A key that it has left out takes the place of the comment that
-        shows it, or comes first in its section.
+        New values. A missing key replaces the comment that shows it, or becomes the first key of
+        its section.
 
     Raises
     ------
@@ -49,15 +49,15 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     """
     lines = text.splitlines()
     for setting in settings:
-        places = _places(lines)
+        indices = _line_indices(lines)
         line = _line(setting)
         new = [*_comment(setting.reason), f"# {line}" if setting.commented else line]
-        if setting.key in places:
-            place = places[setting.key]
-            lines[place : place + 1] = new
+        if setting.key in indices:
+            index = indices[setting.key]
+            lines[index : index + 1] = new
         else:
-            place = places[setting.key.rpartition(".")[0]] + 1
-            lines[place:place] = new
+            index = indices[setting.key.rpartition(".")[0]] + 1
+            lines[index:index] = new
     return "\n".join(lines) + "\n"
 
 
@@ -74,12 +74,12 @@ def with_head(text: str, head: Sequence[str]) -> str:
 
 
 def check_new(path: Path) -> None:
-    """Refuse a path for a new profile under which none could be written, or found again.
+    """Raise if a new profile could not be written to a path, or not be found by its name.
 
     Raises
     ------
     ProfileError
-        If there is a file, no folder for it, or its name is not a profile's.
+        If the file exists, its folder does not exist, or the name is invalid for a profile.
     """
     if path.suffix != ".toml":
         raise ProfileError(f"{path}: the name of a profile ends in .toml.")
@@ -90,19 +90,19 @@ def check_new(path: Path) -> None:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that does not exist yet.
+    """Write a new file.
 
     Parameters
     ----------
     path
         The new file.
     text
-        Its text.
+        Text of the file.
 
     Raises
     ------
     ProfileError
-        If there is one, or it cannot be written.
+        If the file exists or cannot be written.
     """
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -114,22 +114,21 @@ def write_new(path: Path, text: str) -> None:
 
 
 def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
-    """Write a profile to a file that does not exist yet, in a folder that is made if need be.
+    """Write a copy of a profile to a new file; create its folder if necessary.
 
     Parameters
     ----------
     profile
-        What is copied, with all its comments. Where it names the drive's EDS file, that is named
-        by its whole path in the copy, whose folder is another one.
+        Profile to copy, with all comments. The path of the drive's EDS file becomes absolute.
     path
-        Name in the copy.
+        Path of the copy.
     name
-        What the profile calls itself in the copy; None: as before.
+        Name of the rig in the copy; None: unchanged.
 
     Raises
     ------
     ProfileError
-        If there is such a file, it cannot be written, or the name is not a profile's.
+        If the file exists or cannot be written, or the name is invalid for a profile.
     """
     settings = [] if name is None else [Setting("name", name)]
     drive = profile.rig.cia402
@@ -157,34 +156,34 @@ def _taken(path: Path) -> ProfileError:
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
-def _places(lines: Sequence[str]) -> dict[str, int]:
-    """Return the number of the line on which each section and each key of a profile stands.
+def _line_indices(lines: Sequence[str]) -> dict[str, int]:
+    """Return the line index of each section and key of a profile.
 
-    A key that stands in a comment only has the comment's place.
+    A key that occurs only in a comment has the index of the comment.
     """
-    places: dict[str, int] = {}
+    indices: dict[str, int] = {}
     shown: dict[str, int] = {}
     section = ""
-    for place, line in enumerate(lines):
+    for index, line in enumerate(lines):
         if title := re.match(r"\[([^\]]+)\]", line):
-            places[title[1]] = place
+            indices[title[1]] = index
             section = title[1] + "."
         elif key := re.match(r"(\w+)\s*=", line):
-            places[section + key[1]] = place
+            indices[section + key[1]] = index
         elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in keys():
-            shown[section + key[1]] = place
-    return shown | places
+            shown[section + key[1]] = index
+    return shown | indices
 
 
 def _comment(text: str) -> list[str]:
-    """Return a text as lines of comment."""
+    """Return a text as comment lines."""
     return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
 def _line(setting: Setting) -> str:
     name = setting.key.rpartition(".")[2]
     value = setting.value
-    # What JSON makes of texts and truth, TOML reads.
+    # Texts and booleans have the same syntax in JSON and TOML.
     shown = json.dumps(value, ensure_ascii=False)
     if not is_number(keys()[setting.key]):
         return f"{name} = {shown}"

@@ -1,12 +1,13 @@
-"""The supervisor: plans sessions, starts the processes of a rig, has them run, and ends them.
+"""The supervisor: plans sessions and starts, watches and ends the processes of a rig.
 
-Offers the processes (`ProcessGroup`), the rig on which sessions are run (`Rig`), sessions that
-follow each other (`Series`), those in the foreground (`run_in_foreground`) and what a terminal
-shows of them (`plan_lines`, `ProgressLine`, `result_line`). The public modules are what a session
-will do (`planning`), its request and its file (`request`), one session and its result (`session`),
-the quick looks that follow (`quick_looks`), and what is seen of a running one (`status`,
-`signal_blocks`). Nothing is moved here: a dead or hung process is noticed in `session`, which asks
-the control process to stop; that switches the torque off (`rigd.engine.control_process`).
+The package offers the process group (`ProcessGroup`), the rig (`Rig`), series of sessions
+(`Series`), sessions in the foreground (`run_in_foreground`) and their text on a terminal
+(`plan_lines`, `ProgressLine`, `result_line`). The public modules are the prediction of a session
+(`planning`), its request and its file (`request`), one session and its result (`session`), the
+quick looks after a session (`quick_looks`), and the status and signals of a running session
+(`status`, `signal_blocks`). The supervisor moves nothing itself. `session` detects a dead or hung
+process and requests a stop from the control process, which switches the torque off
+(`rigd.engine.control_process`).
 """
 
 import lazy_loader as lazy

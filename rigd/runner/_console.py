@@ -1,7 +1,7 @@
-"""What a terminal shows of sessions: their plan, their progress, and how they ended.
+"""Text of sessions on a terminal: plan, progress and result.
 
-`rigd run` and `rigd start` show the same. Plans and results are taken as JSON documents have them,
-for `rigd start` gets them from the daemon.
+`rigd run` and `rigd start` show the same text. Plans and results are JSON documents, because
+`rigd start` receives them from the daemon.
 """
 
 import contextlib
@@ -15,19 +15,19 @@ from rigd.printable import counts_text, progress_bar
 from rigd.session.touches import touch_line
 
 _REDRAWN_S: Final = 0.05
-"""Shortest time after which progress alone has the line drawn anew: 2 ms of a processor."""
+"""Shortest time between two updates of the line; each costs 2 ms of processor time."""
 _PATIENCE_S: Final = 2.0
-"""Longest wait for a terminal that was stopped, at the end of a session."""
+"""Longest wait for a suspended terminal at the end of a session."""
 
 
 def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
-    """Say what a session is predicted to do.
+    """Return the lines that describe the predicted session.
 
     Parameters
     ----------
     plan
-        As in the reply to ``start``. A daemon of before an update leaves some of it out: to fail
-        here would leave its session without Ctrl-C.
+        The plan as in the reply to ``start``. An older daemon omits some keys; an error here would
+        leave its session without Ctrl-C.
     """
     limits = plan.get("limits", {})
 
@@ -51,12 +51,12 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
 
 
 def result_line(session: Mapping[str, Any]) -> str:
-    """Say how a session ended.
+    """Return one line that states how a session ended.
 
     Parameters
     ----------
     session
-        As :meth:`rigd.runner.session.SessionResult.as_dict` gives it.
+        The result as :meth:`rigd.runner.session.SessionResult.as_dict` returns it.
     """
     outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
@@ -69,10 +69,10 @@ def result_line(session: Mapping[str, Any]) -> str:
 
 
 class ProgressLine:
-    """One line on standard error that says how far a session is, and messages above it.
+    """Progress line on standard error, with messages above it.
 
-    It is written by a separate thread: a terminal that was stopped (Ctrl-S), or a pipe that
-    nobody reads, must not keep the supervisor from its session.
+    A separate thread writes the line: a suspended terminal (Ctrl-S) or a pipe without a reader must
+    not block the supervisor.
     """
 
     def __init__(self) -> None:
@@ -93,20 +93,20 @@ class ProgressLine:
     def update(
         self, phase: Phase, tick: int, total: int, *, missed: int, late: int, number: str = ""
     ) -> None:
-        """Show how far the session is.
+        """Update the progress of the session.
 
         Parameters
         ----------
         phase
-            What the control process is doing.
+            Phase of the control process.
         tick, total
-            Number of ticks scheduled so far, and of all ticks of the record.
+            Number of ticks scheduled so far, and total number of ticks of the record.
         missed, late
-            Number of missed and of late ticks so far; shown once a tick is missed.
+            Number of missed ticks and of late ticks so far. Both are shown once a tick is missed.
         number
-            Number of the session in its series, such as ``2/5``; empty if it is the only one.
+            Number of the session in its series, such as ``2/5``; empty for a single session.
         """
-        # Before tick 0 the count is the last session's.
+        # Before tick 0 the count is that of the previous session.
         self._recorded |= phase is Phase.RUNNING
         self._state = {
             "description": f"{phase.words} {number}".rstrip(),
@@ -126,7 +126,7 @@ class ProgressLine:
         self._changed.set()
 
     def close(self) -> None:
-        """Take the line away, once all is written or the terminal takes nothing for a while."""
+        """Remove the line after all messages are written, or after a timeout."""
         self._closed = True
         self._changed.set()
         self._thread.join(_PATIENCE_S)
@@ -136,12 +136,12 @@ class ProgressLine:
         while not closed:
             self._changed.wait()
             self._changed.clear()
-            closed = self._closed  # looked at first: what was said before is still written
+            closed = self._closed  # read first, so that all earlier messages are still written
             with self._lock:
                 messages, self._messages = self._messages, []
             with contextlib.suppress(OSError):  # the terminal is gone; the session is not
                 self._show(messages)
-        if self._progress.live.is_started:  # otherwise it would only leave an empty line
+        if self._progress.live.is_started:  # otherwise stopping only prints an empty line
             with contextlib.suppress(OSError):
                 self._progress.stop()
 

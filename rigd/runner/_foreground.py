@@ -1,4 +1,4 @@
-"""Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
+"""Sessions in the foreground: plan them, show their progress, and print their results."""
 
 import contextlib
 import time
@@ -25,30 +25,30 @@ from rigd.runner.request import load_rig, what_is_kept
 from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
 from rigd.runtime import RigLock, StopRequest
 
-_LOOK_PATIENCE_S: Final = 10.0
-"""Longest wait for the last quick look at the end, without the time for which it waits for a
-processor that other programs use."""
-_LOOK_LONGEST_S: Final = 120.0
-"""Longest wait for it in all."""
+_QUICK_LOOK_PATIENCE_S: Final = 10.0
+"""Longest run time of the last quick look after the end, without the time in which other programs
+use the processor."""
+_LONGEST_QUICK_LOOK_S: Final = 120.0
+"""Longest total wait for it."""
 _POLL_S: Final = 0.05
 
-_Tell = Callable[[str], None]
+_Print = Callable[[str], None]
 
 
 class SeriesFailedError(FailureError):
-    """No session, or no further one.
+    """A session of a series could not be run, or failed.
 
     Parameters
     ----------
     message
         Reason, for the operator.
     results
-        The sessions before, and the one that failed if it had begun.
+        Results of the earlier sessions, and of the failed session if it had begun.
 
     Attributes
     ----------
     results
-        List of the same.
+        The same results as a list.
     """
 
     def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:
@@ -72,7 +72,7 @@ def run_in_foreground(
     accept: Sequence[str] = (),
     quiet_stdout: bool,
     hardware: bool = False,
-    look: bool = False,
+    quick_look: bool = False,
     from_angle: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
@@ -80,59 +80,59 @@ def run_in_foreground(
     identifies_motor: bool = False,
     tip_slope_rad: float | None = None,
 ) -> list[SessionResult]:
-    """Run `repeat` sessions, up to a stop or the first that does not end well.
+    """Run `repeat` sessions; end at a stop or at the first incomplete session.
 
     Parameters
     ----------
     build
-        Makes the excitation for a rig, from its profile.
+        Returns the excitation for a profile.
     group
-        The processes, started but not yet needed; ended when this returns.
+        The started processes. They are ended when this function returns.
     stop
-        The operator's.
+        Stop request of the operator.
     profile_name
         Name or path of the profile.
     folder
-        Where the files go; made if it does not exist.
+        Folder of the session files; created if it does not exist.
     repeat, seed, notes, fast, live, force, accept, hardware
-        As on the command line. The sessions of a series follow each other on one connection: each
-        waits until the beam has come to rest.
+        As on the command line. The sessions of a series use one connection. Each session waits
+        until the beam is at rest.
     quiet_stdout
-        Tell the operator on standard error, because standard output is for a document.
-    look
-        Take a quick look at each session, and wait some seconds for the last one.
+        Print all text on standard error, because standard output is reserved for a document.
+    quick_look
+        Make a quick look at each session, and wait some seconds for the last one.
     from_angle
-        The excitation depends on where the motor stands: the rig is connected before it is made,
-        with the angle as ``start_rad``.
+        The excitation depends on the motor angle. The rig is connected first, and `build` receives
+        the angle as ``start_rad``.
     prepare
-        Changes the profile before it is planned with.
+        Returns a modified profile, applied before planning.
     obstacles
-        What a simulated beam meets, as on the command line.
+        Obstacles of a simulated beam, as on the command line.
     watch_fit
-        Fit each record while it is recorded, and tell.
+        Fit each record while it is recorded, and print the fits.
     identifies_motor
         See :class:`rigd.runner._series.Series`.
     tip_slope_rad
-        Largest slope of the tip in an identification; None: the profile's.
+        Largest tip slope of an identification; None: the limit of the profile.
 
     Raises
     ------
     UserError
-        If a session is refused before any was run.
+        If a session is refused before the first one is run.
     SeriesFailedError
-        If one cannot be run, or failed.
+        If a session cannot be run, or failed.
     """
-    tell: _Tell = partial(_tell, err=quiet_stdout)
+    write: _Print = partial(_print, err=quiet_stdout)
     results: list[SessionResult] = []
 
-    def told(look: QuickLook) -> None:
-        look.note(results)
-        for line in look.lines:
-            tell(line)
+    def report(quick_look: QuickLook) -> None:
+        quick_look.note(results)
+        for line in quick_look.lines:
+            write(line)
 
-    looks = QuickLooks(told) if look else None
+    quick_looks = QuickLooks(report) if quick_look else None
     try:
-        # The rig is given up last, when no process uses the devices any more.
+        # The rig is released last, when no process uses the devices any more.
         with contextlib.ExitStack() as reserved, group:
             profile, moving = load_rig(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
@@ -143,9 +143,9 @@ def run_in_foreground(
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
             mounted = with_specimen(profile, specimen)
-            _tell(what_moves(profile.rig, moving), err=True)
+            _print(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
-                tell(f"Warning: the simulated rig has {difference}.")
+                write(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
@@ -166,17 +166,17 @@ def run_in_foreground(
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
-                tell(line)
+                write(line)
             if not (stop.requested or rig.connected):
                 rig.connect(moving)
-            with _Operator(series.ticks, repeat, tell) as operator:
-                series.run(rig, stop, operator, live=live, looks=looks)
+            with _Operator(series.ticks, repeat, write) as operator:
+                series.run(rig, stop, operator, live=live, looks=quick_looks)
         if stop.requested:
-            _tell_stop(results, repeat)
-        if looks is not None:
-            _await_looks(looks, stop)
+            _print_stop(results, repeat)
+        if quick_looks is not None:
+            _await_quick_looks(quick_looks, stop)
     except SessionFailedError as error:
-        # Its processes have ended, so that what they have left can be told.
+        # The processes have ended, so that the remaining file can be reported.
         results.append(error.result())
         raise SeriesFailedError(f"{error} {what_is_kept(error.path)}", results) from error
     except RigdError as error:
@@ -184,18 +184,18 @@ def run_in_foreground(
             raise
         raise SeriesFailedError(str(error), results) from error
     finally:
-        if looks is not None:
-            looks.close()
+        if quick_looks is not None:
+            quick_looks.close()
     return results
 
 
 class _Operator:
-    """Tells the operator of a series; leaving its context takes the progress away."""
+    """Print the progress and the results of a series of sessions."""
 
-    def __init__(self, ticks: int, repeat: int, tell: _Tell) -> None:
+    def __init__(self, ticks: int, repeat: int, write: _Print) -> None:
         self._ticks = ticks
         self._repeat = repeat
-        self._tell = tell
+        self._print = write
         self._line: ProgressLine | None = None
         self._number = ""
         self._where = ""
@@ -206,16 +206,16 @@ class _Operator:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - told when it is there
+    def begins(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
         self._number = f"{number}/{self._repeat}" if self._repeat > 1 else ""
         self._line = ProgressLine()
 
     def says(self, level: str, text: str) -> None:
-        self._tell(f"Warning: {text}" if level == "warning" else text)
+        self._print(f"Warning: {text}" if level == "warning" else text)
 
     def shown(self, where: str) -> None:
         if where != self._where:
-            self._tell(where)
+            self._print(where)
             self._where = where
 
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
@@ -236,11 +236,11 @@ class _Operator:
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:  # noqa: ARG002
         self._close()
-        self._tell(result_line(result.as_dict()))
+        self._print(result_line(result.as_dict()))
         if result.path is not None:
             if result.live_dropped:
-                self._tell(f"The viewer dropped {result.live_dropped} samples; the file has them.")
-            self._tell(str(result.path))
+                self._print(f"The viewer dropped {result.live_dropped} samples; the file has them.")
+            self._print(str(result.path))
 
     def _close(self) -> None:
         if self._line is not None:
@@ -248,13 +248,13 @@ class _Operator:
             self._line = None
 
 
-def _tell(text: str, *, err: bool) -> None:
+def _print(text: str, *, err: bool) -> None:
     with contextlib.suppress(OSError):  # the terminal is gone; the session is not
         typer.echo(text, err=err)
 
 
-def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
-    """Give the last quick looks their time; another Ctrl-C skips them."""
+def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
+    """Wait for the last quick looks; another Ctrl-C skips them."""
     stop.sessions_are_over()
     before, skipped = stop.requested, False
 
@@ -263,30 +263,36 @@ def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
         skipped = True
 
     stop.on_request = skip
-    looks.attend()
-    if looks.busy:
-        _tell("Quick look at the session; Ctrl-C skips it.", err=True)
-    deadline_s = time.monotonic() + _LOOK_LONGEST_S
+    quick_looks.attend()
+    if quick_looks.busy:
+        _print("Quick look at the session; Ctrl-C skips it.", err=True)
+    deadline_s = time.monotonic() + _LONGEST_QUICK_LOOK_S
     while (
-        looks.busy
+        quick_looks.busy
         and not skipped
-        and looks.spent_s < _LOOK_PATIENCE_S
+        and quick_looks.spent_s < _QUICK_LOOK_PATIENCE_S
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_S)
-        looks.attend()
-    if looks.busy and not skipped:
-        why = "took too long" if looks.spent_s >= _LOOK_PATIENCE_S else "got no processor time"
-        _tell(
+        quick_looks.attend()
+    if quick_looks.busy and not skipped:
+        why = (
+            "took too long"
+            if quick_looks.spent_s >= _QUICK_LOOK_PATIENCE_S
+            else "got no processor time"
+        )
+        _print(
             f"The quick look {why} and was skipped: python -m analysis.quick_look FILE makes it.",
             err=True,
         )
-    stop.requested = before  # what was skipped is not a session
+    stop.requested = before  # this Ctrl-C skipped the quick look only
 
 
-def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
-    """Tell of a stop between two sessions or before the first; within one, the session tells."""
+def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
+    """Report a stop between two sessions or before the first one; a session reports its own."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
-    _tell(f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True)
+    _print(
+        f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True
+    )

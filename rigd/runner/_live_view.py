@@ -1,4 +1,4 @@
-"""The live view of a rig: started with its processes, watched, started again if it is lost."""
+"""Live view of a rig: starts the publisher process, watches it, and restarts it if it is lost."""
 
 import math
 import time
@@ -22,35 +22,20 @@ from rigd.view import Subject, band_of, sweep_of
 from rigd.view.plots import OF_A_BUS, OF_REAL_TIME
 
 _PATIENCE_S = 10.0
-"""It takes its time to start: a session waits so long for it."""
+"""Longest time for which a session waits for the start of the live view."""
 _START_PATIENCE_S = 60.0
-"""On a computer that is busy, before one that only starts counts as hung."""
+"""Time after which a starting publisher counts as hung, also on a busy computer."""
 _BEGIN_PATIENCE_S = 1.0
 _FIT_BAND_HZ = 50.0
-"""End of the band of an excitation that has none."""
+"""Upper end of the band assumed for an excitation without a band."""
 _MOST_FIT_MODES = 4
-"""Modes of which fits are plotted: of more, a plot would be too low to be read."""
+"""Largest number of modes whose fits are plotted; more plots would be too small to read."""
 _MOST_RESTARTS = 3
-"""Most restarts in one session: a process that dies again and again is given up."""
+"""Largest number of restarts in one session."""
 
 
 class LiveView:
-    """The publisher process of a rig, which no session ever waits for.
-
-    Parameters
-    ----------
-    group
-        Processes with a publisher, their memory laid out.
-    rig
-        The profile's name.
-    fast
-        The sessions are not run in real time.
-
-    Attributes
-    ----------
-    address
-        Address of the view, as far as it is known.
-    """
+    """Publisher process of a rig; a session continues without it if it is lost."""
 
     def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
         self._fast = fast
@@ -58,38 +43,25 @@ class LiveView:
         self._group = group
         self._job = LiveJob(rig, group.channels.specs)
         self._session: LiveSession | None = None
-        self._untold: list[Event] = []
+        self._unreported: list[Event] = []
         self._restarts = 0
         self._lost = ""
         self._shown = False
         self._start()
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Show a session that is about to be run.
-
-        Parameters
-        ----------
-        order
-            Session that is run.
-        stop
-            The operator's: then the view is waited for no longer.
-
-        Returns
-        -------
-        str
-            The address of the view, or why there is none, for the operator.
-        """
+        """Show the next session; return the address of the view, or why there is none."""
         self._restarts = 0
-        if self._lost:  # perhaps not any more
+        if self._lost:  # a new attempt for the new session
             self._start()
-        self._await(lambda: self._heard, _PATIENCE_S, stop)
+        self._await(lambda: self._answered, _PATIENCE_S, stop)
         begins = tuple(ring.written for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast), str(uuid.uuid4()), begins, order.path.parent
         )
         self._shown = False
         self._send(self._session)
-        # So that it is there from the first sample on; a session does not depend on it.
+        # The view then has all samples from the first one; the session does not depend on it.
         self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
         if self._lost:
             return f"No live view: {self._lost} The session continues without it."
@@ -97,18 +69,18 @@ class LiveView:
             return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
 
-    def look(self) -> None:
-        """See whether it is running; if it died or hangs, start it again."""
+    def check(self) -> None:
+        """Check whether the publisher is running; restart it if it died or hangs."""
         if not self._lost:
             self._listen(0.0)
         if not self._lost:
             self._feel_pulse()
 
-    def attend(self) -> list[Event]:
-        """Look, and return what the operator is to be told."""
-        self.look()
-        told, self._untold = self._untold, []
-        return told
+    def poll(self) -> list[Event]:
+        """Check the publisher, and return the events for the operator."""
+        self.check()
+        events, self._unreported = self._unreported, []
+        return events
 
     def touched(self, touches: Sequence[Mapping[str, Any]]) -> None:
         """Show touches of the session, as in JSON documents."""
@@ -116,26 +88,26 @@ class LiveView:
             self._send(LiveTouches(tuple(touches)))
 
     def fitted(self, fits: Sequence[Mapping[str, Any]]) -> None:
-        """Show the last of the fits of the record so far, as in JSON documents."""
+        """Show the latest fit of the record, as in JSON documents."""
         if fits and self._session is not None:
             self._send(LiveFit(fits[-1]))
 
     def finish(self, outcome: str, reason: str) -> None:
-        """Note the end of the session that is shown; its outcome may be unknown."""
+        """Show the end of the current session; its outcome may be unknown."""
         if self._session is not None:
             self._session = None
             ends = tuple(ring.written for ring in self._group.channels.rings)
             self._send(LiveEnd(ends, outcome, reason))
 
     def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
-        """Listen until something is met, or cannot be any more, or there is no time for it."""
+        """Listen until a condition is met, the publisher is lost, or the time is over."""
         deadline = time.monotonic() + patience_s
         while not (met() or self._lost or stop.requested) and time.monotonic() < deadline:
             self._listen(0.1)
 
     def _start(self) -> None:
         """Start a new process."""
-        self._heard = False
+        self._answered = False
         self._lost = ""
         self._pulse = Pulse()
         try:
@@ -170,7 +142,7 @@ class LiveView:
                 self._shown = True
             case LiveAddress():
                 before, self.address = self.address, answer
-                self._heard = True
+                self._answered = True
                 if before is not None and before.viewer_url != answer.viewer_url:
                     self._note("info", f"Live view: {answer.viewer_url}")
             case _:
@@ -181,7 +153,7 @@ class LiveView:
 
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
-        patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
+        patience_s = LIVE.hung_after_s if self._answered else _START_PATIENCE_S
         beat = self._group.channels.board[Word.LIVE_BEAT]
         if self._pulse.look(beat, time.monotonic()) > patience_s:
             self._restart(f"The live process was killed: no response for {patience_s:g} s.")
@@ -197,19 +169,11 @@ class LiveView:
         self._start()
 
     def _note(self, level: Level, message: str) -> None:
-        self._untold.append(Event(0, level, message))
+        self._unreported.append(Event(0, level, message))
 
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:
-    """Return what the live view needs to know of a session.
-
-    Parameters
-    ----------
-    order
-        Session that is run.
-    fast
-        It is not run in real time.
-    """
+    """Return the data of a session that the live view needs."""
     rig, excitation = order.profile.rig, order.excitation
     absent: set[str] = set()
     if rig.devices.drive == rig.devices.sensor == "sim":
@@ -238,7 +202,7 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
 
 
 def _fit_modes(order: Order) -> int | None:
-    """Return of how many modes fits are plotted: those that are expected in the excited band."""
+    """Return the number of modes whose fits are plotted: those expected in the excited band."""
     excitation = order.excitation
     if excitation.search is None and not order.watch_fit:
         return None
@@ -249,20 +213,14 @@ def _fit_modes(order: Order) -> int | None:
 
 
 def gauge_limits(profile: Profile) -> dict[str, float]:
-    """Return the limits of the gauges by their names, and that of missed ticks in percent.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    """
+    """Return the limits of the gauges by name; the limit of missed ticks is in percent."""
     limits, motor, sensor = profile.limits, profile.rig.motor, profile.rig.sensor
     axes = ("fx", "fy", "fz", "tx", "ty", "tz")
     return {
         "angle": limits.angle_rad,
         "velocity": limits.velocity_rad_s,
         "tracking_error": limits.tracking_error_rad,
-        # What is asked for beyond it is clipped.
+        # A torque command beyond this limit is clipped.
         "torque_command": motor.peak_torque_nm,
         "i2t": motor.continuous_torque_nm,
         "missed": limits.missed_percent,

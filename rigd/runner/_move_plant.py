@@ -1,4 +1,4 @@
-"""The rig as the planning of moves knows it: its closed loop, with the beam of an analysis."""
+"""Rig model for the planning of moves: its closed loop, optionally with an identified beam."""
 
 import math
 from dataclasses import replace
@@ -23,28 +23,20 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _MOST_MODES = 6
-"""Modes that a move leaves at rest; those above are too weak to be seen."""
+"""Number of modes that a move leaves at rest; higher modes are too weak to be observed."""
 _UNSURE = 0.01
-"""Relative uncertainty of the frequencies of a profile's beam, which nobody states."""
+"""Assumed relative uncertainty of the mode frequencies of a profile's beam."""
 _FILTERS = 1.2
-"""Acceleration of a move's reference over what the peak torque does to the motor alone: some more,
-for the loop follows it through its filters."""
+"""Largest reference acceleration over the acceleration of the free motor at peak torque. It exceeds
+1 because the filters of the loop smooth the reference."""
 _SETTLED = 5.0
-"""Time constants of the loop in which it follows up a reference."""
+"""Settling time of the loop, in time constants."""
 _DRAWS = 4
-"""Draws of the noise from which the vibration after a move is predicted."""
+"""Number of noise realisations for the predicted vibration after a move."""
 
 
 def loop_model_with(profile: Profile, found: IdentifiedBeam | None) -> LoopModel:
-    """Return the loop of a rig with an identified beam, and with the channels found with it.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    found
-        Beam of an analysis; None: the profile's.
-    """
+    """Return the loop model of a rig with an identified beam and its channel parameters."""
     model = profile.loop_model()
     if found is None:
         return model
@@ -52,22 +44,14 @@ def loop_model_with(profile: Profile, found: IdentifiedBeam | None) -> LoopModel
     if found.tool_inertia_kg_m2 is not None:
         model = replace(model, tool_inertia_kg_m2=found.tool_inertia_kg_m2)
     if found.delay_s is not None:
-        # Only the difference of both ages is identified, and neither can be negative.
+        # Only the difference of the two delays is identified, and neither can be negative.
         angle_s = max(model.angle_delay_s, -found.delay_s)
         model = replace(model, angle_delay_s=angle_s, torque_delay_s=angle_s + found.delay_s)
     return model
 
 
 def with_beam(model: LoopModel, loaded: LoadedBeam) -> LoopModel:
-    """Return a loop with another beam and what is at its ends.
-
-    Parameters
-    ----------
-    model
-        The loop.
-    loaded
-        The beam.
-    """
+    """Return a loop model with another loaded beam."""
     return replace(
         model,
         beam=loaded.beam,
@@ -84,27 +68,8 @@ def move_plant_of(
     coupling_limit_nm: float,
     found: IdentifiedBeam | None = None,
 ) -> MovePlant:
-    """Return a rig for planning a move.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    model
-        Its loop, with the beam that the move is planned for.
-    coupling_limit_nm
-        Range of the sensor.
-    found
-        What an analysis says of that beam; None: it is a profile's or an estimate.
-
-    Raises
-    ------
-    ControlDesignError
-        If the loop is unstable with that beam.
-    RealisationError
-        If its damping cannot be realised.
-    """
-    # tanh of the speed is not linear: its largest value is taken off the torque.
+    """Return the rig model for the planning of a move; `found` is None without an analysis."""
+    # The friction compensation (tanh of the speed) is not linear: its maximum is subtracted.
     settings = replace(model.settings, friction_compensation_nm=0.0)
     loop = close_loop(replace(model, settings=settings))
     check_stability(loop)
@@ -147,13 +112,7 @@ def move_plant_of(
 
 
 def torque_noise_nm(profile: Profile) -> float:
-    """Return the noise of one reading of the coupling torque, as the profile has it.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig: of a simulated one the noise, of another the resolution of its sensor.
-    """
+    """Return the noise of one torque reading: simulated noise, or the resolution of the sensor."""
     rig = profile.rig
     axes = np.array(rig.sensor.resolution)
     if rig.simulation is not None:
@@ -162,20 +121,11 @@ def torque_noise_nm(profile: Profile) -> float:
 
 
 def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
-    """Return the poles of the modes of the beam with locked hub, and of the closed loop, in rad/s.
+    """Return the poles of the beam with locked hub and of the closed loop, in rad/s, (m,) each.
 
-    What rings on while the motor is held is the closed loop: its poles lie near those of the beam
-    with locked hub, and where the loop damps them they differ.
-
-    Parameters
-    ----------
-    loop
-        Closed loop with a beam.
-
-    Returns
-    -------
-    locked, closed : ndarray, shape (m,)
-        One pole of each pair, of the lowest modes that oscillate and lie within reach of the ticks.
+    One pole of each pair is returned, for the lowest modes that oscillate below half the Nyquist
+    frequency. While the motor is held, the closed loop vibrates: its poles are near those of the
+    beam with locked hub, and differ from them where the loop damps a mode.
     """
     model = loop.model
     locked = model.loaded_beam.poles(clamped_free_eigenvalues(_MOST_MODES))[:, 0]

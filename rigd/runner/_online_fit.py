@@ -1,4 +1,4 @@
-"""Fits of a running session: what its fit process tells, and what follows for the session."""
+"""Fits of a running session: supervision of the fit process and use of its estimates."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import FIT, ChildError, Pulse
 from rigd.engine.shared_state import Event, Stop, Word
-from rigd.runner._precision_search import Stated, in_words, stated, targets_json
+from rigd.runner._precision_search import TargetEstimate, in_words, target_estimates, targets_json
 from rigd.runner._process_group import await_ready
 
 if TYPE_CHECKING:
@@ -26,42 +26,23 @@ if TYPE_CHECKING:
     from rigd.runner._process_group import ProcessGroup
 
 _LAST_PATIENCE_S: Final = 60.0
-"""Time for the fit of the whole record, when the torque is off; a stop skips it."""
+"""Time for the fit of the whole record, with the torque off; a stop skips it."""
 _STOP_PATIENCE_S: Final = 5.0
 _POLL_S: Final = 0.05
-_KEPT: Final = (
+_STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
 )  # fmt: skip
-"""What of the last estimate goes into the file; the rest is what pieces are designed from."""
+"""Keys of the last estimate that are stored in the file."""
 
 
-class OnlineFit:
-    """What the fit process tells of one session.
+class FitSupervisor:
+    """Supervise the fit process of one session and collect its estimates.
 
-    A session that goes on until a precision is reached ends with its last piece: when the process
-    says so, and when the process is lost.
-
-    Parameters
-    ----------
-    group
-        Processes of the rig, their memory laid out.
-    profile
-        Profile of the rig.
-    reference
-        Reference of the session.
-    search
-        What the session goes on for; None: its reference is given.
-    realtime
-        Where the loop runs; None: not in real time.
-
-    Attributes
-    ----------
-    segments
-        Those that were planned while the record ran, once the search has ended.
-    shortcoming
-        What is missing of the precision that was asked for, or that this is not known; empty if
-        the whole record has it.
+    A session with a precision search ends with its last segment, when the process reports the end
+    of the search or when the process is lost. `segments` holds the planned segments after the end
+    of the search. `shortcoming` states why the whole record does not have the requested precision,
+    or why this is not known; it is empty if the record has the precision.
     """
 
     def __init__(
@@ -73,12 +54,12 @@ class OnlineFit:
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
         self._group = group
-        self._board = group.channels.board
+        self._shared_state = group.channels.board
         self._search = search
         self._events: list[Event] = []
         self._news: list[Mapping[str, Any]] = []
-        self._pieces: list[Mapping[str, Any]] = []
-        self._told: FitTold | None = None
+        self._planned: list[Mapping[str, Any]] = []
+        self._last_report: FitTold | None = None
         self._ended: SearchEnded | None = None
         self._ready = self._begun = False
         self._lost = ""
@@ -94,25 +75,19 @@ class OnlineFit:
             self._lose(str(error))
 
     def await_ready(self, meanwhile: Callable[[], bool]) -> str:
-        """Wait until the process can fit; return why it cannot, or nothing.
-
-        Parameters
-        ----------
-        meanwhile
-            Called some times a second; says whether to go on waiting.
-        """
+        """Wait until the process is ready; return why it is not, else an empty text."""
         late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
         if late:
             self._lose(f"The fit process was {late}.")
         return self._lost
 
     def begin(self, header: FileHeader) -> None:
-        """Tell what the file says of the session, before its record begins."""
+        """Send the header of the session file to the process, before the record begins."""
         self._begun = True
         self._send(header)
 
-    def attend(self) -> list[Event]:
-        """Take what has come, and return what the operator is to be told."""
+    def poll(self) -> list[Event]:
+        """Read the received messages, and return the events for the operator."""
         self._listen(0.0)
         if self._ready and not self._lost:
             self._feel_pulse()
@@ -120,74 +95,71 @@ class OnlineFit:
         return events
 
     def _feel_pulse(self) -> None:
-        """End a process that hangs."""
+        """End the process if it hangs."""
         assert FIT.hung_after_s is not None
-        still_s = self._pulse.look(self._board[Word.FIT_BEAT], time.monotonic())
+        still_s = self._pulse.look(self._shared_state[Word.FIT_BEAT], time.monotonic())
         if still_s > FIT.hung_after_s:
             self._group[FIT].kill()
             self._lose(f"The fit process hung for {FIT.hung_after_s:g} s and was ended.")
 
     def news(self) -> list[Mapping[str, Any]]:
-        """Return the estimates that came since the last time, for the live view."""
+        """Return the estimates received since the last call, for the live view."""
         news, self._news = self._news, []
         return news
 
     def finish(self, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
-        """Wait for the fit of the whole record; return what is known as a JSON document.
-
-        Parameters
-        ----------
-        ticks
-            Ticks that were scheduled.
-        meanwhile
-            Called some times a second.
-        """
+        """Wait for the fit of the whole record of `ticks` ticks; return the result for JSON."""
         self._send(RecordEnded(ticks))
         begun_s = time.monotonic()
-        while self._begun and not (self._lost or (self._told is not None and self._told.final)):
+        while self._begun and not (
+            self._lost or (self._last_report is not None and self._last_report.final)
+        ):
             self._listen(_POLL_S)
             meanwhile()
-            if self._board[Word.STOP] != Stop.NO and time.monotonic() > begun_s + _STOP_PATIENCE_S:
+            if (
+                self._shared_state[Word.STOP] != Stop.NO
+                and time.monotonic() > begun_s + _STOP_PATIENCE_S
+            ):
                 self._skipped = "A stop skipped the fit of the whole record."
                 break
             if time.monotonic() > begun_s + _LAST_PATIENCE_S:
                 self._lose("The fit of the whole record took too long.")
-        told = {} if self._told is None else self._told.document
-        document = {key: told[key] for key in _KEPT if key in told}
+        estimate = {} if self._last_report is None else self._last_report.document
+        document = {key: estimate[key] for key in _STORED_KEYS if key in estimate}
         if self._search is not None:
             targets = self._search.targets
-            found = stated(document, targets) if "modes" in document else []
-            reached, self.shortcoming = self._judge(found)
+            found = target_estimates(document, targets) if "modes" in document else []
+            reached, self.shortcoming = self._assess(found)
             document["search"] = {
                 "asked": [str(target) for target in targets],
                 "targets": targets_json(found),
                 "reached": reached,
                 "reason": self.shortcoming or self._success,
-                "pieces": self._pieces,
+                "pieces": self._planned,
             }
         return document
 
     @property
     def _reason(self) -> str:
-        """Why a search for a precision ended, a sentence; empty if it was stopped."""
+        """Reason for the end of the search as a sentence; empty if it was stopped."""
         return self._ended.reason if self._ended is not None else self._lost
 
     @property
     def _success(self) -> str:
-        """How what was asked for was reached, a sentence."""
+        """Statement that the requested precision was reached, as a sentence."""
         if self._ended is not None and self._ended.reached:
             return self._ended.reason
         return "Reached by the fit of the whole record."
 
-    def _judge(self, found: Sequence[Stated]) -> tuple[bool | None, str]:
-        """Return whether the whole record has what was asked for, and what is missing of it.
+    def _assess(self, found: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
+        """Return whether the whole record has the requested precision, and the shortcoming.
 
-        Without a fit of the whole record that is not known, whatever was found on the way.
+        Without a fit of the whole record this is not known, whatever earlier estimates stated.
         """
-        told, ended = self._told, self._ended
+        report, ended = self._last_report, self._ended
         on_the_way = ended is not None and ended.reached
-        unknown = "" if told is None else str(told.document.get("problem") or "")
-        if told is None or not told.final:
+        unknown = "" if report is None else str(report.document.get("problem") or "")
+        if report is None or not report.final:
             unknown = self._lost or self._skipped or "The whole record was not fitted."
         elif not unknown and not found:
             unknown = "Its fit has no modes."
@@ -207,7 +179,7 @@ class OnlineFit:
 
     @property
     def failure(self) -> str:
-        """Why the process was lost before its search ended, which ends a session; else empty."""
+        """Reason for a loss of the process before the end of its search; else empty."""
         return self._lost if self._search is not None and self._ended is None else ""
 
     def _send(self, message: object) -> None:
@@ -232,24 +204,24 @@ class OnlineFit:
             case FitReady():
                 self._ready = True
             case FitTold(document):
-                self._told = message
+                self._last_report = message
                 self._news.append(document)
                 self._events += [Event(0, "info", line, notable=True) for line in document["text"]]
             case PieceTold(name, document):
-                self._pieces.append({"name": name, **document})
+                self._planned.append({"name": name, **document})
                 self._events.append(Event(0, "info", f"Next: {name}."))
             case SearchEnded(_, reason, segments):
                 self._ended, self.segments = message, segments
-                self._board[Word.LAST_PIECE] = 1
+                self._shared_state[Word.LAST_PIECE] = 1
                 self._events.append(Event(0, "info", reason, notable=True))
             case Failed(reason):
                 self._lose(reason)
 
     def _lose(self, why: str) -> None:
-        """Go on without the process; a reference that it was to plan ends with what there is."""
+        """Continue without the process; a planned reference ends with its last segment."""
         self._lost = why
         follows = "The session continues without fits."
         if self._search is not None and self._ended is None:
-            self._board[Word.LAST_PIECE] = 1
+            self._shared_state[Word.LAST_PIECE] = 1
             follows = "The session ends with what is planned."
         self._events.append(Event(0, "warning", f"{why} {follows}"))

@@ -1,7 +1,7 @@
-"""Probing move before the first session: whether it is needed, and its stored result.
+"""Probing move before the first session: decision, execution and stored result.
 
-A result holds until the computer is restarted, and as long as the values that it verifies, the
-drive, the sensor and a simulated rig are the same. It is in the user's runtime folder.
+A result is valid until the computer is restarted, as long as the verified values, the drive, the
+sensor and a simulated rig do not change. It is stored in the user's runtime folder.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ _VERIFIED: Final = (
     "rate_hz", "beam.", "damping.", "motor.", "encoder.", "actuation.", "sensor.projection",
     "sensor.tool_inertia_kg_m2", "sensor.delay_s", "cia402.direction", "cia402.gear_ratio",
 )  # fmt: skip
-"""Beginnings of the keys that a result depends on."""
+"""Prefixes of the profile keys that a result depends on."""
 
 
 class ProbeFailedError(FailureError):
-    """The rig contradicts its profile; the message says what contradicts what."""
+    """The rig contradicts its profile; the message states the contradiction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,35 +41,21 @@ class ProbeResult:
     """Result of a probing move."""
 
     end: ProbeEnd
-    """Why it ended."""
+    """Reason for the end of the move."""
     estimate: ProbeEstimate
-    """Scales and friction."""
+    """Estimated scales and friction."""
 
     def contradiction(self, profile: Profile, *, motor: bool = True) -> str:
-        """Return what contradicts the profile; empty if nothing does.
-
-        Parameters
-        ----------
-        profile
-            Profile of the rig.
-        motor
-            Judge the motor's torque and inertia too.
-        """
+        """Return the contradiction to the profile, with or without the motor data; else empty."""
         return contradiction(probed_rig(profile), self.end, self.estimate, motor=motor)
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the result as a session file states it."""
+        """Return the result as metadata of a session file."""
         numbers = self.estimate.as_dict()
         return {f"probe_{key}": repr(numbers[key]) for key in numbers if numbers[key] is not None}
 
     def lines(self, profile: Profile) -> list[str]:
-        """Return the result in words.
-
-        Parameters
-        ----------
-        profile
-            Profile of the rig.
-        """
+        """Return the result as lines of text."""
         estimate = self.estimate
         rows = (
             ("coupling torque over the beam's at the measured angle", estimate.coupling_ratio,
@@ -100,32 +86,10 @@ def verify(
     *,
     motor: bool = True,
 ) -> ProbeResult | None:
-    """Make a probing move where motor and encoder are not known, and no stored result holds.
+    """Make a probing move if it is needed; return its result, or None if none is needed.
 
-    Parameters
-    ----------
-    profile
-        Profile whose values are verified.
-    rig
-        Connected.
-    stop
-        The operator's.
-    says
-        Takes level and text of what the operator should know.
-    motor
-        Judge the motor's torque and inertia too.
-
-    Returns
-    -------
-    ProbeResult or None
-        None: no move is needed.
-
-    Raises
-    ------
-    ProbeFailedError
-        If the rig contradicts the profile.
-    RigError
-        If the move is stopped, or an interlock ends it.
+    The move is needed if motor and encoder were not measured and no stored result is valid. With
+    `motor`, torque and inertia of the motor are checked too.
     """
     if _is_identified(profile) or _is_simulated_alike(profile):
         return None
@@ -148,7 +112,7 @@ def _is_identified(profile: Profile) -> bool:
 
 
 def _is_simulated_alike(profile: Profile) -> bool:
-    """Whether the rig is simulated with the values of its profile: there is nothing to verify."""
+    """Whether the rig is simulated with the values of its profile, so that a probe is useless."""
     if profile.rig.devices.drive == "sim":
         return True
     simulator = find_simulator(profile.rig.name)
@@ -159,13 +123,7 @@ def _is_simulated_alike(profile: Profile) -> bool:
 
 
 def announcement(profile: Profile) -> str:
-    """Return a sentence on what the shaft is about to do.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    """
+    """Return a sentence that announces the motion of the shaft."""
     plan = plan_probe(probed_rig(profile))
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
@@ -175,22 +133,7 @@ def announcement(profile: Profile) -> str:
 
 
 def probe(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
-    """Make a probing move, and store its result.
-
-    Parameters
-    ----------
-    profile
-        Profile whose values are verified.
-    rig
-        Connected.
-    stop
-        The operator's.
-
-    Raises
-    ------
-    RigError
-        If the move is stopped, or an interlock ends it.
-    """
+    """Make a probing move on a connected rig, and store its result."""
     result = _result(rig.probe(profile, stop))
     document = {"key": _key(profile, rig), "boot": _boot(), "end": result.end.name}
     path = _file(profile)
@@ -211,30 +154,30 @@ def probe_in_foreground(
     hardware: bool,
     says: Callable[[str], None],
 ) -> tuple[Profile, ProbeResult]:
-    """Make a probing move by itself, whatever the profile states.
+    """Make a single probing move, whatever the profile states.
 
     Parameters
     ----------
     group
-        The processes, started; ended when this returns.
+        The started processes. They are ended when this function returns.
     stop
-        The operator's.
+        Stop request of the operator.
     profile_name
         Name or path of the profile.
     fast, hardware
         As on the command line.
     says
-        Takes what the operator should know before it begins.
+        Receives messages for the operator before the move begins.
 
     Returns
     -------
     profile, result
-        The profile, and what the move showed.
+        The profile, and the result of the move.
 
     Raises
     ------
     UserError
-        If it is refused.
+        If the move is refused.
     RigError
         If the rig cannot be connected, or the move is stopped or ended by an interlock.
     """
@@ -251,15 +194,7 @@ def probe_in_foreground(
 
 
 def stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
-    """Return the result of the last probing move that still holds, or None.
-
-    Parameters
-    ----------
-    profile
-        Profile whose values it verified.
-    rig
-        Connected.
-    """
+    """Return the valid stored result of the last probing move, or None."""
     try:
         document = json.loads(_file(profile).read_text("utf-8"))
         if document.pop("key") != _key(profile, rig) or document.pop("boot") != _boot():
@@ -279,7 +214,7 @@ def _verified(values: Mapping[str, object]) -> dict[str, object]:
 
 
 def _key(profile: Profile, rig: Rig) -> str:
-    """Return what a result belongs to: values, drive, sensor, and a simulated rig's process."""
+    """Return the key of a result: hash of values, drive, sensor and process of a simulated rig."""
     simulator = find_simulator(profile.rig.name)
     limits = profile.limits
     belongs = (
@@ -293,7 +228,7 @@ def _key(profile: Profile, rig: Rig) -> str:
 
 
 def _boot() -> str:
-    """Return what identifies the present start of the computer; empty if nothing does."""
+    """Return the boot id of the computer; empty if there is none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text("utf-8").strip()
     except OSError:

@@ -1,7 +1,7 @@
-"""Process group of a rig: control, recorder and live publisher, and the memory they share.
+"""Process group of a rig: control, recorder and live publisher, and their shared memory.
 
-This module is quick to import, so that the processes can be started before anything else: they
-import what they need while the supervisor reads the profile and plans.
+This module is quick to import, so that the processes are started first: they import their modules
+while the supervisor reads the profile and plans.
 """
 
 import contextlib
@@ -19,28 +19,17 @@ if TYPE_CHECKING:
 
 _DESCRIPTORS = 6
 _PREPARING_S = 20.0
-"""Time for a process of one session to prepare on a busy computer; nothing moves yet."""
+"""Time for a process of one session to get ready on a busy computer; nothing moves yet."""
 _POLL_S = 0.05
 
 
 def await_ready(
     settled: Callable[[], bool], listen: Callable[[float], None], meanwhile: Callable[[], bool]
 ) -> str:
-    """Wait until a process of one session is ready, or is lost.
+    """Wait until a process is `settled`: ready or lost; return how late it is, or an empty text.
 
-    Parameters
-    ----------
-    settled
-        Says whether it is either.
-    listen
-        Takes what it sends, waiting for so many seconds at most.
-    meanwhile
-        Called some times a second; says whether to go on waiting.
-
-    Returns
-    -------
-    str
-        How long was waited in vain; empty where that was not too long.
+    `listen` receives its messages for at most the given time in s. The wait ends early if
+    `meanwhile` returns False.
     """
     deadline_s = time.monotonic() + _PREPARING_S
     while not settled() and meanwhile():
@@ -51,16 +40,16 @@ def await_ready(
 
 
 class ProcessGroup:
-    """Control, recorder and, if wanted, live publisher of a rig.
+    """Control process, recorder and optional live publisher of a rig.
 
-    Leaving the context ends them all, the one with the torque first.
+    Leaving the context ends all processes, the control process first.
 
     Parameters
     ----------
     live
         Start the live publisher too.
     also
-        Processes of one session to start too; others are started when they are needed.
+        Further processes to start now; others are started when they are needed.
 
     Raises
     ------
@@ -74,8 +63,7 @@ class ProcessGroup:
     live
         Whether the live publisher is started too.
     cores
-        For the processes that are still to be started, where this one keeps off some; empty: its
-        own.
+        Cores of the processes that are started later; empty: those of this process.
     """
 
     def __init__(self, *, live: bool, also: Collection[Process] = ()) -> None:
@@ -104,7 +92,7 @@ class ProcessGroup:
 
     @property
     def control(self) -> Child:
-        """The process that talks to the devices."""
+        """The process that communicates with the devices."""
         return self._children[CONTROL]
 
     @property
@@ -113,22 +101,22 @@ class ProcessGroup:
         return self._children[RECORDER]
 
     def fresh(self, process: Process) -> Child:
-        """Return a process that has had no job yet, in place of the one that has.
+        """Return a new process that replaces one with a job.
 
         Raises
         ------
         ChildError
-            If it cannot be started.
+            If the process cannot be started.
         """
         if process in self._used or process not in self._children:
-            if process in self._children:  # the last one may not have been started
+            if process in self._children:  # the previous one may not have been started
                 self._children.pop(process).stop(process.grace_s)
             self._start(process)
         self._used.add(process)
         return self._children[process]
 
     def has_job(self, process: Process) -> bool:
-        """Whether a process has had its job."""
+        """Return whether a process has received its job."""
         return process in self._used
 
     @property
@@ -138,21 +126,21 @@ class ProcessGroup:
 
     @property
     def channels(self) -> "Channels":
-        """The shared memory, laid out."""
+        """The channels in shared memory."""
         assert self._channels is not None
         return self._channels
 
     def lay_out(self, rate_hz: float, *, fast: bool = False, watched: bool = False) -> None:
-        """Size the shared memory for sessions at ``rate_hz``, `fast` under the virtual clock.
+        """Set the size of the shared memory for sessions at a rate.
 
         Parameters
         ----------
         rate_hz
             Ticks a second.
         fast
-            Under the virtual clock.
+            The sessions run under the virtual clock.
         watched
-            Processes that watch samples may be started later.
+            Observers of samples may be started later.
 
         Raises
         ------
@@ -162,7 +150,7 @@ class ProcessGroup:
         from rigd.engine.channels import HURRIED_BUFFERED_S, create_channels
         from rigd.safety.limits import BUFFERED_S
 
-        # Whoever watches samples, as a live view does and a fit, is slower than the virtual clock.
+        # Observers of samples, such as a live view or a fit, are slower than the virtual clock.
         hurried = fast and (self.live or self._also or watched)
         buffered_s = HURRIED_BUFFERED_S if hurried else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
@@ -183,10 +171,10 @@ class ProcessGroup:
         self.end()
 
     def end(self) -> None:
-        """End all processes and give the memory back; harmless when repeated."""
+        """End all processes and release the memory; repeated calls do nothing."""
         if self._channels is not None:
             self._channels.ask_to_stop()
-        with contextlib.ExitStack() as ending:  # which goes on whatever becomes of one of them
+        with contextlib.ExitStack() as ending:  # continues after an error of one of them
             for process in reversed(PROCESSES):
                 if process in self._children:
                     ending.callback(self._children.pop(process).stop, process.grace_s)

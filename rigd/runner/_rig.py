@@ -1,4 +1,4 @@
-"""The rig on which sessions are run: connect, run, tare, zero, status, disconnect."""
+"""The rig: connect, run sessions, tare, zero, status, disconnect."""
 
 import contextlib
 import gc
@@ -19,7 +19,7 @@ from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
-from rigd.runner.session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner.session import SessionFailedError, SessionResult, SessionRun, Watcher, always
 from rigd.runner.signal_blocks import SignalBlock, SignalReader
 from rigd.runner.status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
@@ -27,22 +27,22 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
 _SLOW_PATIENCE_S = 30.0
-"""Time for a heartbeat under the virtual clock, whose ticks may wait for replies."""
+"""Longest time between heartbeats under the virtual clock, whose ticks may wait for replies."""
 _ENABLE_PATIENCE_S = 5.0
 """Time for enabling a drive, during which there is no heartbeat."""
 _PROBE_PATIENCE_S = 60.0
 _ANSWER_PATIENCE_S = 10.0
-"""Time to wait for an answer, beyond the time that is measured."""
+"""Time to wait for an answer, in addition to the measuring time."""
 
 
 class RigError(FailureError):
-    """The rig cannot do what is asked, or is lost; the message is for the operator."""
+    """The rig cannot carry out a request, or is lost; the message is for the operator."""
 
 
 class Rig:
     """The devices of one profile, in separate processes.
 
-    All but :meth:`status` is called from one thread.
+    All methods except :meth:`status` and :meth:`signals` are called from one thread.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ class Rig:
     live
         Show each session in a live view.
     group
-        Processes that have been started already, for the first connection.
+        Processes that are already started, for the first connection.
 
     Attributes
     ----------
     connected
-        The control process owns the devices.
+        Whether the control process owns the devices.
     zero_lost
-        The operator set a zero, and the connection that it belonged to is gone.
+        Whether a zero set by the operator was lost with its connection.
     """
 
     def __init__(
@@ -75,12 +75,12 @@ class Rig:
         self._fast = fast
         self._live = live
         self._group = group
-        self._told: Connected | None = None
+        self._connection: Connected | None = None
         self._view: LiveView | None = None
         self._zero_set = False
         self._pulse = Pulse()
         self._precedence: Precedence | None = None
-        self._looking = threading.Lock()
+        self._status_lock = threading.Lock()
         self._statuses = StatusWatch(profile.rig.rate_hz)
         self._signals = SignalReader(profile)
         self.connected = False
@@ -88,12 +88,12 @@ class Rig:
 
     @property
     def simulated(self) -> bool:
-        """Whether no motor moves; known once connected."""
-        return self._told is not None and self._told.simulated
+        """Whether the rig is simulated; False before the first connection."""
+        return self._connection is not None and self._connection.simulated
 
     @property
     def angle_rad(self) -> float:
-        """Where the motor stands, from the rig's zero.
+        """Motor angle from the rig's zero.
 
         Raises
         ------
@@ -105,12 +105,14 @@ class Rig:
     @property
     def calibration(self) -> Mapping[str, Any] | None:
         """Identity and calibration of the connected sensor; None while not connected."""
-        return None if self._told is None or not self.connected else self._told.calibration
+        return (
+            None if self._connection is None or not self.connected else self._connection.calibration
+        )
 
     @property
     def drive_statement(self) -> Mapping[str, str]:
-        """What the connected drive states of itself; empty while not connected."""
-        return {} if self._told is None or not self.connected else self._told.drive
+        """Metadata that the connected drive states; empty while not connected."""
+        return {} if self._connection is None or not self.connected else self._connection.drive
 
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
@@ -118,22 +120,22 @@ class Rig:
         Parameters
         ----------
         moving
-            What the operator was told would move: anything else is refused.
+            Actuation target that was announced to the operator; any other is refused.
         reset_fault
-            Reset a fault of the drive first: the operator's decision.
+            Reset a fault of the drive first, by decision of the operator.
 
         Raises
         ------
         RigError
-            If that fails; everything is closed again then. Nothing is connected while a value of
-            the profile is unknown.
+            If the connection fails, or a value of the profile is unknown. Everything is closed
+            then.
         """
         if unknown := describe_unknown_values(self._profile.rig):
             raise RigError(f"{unknown}\nThen start the daemon again, which reads the profile once.")
         if self.connected:
             self.disconnect()
         try:
-            # Nobody knows yet what sessions the processes that it starts itself will run.
+            # The sessions of the processes started here are not yet known.
             any_session = self._group is None
             group = self._group = self._group or ProcessGroup(live=self._live)
             granted = self._take_precedence(group)
@@ -142,9 +144,9 @@ class Rig:
             _lay_out(group, self._profile.rig.rate_hz, fast=self._fast, watched=any_session)
             job = ControlJob(self._profile, moving, group.channels.specs, self._fast)
             group.fresh(CONTROL).start(job)
-            told = self._ask(_CONNECT_PATIENCE_S)
-            assert isinstance(told, Connected)
-            self._told = replace(told, realtime={**told.realtime, **granted})
+            connection = self._ask(_CONNECT_PATIENCE_S)
+            assert isinstance(connection, Connected)
+            self._connection = replace(connection, realtime={**connection.realtime, **granted})
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
@@ -168,9 +170,9 @@ class Rig:
         order
             Session to run.
         stop
-            The operator's, which ends it.
+            Stop request of the operator, which ends the session.
         watcher, listens
-            See :class:`rigd.runner.session.Session`.
+            See :class:`rigd.runner.session.SessionRun`.
 
         Raises
         ------
@@ -180,7 +182,7 @@ class Rig:
             If the file cannot be written, or the recorder died.
         """
         group = self._require()
-        assert self._told is not None
+        assert self._connection is not None
         if self.zero_lost:
             raise RigError(
                 "The zero of the angle was lost with the connection, and the limits with it; move "
@@ -190,7 +192,7 @@ class Rig:
             self._precedence.cover()
         _wipe(group.channels.board)
         group.channels.clear()
-        session = Session(order, group, self._told, self._view, watcher, listens)
+        session = SessionRun(order, group, self._connection, self._view, watcher, listens)
         outcome = reason = ""
         try:
             result = replace(session.run(stop), hardware=not self.simulated)
@@ -205,12 +207,12 @@ class Rig:
                 self._view.finish(outcome, reason)
             if session.device_failed:
                 self._await_end()
-            # Between sessions: what a session leaves behind would lie scattered among what stays,
-            # and a long series would take 4 kB more for each.
+            # Between sessions: objects of a session would fragment the memory, and a long series
+            # would take 4 kB more for each session.
             gc.collect()
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Show a session that is about to be run in the live view.
+        """Show the next session in the live view.
 
         Parameters
         ----------
@@ -220,7 +222,7 @@ class Rig:
         Returns
         -------
         str
-            Its address, or why there is none, for the operator.
+            Address of the view, or why there is none, for the operator.
         """
         group = self._require()
         if self._view is None:
@@ -234,22 +236,22 @@ class Rig:
         Returns
         -------
         dict
-            ``mean`` and ``std``: a number an axis (N, N·m); ``torque_std_nm``.
+            ``mean`` and ``std`` by axis (N, N·m), and ``torque_std_nm``.
 
         Raises
         ------
         RigError
-            If it cannot be done.
+            If the tare fails.
         """
         return self._order(Tare(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
-        """Make the motor's present angle the zero to which the limits are relative.
+        """Set the present motor angle as zero; the limits are relative to it.
 
         Returns
         -------
         dict
-            ``moved_rad``: the angle that became 0.
+            ``moved_rad``: the angle before the reset to zero.
 
         Raises
         ------
@@ -266,29 +268,29 @@ class Rig:
         Parameters
         ----------
         profile
-            The rig's; its beam may be another.
+            Profile of the rig, possibly with another beam.
         stop
-            The operator's, which ends it.
+            Stop request of the operator, which ends the move.
 
         Returns
         -------
         dict
-            ``end``: name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
+            ``end``, the name of a `rigd.safety.probing_move.ProbeEnd`, and the fields of a
             `rigd.safety.probe_estimate.ProbeEstimate`.
 
         Raises
         ------
         RigError
-            If it is stopped, an interlock ends it, or the rig is lost.
+            If the move is stopped, an interlock ends it, or the rig is lost.
         """
         group = self._require()
-        board = group.channels.board
+        shared_state = group.channels.board
         if self._precedence is not None:
             self._precedence.cover()
-        _wipe(board)
+        _wipe(shared_state)
 
         def request_stop() -> None:
-            board[Word.STOP] = Stop.OPERATOR
+            shared_state[Word.STOP] = Stop.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
@@ -301,27 +303,27 @@ class Rig:
             raise RigError(str(error)) from None
         finally:
             stop.on_request = _nothing
-            _wipe(board)
+            _wipe(shared_state)
         if isinstance(answer, Refused):
             raise RigError(answer.reason)
         assert isinstance(answer, Measured)
         return answer.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
-        """Wait for the result of a probing move, and watch over the control process meanwhile."""
-        board, pulse = group.channels.board, Pulse()
+        """Wait for the result of a probing move while monitoring the control process."""
+        shared_state, pulse = group.channels.board, Pulse()
         assert CONTROL.hung_after_s is not None
         hung_after_s = _SLOW_PATIENCE_S if self._fast else CONTROL.hung_after_s + _ENABLE_PATIENCE_S
         until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_PATIENCE_S
         while True:
             answer = group.control.poll(_POLL_S)
-            board.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
             if isinstance(answer, Ended):
                 raise RigError(answer.reason or "It was stopped.")
             if answer is not None:
                 return answer
             now_s = time.monotonic()
-            still_s = pulse.look(board[Word.CONTROL_BEAT], now_s)
+            still_s = pulse.look(shared_state[Word.CONTROL_BEAT], now_s)
             if still_s > hung_after_s or now_s > until_s:
                 group.control.kill()
                 raise RigError(
@@ -330,24 +332,24 @@ class Rig:
                 )
 
     def watch(self) -> None:
-        """Check whether the control process is well; call it some times a second between sessions.
+        """Check the control process; call this several times a second between sessions.
 
         Raises
         ------
         RigError
-            If it reported a fault, died or hangs; everything is closed then.
+            If the process reported a fault, died or hangs. Everything is closed then.
         """
         group = self._require()
         if self._view is not None:
-            self._view.look()
+            self._view.check()
         try:
             message = group.control.poll(0.0)
         except ChildError as error:
             message = Ended(str(error))
-        board = group.channels.board
-        board.beat(Word.SUPERVISOR_BEAT)
+        shared_state = group.channels.board
+        shared_state.beat(Word.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
+        still_s = self._pulse.look(shared_state[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             group.control.kill()
             message = Ended(
@@ -360,27 +362,27 @@ class Rig:
 
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
-        with self._looking:
+        with self._status_lock:
             group, view = self._group, self._view
             if group is None or not group.laid_out:
                 return None
             address = None if view is None else view.address
-            return replace(self._statuses.look(group), live_view=address)
+            return replace(self._statuses.read(group), live_view=address)
 
     def signals(self) -> list[SignalBlock]:
-        """Return what has come of the record since the last call, from any thread.
+        """Return the signals of the record since the last call, from any thread.
 
-        It begins with the first call, and again if the last one is more than 1 s ago.
+        Reading starts with the first call, and again if the last call was more than 1 s ago.
         """
-        with self._looking:
+        with self._status_lock:
             group = self._group
             if group is None or not group.laid_out:
                 return []
             return self._signals.take(group.channels)
 
     def disconnect(self) -> None:
-        """Disable the drive, close the devices, end the processes; harmless when repeated."""
-        with self._looking:
+        """Disable the drive, close the devices, end the processes; repeated calls do nothing."""
+        with self._status_lock:
             group, self._group = self._group, None
             self._view = None
             self.connected = False
@@ -391,7 +393,7 @@ class Rig:
             self._precedence = None
 
     def _take_precedence(self, group: ProcessGroup) -> dict[str, str]:
-        """Put this process before the ordinary ones; say what was granted."""
+        """Raise the priority of this process; return what the system granted."""
         if self._fast:
             return {}
         realtime = self._profile.realtime
@@ -401,7 +403,7 @@ class Rig:
 
     def _reset_fault(self, moving: WhatMoves | None) -> None:
         try:
-            from rigd.devices import reset_drive  # loads the drivers, which no other order needs
+            from rigd.devices import reset_drive  # late: loads the drivers, needed only here
 
             reset_drive(self._profile.rig, moving)
         except (DeviceError, OSError) as error:
@@ -413,7 +415,7 @@ class Rig:
         return self._group
 
     def _order(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
-        """Have the control process measure something between sessions."""
+        """Send a measuring order to the control process between sessions, and return the result."""
         group = self._require()
         try:
             group.control.send(order)
@@ -427,7 +429,7 @@ class Rig:
         return answer.values
 
     def _ask(self, patience_s: float) -> object:
-        """Wait for what the control process answers.
+        """Wait for an answer of the control process.
 
         Raises
         ------
@@ -448,7 +450,7 @@ class Rig:
         return answer
 
     def _await_end(self) -> None:
-        """Let a control process whose device failed close what can be closed."""
+        """Wait until a control process with a failed device has closed the others."""
         assert self._group is not None
         with contextlib.suppress(ChildError):
             self._group.control.poll(_ANSWER_PATIENCE_S)
@@ -456,16 +458,16 @@ class Rig:
 
 
 def _nothing() -> None:
-    """Leave a stop request to whoever polls it."""
+    """Do nothing: the stop request is polled."""
 
 
-def _wipe(board: SharedState) -> None:
-    """Clear the words of the board that belong to one session."""
-    board[Word.STOP] = Stop.NO
-    board[Word.GO] = 0
-    board[Word.LIVE_DROPPED] = 0
-    board[Word.PLANNED] = 0
-    board[Word.LAST_PIECE] = 0
+def _wipe(shared_state: SharedState) -> None:
+    """Clear the fields of the shared state that belong to one session."""
+    shared_state[Word.STOP] = Stop.NO
+    shared_state[Word.GO] = 0
+    shared_state[Word.LIVE_DROPPED] = 0
+    shared_state[Word.PLANNED] = 0
+    shared_state[Word.LAST_PIECE] = 0
 
 
 def _lay_out(group: ProcessGroup, rate_hz: float, *, fast: bool, watched: bool) -> None:

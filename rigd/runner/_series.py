@@ -1,7 +1,6 @@
-"""Series: the sessions of one request, planned once and run one after the other.
+"""Series: the sessions of one request, planned once and run in sequence.
 
-`rigd run` and the daemon run their sessions by it; whom they tell of it is theirs to say
-(`SeriesWatcher`).
+`rigd run` and the daemon use it, each with its own observer (`SeriesWatcher`).
 """
 
 import contextlib
@@ -22,9 +21,9 @@ from rigd.runner.request import Order, check_required, choose_path, make_room
 from rigd.runner.session import SessionProgress, SessionResult, always
 from rigd.runtime import StopRequest
 
-_LOOK_PATIENCE_S: Final = 8.0
-"""Longest pause between two sessions of a series for the quick look at the first: two or three
-seconds are enough for most. What is not done by then is suspended."""
+_QUICK_LOOK_PATIENCE_S: Final = 8.0
+"""Longest pause between two sessions for the quick look at the first one, which mostly takes two or
+three seconds. If it is unfinished, it is suspended."""
 _POLL_S: Final = 0.05
 
 
@@ -32,19 +31,19 @@ class SeriesWatcher(Protocol):
     """Observer of a series; these methods are called in this order for each of its sessions."""
 
     def begins(self, number: int, path: Path) -> None:
-        """Take note of the next session, from 1 on, and its file; an error ends the series."""
+        """Receive number and file of the next session, from 1; an error ends the series."""
 
     def says(self, level: Literal["info", "warning"], text: str) -> None:
-        """Take note of what comes before the first session."""
+        """Receive a message before the first session."""
 
     def shown(self, where: str) -> None:
-        """Take note of where its live view is, or why there is none."""
+        """Receive the address of the live view, or why there is none."""
 
     def update(self, progress: SessionProgress, events: list[Event]) -> None:
-        """Take note of the progress and of what happened, some fifty times a second."""
+        """Receive progress and events, about fifty times a second."""
 
     def ended(self, result: SessionResult, *, look_follows: bool) -> None:
-        """Take note of how it ended, and whether a quick look at it follows."""
+        """Receive the result, and whether a quick look follows."""
 
 
 class Series:
@@ -55,38 +54,38 @@ class Series:
     profile, excitation
         Rig and excitation of each session.
     folder
-        Where the files go; made if it does not exist.
+        Folder of the session files; created if it does not exist.
     repeat
         Number of sessions.
     notes
-        Operator, specimen, note and added metadata; what is empty is left out. The beam of a
-        specimen that has a file is in the profile already.
+        Operator, specimen, note and added metadata; empty texts are omitted. The profile already
+        has the beam of a specimen with a file.
     force
         See :func:`rigd.runner.planning.plan_session`.
     accept
-        Names of rows of `rigd check` that may fail; those that do are recorded in the files.
+        Names of rows of `rigd check` that may fail; the failed ones are recorded in the files.
     watch_fit
         Fit each record while it is recorded.
     identifies_motor
-        The sessions are to measure the motor: a probing move then verifies only what the bounds of
-        travel and speed rest on.
+        The sessions measure the motor. A probing move then verifies only the values that the limits
+        of travel and speed depend on.
 
     Attributes
     ----------
     plan
-        What each session is predicted to do.
+        Predicted behaviour of each session.
     results
-        How the sessions so far ended.
+        Results of the sessions so far.
 
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check on paper fails that is not accepted, or `accept` names no row.
+        If a check on paper fails and is not accepted, or `accept` has an unknown name.
     RefusedError, ControlDesignError, RealisationError
         If the sessions would leave the limits, cannot be predicted, or lack metadata that the
         profile requires.
     NoRoomError
-        If there is no room for the first one.
+        If the disk has no room for the first session.
     """
 
     def __init__(
@@ -126,11 +125,11 @@ class Series:
         return int(self._excitation.reference_rad.size)
 
     def frequency_hz(self, tick: int) -> float | None:
-        """Return the frequency of the excitation at a tick, where it has one."""
+        """Return the frequency of the excitation at a tick; None if it has none."""
         return present_frequency_hz(self._excitation, tick)
 
     def plan_document(self) -> dict[str, Any]:
-        """Return the plan as JSON documents have it."""
+        """Return the plan for JSON."""
         return plan_document(self._profile, self._excitation, self.plan)
 
     def run(
@@ -143,16 +142,16 @@ class Series:
         listens: Callable[[], bool] = always,
         looks: QuickLooks | None = None,
     ) -> None:
-        """Run the sessions, up to a stop or the first that does not end well.
+        """Run the sessions; end at a stop or at the first incomplete session.
 
-        Each waits until the beam has come to rest from the one before.
+        Each session waits until the beam is at rest.
 
         Parameters
         ----------
         rig
-            Connected.
+            The connected rig.
         stop
-            The operator's.
+            Stop request of the operator.
         watcher
             Observer of the series.
         live
@@ -160,14 +159,14 @@ class Series:
         listens
             See :class:`rigd.runner.session.Session`.
         looks
-            Takes a quick look at each session; the next one waits some seconds for it.
+            Makes a quick look at each session; the next session waits some seconds for it.
 
         Raises
         ------
         NoRoomError
-            If there is no room for a further session.
+            If the disk has no room for a further session.
         RigError, SessionFailedError
-            If a session cannot be run, or failed; it is not among the results.
+            If a session cannot be run, or failed; its result is not stored.
         ProbeFailedError
             If a probing move before the first session shows that the rig contradicts its profile.
         """
@@ -179,7 +178,7 @@ class Series:
             raise
         for number in range(1, self._repeat + 1):
             if looks is not None and number > 1:
-                _await_look(looks, rig, stop)
+                _await_quick_look(looks, rig, stop)
             if stop.requested:
                 return
             self._make_room()
@@ -209,7 +208,7 @@ class Series:
                     watcher.shown(rig.show(order, stop))
                 result = rig.run(order, stop, watcher.update, listens)
             self.results.append(result)
-            # A move that leaves no vibration shows nothing of the modes.
+            # The record of a vibration-free move contains no information on the modes.
             seen = result.path if self._excitation.shows_modes else None
             watcher.ended(result, look_follows=looks is not None and seen is not None)
             if looks is not None and seen is not None:
@@ -225,7 +224,7 @@ class Series:
         return session_seed(simulation.seed, number)
 
     def _probe(self, rig: Rig, stop: StopRequest, watcher: SeriesWatcher) -> dict[str, str]:
-        """Make a probing move where motor and encoder are not known; return its metadata."""
+        """Make a probing move if motor and encoder are not known; return its metadata."""
         if self._profile.rig.devices.drive == "sim":
             return {}
         from rigd.runner import _probing  # late: a simulation in this process needs none
@@ -239,9 +238,9 @@ class Series:
         make_room(self._folder, self._excitation, self._profile.limits)
 
 
-def _await_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
-    """Give the quick look at the last session its time, before the next one suspends it."""
-    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+def _await_quick_look(looks: QuickLooks, rig: Rig, stop: StopRequest) -> None:
+    """Wait for the quick look at the last session before the next session suspends it."""
+    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
     while looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.watch()
         looks.attend()

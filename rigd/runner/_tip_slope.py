@@ -1,7 +1,7 @@
-"""Slope of the antenna's tip: the limit of an identification, and what a plan says of it.
+"""Slope of the antenna's tip: its limit in identifications, and its description in plans.
 
-The exact model (`rigd.beam`) is exact for small slopes. How far a session may go beyond them is
-`limits.tip_slope_rad` of the profile, or `--tip-slope` of the session.
+The exact model (`rigd.beam`) is valid for small slopes. `limits.tip_slope_rad` of the profile or
+`--tip-slope` of the session limits the slope.
 """
 
 import math
@@ -18,7 +18,7 @@ PAPER_AMPLITUDE_RAD: Final = 0.025
 """Amplitude of the reference paper's chirp, up to which chirps are exempt from the limit."""
 
 NOT_IDENTIFYING: Final = ("move", "touch")
-"""Excitations that go to an angle: they know where they start, and have no amplitude."""
+"""Excitations with a target angle: they depend on the start angle and have no amplitude."""
 
 _MEANING: Final = {
     "move": ", so that more vibration may be left than predicted",
@@ -27,7 +27,7 @@ _MEANING: Final = {
 
 
 class TipSlopeError(UserError):
-    """The largest slope of the tip that an operator gives cannot be used."""
+    """The operator's limit of the tip slope cannot be used."""
 
 
 def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
@@ -55,15 +55,15 @@ def with_tip_slope(profile: Profile, tip_slope_rad: float | None) -> Profile:
 
 
 def is_limited(excitation: Excitation) -> bool:
-    """Whether a session identifies the antenna, so that the limit of the slope holds for it."""
+    """Return whether the slope limit applies: the session identifies the antenna."""
     if excitation.kind == "chirp":
         return not is_exempt(excitation)
-    # Sessions that identify the motor are of other kinds: they do not rest on a model of the beam.
+    # Sessions that identify the motor have other kinds: they do not depend on a beam model.
     return excitation.kind in KINDS and excitation.kind not in NOT_IDENTIFYING
 
 
 def is_exempt(excitation: Excitation) -> bool:
-    """Whether it is a chirp of the reference paper's amplitude at most."""
+    """Return whether the excitation is a chirp of at most the reference paper's amplitude."""
     return (
         excitation.kind == "chirp"
         and abs(float(excitation.parameters["amplitude_rad"])) <= PAPER_AMPLITUDE_RAD
@@ -71,12 +71,12 @@ def is_exempt(excitation: Excitation) -> bool:
 
 
 def is_physical(tip: TipMotion, beam: Beam) -> bool:
-    """Whether the predicted motion is possible: no further than the length, error below 100 %."""
+    """Return whether the motion is possible: deflection up to the length, error below 100 %."""
     return tip.deflection_m <= beam.length_m and linear_model_error(tip.slope_rad) < 1.0
 
 
 def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
-    """Return the predicted motion of the tip as JSON documents have it."""
+    """Return the predicted motion of the tip for JSON."""
     if tip is None:
         return None
     return {
@@ -87,7 +87,7 @@ def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
 
 
 def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> str:
-    """Say how a session that exceeds the limit can be run."""
+    """Return how a session beyond the limit can be changed or allowed."""
     lower = ""
     if excitation.kind == "file":
         factor = _rounded_down(limit_rad / slope_rad)
@@ -102,7 +102,7 @@ def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> 
 
 
 def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> str:
-    """Say what the tip will do, and how exact the linear model is there; empty without a beam."""
+    """Describe the tip motion and the error of the linear model; empty without a beam."""
     if tip is None:
         return ""
     error = linear_model_error(tip.slope_rad)
@@ -141,5 +141,5 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
 
 
 def _rounded_down(factor: float) -> float:
-    """Round a factor down to two digits behind the point."""
+    """Round a factor down to two decimals."""
     return math.floor(100.0 * factor) / 100.0

@@ -1,7 +1,7 @@
-"""Search for an obstacle: what loop and estimator are told, and what comes of a session's touches.
+"""Search for an obstacle: settings of detector and estimator, and the estimates of the touches.
 
-The control loop detects a touch and reacts by itself. The touch process estimates it meanwhile; a
-session goes on without it if it is lost.
+The control loop detects a touch and reacts by itself. The touch process estimates position and
+force at the same time. A session continues without the touch process if it is lost.
 """
 
 import time
@@ -27,37 +27,24 @@ if TYPE_CHECKING:
     from rigd.touch import Noise, SensorFilter, TouchModel
 
 _STEP_STD: Final = 1 / sqrt(12)
-"""Standard deviation of a value that is rounded to steps of 1."""
+"""Standard deviation of the rounding error for steps of 1."""
 _LAST_PATIENCE_S: Final = 30.0
-"""Time for the last estimate after the end of a record; one that takes longer is not told."""
+"""Time for the last estimate after the end of a record; a later estimate is not reported."""
 _POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class TouchSearch:
-    """The obstacle to look for, for both processes."""
+    """Settings of the search for an obstacle."""
 
     order: TouchOrder
-    """For the control loop."""
+    """Settings of the control loop."""
     model: "TouchModel"
-    """For the estimator."""
+    """Model of the estimator."""
 
 
 def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None:
-    """Return what a session is to look for; None: nothing.
-
-    Parameters
-    ----------
-    profile
-        Profile of the rig.
-    excitation
-        Reference, with its approach if it is a search.
-
-    Raises
-    ------
-    IdentifiedBeamError
-        If the document of the model is not what it should be.
-    """
+    """Return the touch search of an excitation; None for an excitation without an approach."""
     if excitation.approach is None:
         return None
     from rigd.touch import DetectorSettings, TouchModel, watched_beam
@@ -81,7 +68,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
 
 
 def _sensor_filter(rig: RigParameters) -> "SensorFilter":
-    """Return the filters between beam and samples that a profile states."""
+    """Return the sensor filters that a profile states."""
     from rigd.touch import SensorFilter
 
     low_pass = rig.sensor.filter_hz, rig.sensor.filter_order
@@ -93,7 +80,7 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
 
 
 def _noise(profile: Profile) -> "Noise":
-    """Return the noise of the readings, of which the ratio counts: its size is measured at rest."""
+    """Return the noise of the readings; only the ratio matters, its size is measured at rest."""
     from rigd.touch import Noise
 
     rig = profile.rig
@@ -108,19 +95,7 @@ def _noise(profile: Profile) -> "Noise":
 
 
 class TouchEstimates:
-    """What the touch process tells of one session.
-
-    Parameters
-    ----------
-    group
-        Processes of the rig, their memory laid out.
-    search
-        The obstacle that is looked for.
-    rate_hz
-        Ticks a second.
-    realtime
-        Where the loop runs; None: not in real time.
-    """
+    """Supervise the touch process of one session and collect its estimates."""
 
     def __init__(
         self,
@@ -135,7 +110,7 @@ class TouchEstimates:
         self._news: list[dict[str, Any]] = []
         self._lost = ""
         self._ready = False
-        self._told: dict[int, TouchTold] = {}
+        self._reports: dict[int, TouchTold] = {}
         job = TouchJob(
             group.channels.specs,
             group.channels.samples.written,
@@ -150,63 +125,46 @@ class TouchEstimates:
             self._lose(str(error))
 
     def await_ready(self, meanwhile: Callable[[], bool]) -> None:
-        """Wait until the process can estimate, or is lost.
-
-        Parameters
-        ----------
-        meanwhile
-            Called some times a second; says whether to go on waiting.
-        """
+        """Wait until the process is ready or lost, as long as `meanwhile` returns True."""
         late = await_ready(lambda: self._ready or bool(self._lost), self._listen, meanwhile)
         if late:
             self._lose(f"The touch process was {late}.")
 
     def listen(self, patience_s: float) -> bool:
-        """Wait for an estimate at most so long; say whether there is somebody to wait for."""
+        """Wait for an estimate for at most `patience_s`; return whether the process is running."""
         self._listen(patience_s)
         return not self._lost
 
-    def attend(self) -> list[Event]:
-        """Take what has come, and return what the operator is to be told."""
+    def poll(self) -> list[Event]:
+        """Read the received messages, and return the events for the operator."""
         self._listen(0.0)
         events, self._events = self._events, []
         return events
 
     def finish(self, touches: int, meanwhile: Callable[[], None]) -> list[dict[str, Any]]:
-        """Wait for the last estimates; return what is known of each touch.
+        """Wait for the last estimates of all detected touches; return each touch for JSON.
 
-        Parameters
-        ----------
-        touches
-            How many the loop has detected.
-        meanwhile
-            Called some times a second.
-
-        Returns
-        -------
-        list of dict
-            In the order in which they happened, as in JSON documents; of one that was not
-            estimated there is its number alone, and ``final`` is false of a first estimate that no
-            better one followed.
+        A touch without an estimate has its number alone. ``final`` is false for a first estimate
+        without a better one.
         """
         deadline_s = time.monotonic() + _LAST_PATIENCE_S
 
         def missing() -> bool:
-            final = [told for told in self._told.values() if told.final]
+            final = [report for report in self._reports.values() if report.final]
             return len(final) < touches and not self._lost and time.monotonic() < deadline_s
 
         while missing():
             self._listen(_POLL_S)
             meanwhile()
-        return [_document(number, self._told.get(number)) for number in range(1, touches + 1)]
+        return [_document(number, self._reports.get(number)) for number in range(1, touches + 1)]
 
     def packed(self) -> bytes:
         """Return the last estimates as messages for the session file."""
-        touches = [(told.tick, told.document) for _, told in sorted(self._told.items())]
+        touches = [(report.tick, report.document) for _, report in sorted(self._reports.items())]
         return packed_touches(touches, self._rate_hz)
 
     def news(self) -> list[dict[str, Any]]:
-        """Return the estimates that came since the last time, for the live view."""
+        """Return the estimates received since the last call, for the live view."""
         news, self._news = self._news, []
         return news
 
@@ -218,13 +176,13 @@ class TouchEstimates:
                 if isinstance(message, TouchReady):
                     self._ready = True
                 elif isinstance(message, TouchTold):
-                    self._told[message.number] = message
+                    self._reports[message.number] = message
                     self._note(message)
         except ChildError as error:
             self._lose(str(error))
 
-    def _note(self, told: TouchTold) -> None:
-        touch = _document(told.number, told)
+    def _note(self, report: TouchTold) -> None:
+        touch = _document(report.number, report)
         self._news.append(touch)
         self._events.append(Event(0, "info", touch_line(touch), notable=True))
 
@@ -234,8 +192,8 @@ class TouchEstimates:
         self._events.append(Event(0, "warning", text))
 
 
-def _document(number: int, told: TouchTold | None) -> dict[str, Any]:
-    if told is None:
+def _document(number: int, report: TouchTold | None) -> dict[str, Any]:
+    if report is None:
         return {"number": number}
-    # The better estimate that a first one announces may never come.
-    return {"number": number, **told.document, **({} if told.final else {"final": False})}
+    # A first estimate may be the only one.
+    return {"number": number, **report.document, **({} if report.final else {"final": False})}

@@ -1,9 +1,10 @@
-"""The fit process: fits the record of a running session, and plans what is excited next.
+"""The fit process: fits the record of a running session and plans the next excitation.
 
-It watches the ring of samples as the live publisher does, so that it can neither delay the loop nor
-take a sample from the recorder, and hands them to the program of the analyser that fits them
-(``python -m analysis.online``). What that answers goes to the supervisor. Where the session goes on
-until a precision is reached, the answer decides on the next piece of the reference (`Search`).
+The process observes the ring of samples as the live publisher does, so that it neither delays the
+loop nor takes samples from the recorder. It passes the samples to the analyser's fit program
+(``python -m analysis.online``) and the answers to the supervisor. If the session runs until a
+precision is reached, each answer also decides on the next segment of the reference
+(`ExcitationPlanner`).
 """
 
 import contextlib
@@ -21,7 +22,7 @@ from rigd.engine.processes import Parent
 from rigd.engine.realtime import keep_off_loop
 from rigd.engine.reference import PieceWriter
 from rigd.engine.shared_state import Word
-from rigd.runner._precision_search import Search
+from rigd.runner._precision_search import ExcitationPlanner
 from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.layout import SAMPLE_SIZE, decode_samples
@@ -38,14 +39,14 @@ _PROGRAM: Final = "analysis.online"
 _BLOCK: Final = 500
 _IDLE_S: Final = 0.005
 _EVERY_S: Final = 1.0
-"""Time between two fits of a session that is only watched."""
+"""Time between two fits of a session with a given reference."""
 _GRACE_S: Final = 1.0
-_FIRST_ASKED: Final = 1_000_000_000
-"""Numbers of the estimates that are asked for; those made unasked count from 0 on."""
+_FIRST_REQUEST: Final = 1_000_000_000
+"""First id of requested estimates; the ids of periodic estimates start at 0."""
 
 
 class FitProgramError(Exception):
-    """The fit program ended; the message says how."""
+    """The fit program ended; the message states how."""
 
 
 def main() -> None:
@@ -68,7 +69,7 @@ def main() -> None:
 
 
 class FitProgram:
-    """The analyser's program that fits; leaving its context ends it."""
+    """The analyser's fit program; leaving the context ends it."""
 
     def __init__(self) -> None:
         try:
@@ -83,18 +84,12 @@ class FitProgram:
                 f"The fit program cannot be started ({error.strerror})."
             ) from None
         self.input = cast("BinaryIO", self._process.stdin)
-        """Takes a stream as `rigd.session` writes it."""
+        """Input stream, in the format of `rigd.session.online_fit`."""
         self._answers: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._read, daemon=True).start()
 
     def answer(self) -> dict[str, Any] | None:
-        """Return an answer, or None if none has come.
-
-        Raises
-        ------
-        FitProgramError
-            If the program has ended.
-        """
+        """Return the next answer, or None if there is none; raise if the program has ended."""
         try:
             answer = self._answers.get_nowait()
         except queue.Empty:
@@ -104,14 +99,14 @@ class FitProgram:
         return answer
 
     def ended(self) -> FitProgramError:
-        """Return how the program has ended."""
+        """Return an error that states how the program ended."""
         code = self._process.wait()
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return FitProgramError(f"The fit program {how}.")
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        with contextlib.suppress(ValueError):  # not whole: it ended while it wrote
+        with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
             for line in self._process.stdout:
                 self._answers.put(json.loads(line))
         self._answers.put(None)
@@ -130,28 +125,28 @@ class FitProgram:
 
 
 class _Follower:
-    """Follows one session from its first sample to the fit of the whole record."""
+    """Fit one session, from its first sample to the fit of the whole record."""
 
     def __init__(
         self, job: FitJob, parent: Parent, program: FitProgram, channels: Channels
     ) -> None:
         self._parent = parent
         self._program = program
-        self._board = channels.board
+        self._shared_state = channels.board
         self._reader = Observer(channels.samples, job.first)
         self._job = job
-        self._search: Search | None = None
-        self._asked: EstimateRequest | None = None
+        self._search: ExcitationPlanner | None = None
+        self._pending: EstimateRequest | None = None
         self._ahead = False
         self._before: dict[str, Any] | None = None
         self._ticks = self._number = 0
         self._ended_after: int | None = None
 
     def follow(self) -> None:
-        """Serve until the whole record is fitted, or the supervisor is gone."""
+        """Run until the whole record is fitted, or the supervisor has ended."""
         self._parent.send(FitReady())
         while True:
-            self._board.beat(Word.FIT_BEAT)
+            self._shared_state.beat(Word.FIT_BEAT)
             moved = self._feed()
             answer = self._program.answer()
             if answer is not None and self._answered(answer):
@@ -167,22 +162,25 @@ class _Follower:
                 case RecordEnded(ticks):
                     self._ended_after = ticks
                     if self._search is not None and self._search.due is not None:
-                        before, begun = self._board[Word.HELD_BEFORE], self._board[Word.BEGUN]
+                        before, begun = (
+                            self._shared_state[Word.HELD_BEFORE],
+                            self._shared_state[Word.BEGUN],
+                        )
                         self._parent.send(self._search.ended(ticks, before, begun))
 
     def _begin(self, header: FileHeader) -> None:
-        """Begin with what the file says of the session."""
+        """Start the fits with the header of the session file."""
         job = self._job
         if job.search is not None:
-            writer = PieceWriter(job.reference, self._board)
+            writer = PieceWriter(job.reference, self._shared_state)
             start_rad = float(header.metadata["start_angle_rad"])
-            self._search = Search(job.search, job.profile, writer, start_rad=start_rad)
+            self._search = ExcitationPlanner(job.search, job.profile, writer, start_rad=start_rad)
         every_s = _EVERY_S if job.search is None else None
         start = StreamStart(dict(header.metadata), dict(header.segments), every_s)
         write_start(self._program.input, start)
 
     def _feed(self) -> bool:
-        """Hand on what was recorded; say whether there was anything."""
+        """Pass recorded samples to the fit program; return whether there were any."""
         block = self._reader.take(_BLOCK)
         if not block:
             return False
@@ -191,8 +189,8 @@ class _Follower:
         return True
 
     def _ask(self, *, drained: bool) -> None:
-        """Ask for the next estimate once the samples that it rests on are there."""
-        if self._asked is not None:
+        """Request the next estimate as soon as its samples are available."""
+        if self._pending is not None:
             return
         search = self._search
         if self._ended_after is not None:
@@ -201,31 +199,31 @@ class _Follower:
         elif (
             search is not None
             and search.due is not None
-            and search.is_begun(self._board[Word.BEGUN])
+            and search.is_begun(self._shared_state[Word.BEGUN])
         ):
-            # Read after the samples: the loop counts what it holds before it gives the sample.
-            tick = search.due + self._board[Word.HELD]
+            # Read after the samples: the loop counts a held tick before it publishes the sample.
+            tick = search.due + self._shared_state[Word.HELD]
             if self._ticks >= tick:
                 self._request(tick, whole=search.may_be_last, from_last=True)
 
     def _request(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
         self._number += 1
-        self._asked = EstimateRequest(_FIRST_ASKED + self._number, tick, whole, from_last)
-        write_request(self._program.input, self._asked)
+        self._pending = EstimateRequest(_FIRST_REQUEST + self._number, tick, whole, from_last)
+        write_request(self._program.input, self._pending)
 
     def _answered(self, answer: dict[str, Any]) -> bool:
-        """Tell of an estimate, and plan by it; say whether it is of the whole record."""
-        asked, search = self._asked, self._search
-        if asked is not None and asked.id != answer["id"]:
-            asked = None
-        # The last estimate alone is asked for from nothing.
-        final = asked is not None and asked.tick == self._ended_after and not asked.from_last
+        """Report an estimate and plan with it; return whether it is of the whole record."""
+        request, search = self._pending, self._search
+        if request is not None and request.id != answer["id"]:
+            request = None
+        # Only the last estimate is requested without start values from the previous one.
+        final = request is not None and request.tick == self._ended_after and not request.from_last
         ahead = self._ahead
-        if asked is not None:
-            self._asked, self._ahead = None, False
+        if request is not None:
+            self._pending, self._ahead = None, False
         if search is not None and not final:
-            if asked is not None and self._ended_after is None and not ahead:
-                self._decide(search, asked, answer)
+            if request is not None and self._ended_after is None and not ahead:
+                self._decide(search, request, answer)
             return False
         answer["text"] = estimate_lines(answer, self._before)
         if search is None:
@@ -235,15 +233,16 @@ class _Follower:
         self._parent.send(FitTold(answer, final=final))
         return final
 
-    def _decide(self, search: Search, asked: EstimateRequest, answer: dict[str, Any]) -> None:
-        """Plan by an estimate."""
-        held, before = self._board[Word.HELD], self._board[Word.HELD_BEFORE]
-        for message in search.answered(answer, held, before):
+    def _decide(
+        self, search: ExcitationPlanner, request: EstimateRequest, answer: dict[str, Any]
+    ) -> None:
+        """Plan the next segment from an estimate."""
+        held, before = self._shared_state[Word.HELD], self._shared_state[Word.HELD_BEFORE]
+        for message in search.decide(answer, held, before):
             self._parent.send(message)
-        if search.looks_ahead:
-            # Nobody waits yet: the judgement of all of it starts from what all structures make of
-            # the samples before.
-            self._request(asked.tick, whole=True, from_last=True)
+        if search.needs_early_fit:
+            # This fit of all structures gives start values for the check of the whole record.
+            self._request(request.tick, whole=True, from_last=True)
             self._ahead = True
 
 

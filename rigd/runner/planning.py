@@ -1,4 +1,4 @@
-"""Planning of a session, before anything moves: stability of the loop, peaks, limits."""
+"""Planning of a session before any motion: stability of the loop, predicted peaks, limits."""
 
 import inspect
 import math
@@ -42,7 +42,7 @@ Complex = NDArray[np.complex128]
 
 
 _MOST_RAD = 2.0 * math.pi
-"""Largest amplitude that an excitation takes."""
+"""Largest permitted amplitude of an excitation."""
 _ROUNDS = 10
 """Steps of the search for the largest amplitude; three or four are needed."""
 _NO_FORCE = (
@@ -52,14 +52,15 @@ _NO_FORCE = (
 
 
 class RefusedError(UserError):
-    """A session would leave the limits of the profile; the message says which, and the remedy."""
+    """A session would exceed limits of the profile; the message states them and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
-    """Largest magnitudes of a session that starts at the rig's zero, from the linear closed loop.
+class SessionPrediction:
+    """Predicted peak magnitudes of a session that starts at the rig's zero.
 
-    The torque is not limited: what saturates shows as a peak beyond the motor's.
+    The prediction uses the linear closed loop without torque limit: saturation shows as a peak
+    above the motor's peak torque.
     """
 
     peak_angle_rad: float
@@ -69,7 +70,7 @@ class Prediction:
     peak_torque_nm: float
     """Torque command at the output shaft."""
     peak_tracking_error_rad: float
-    """Reference minus angle."""
+    """Reference less angle."""
     peak_coupling_torque_nm: float
     """Torque between hub and antenna."""
     tip: TipMotion | None = None
@@ -78,31 +79,31 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a session is predicted to do, and whether the limits allow it."""
+    """Prediction of a session, and whether the limits allow it."""
 
-    prediction: Prediction
-    """What the session is predicted to do."""
+    prediction: SessionPrediction
+    """Predicted peaks."""
     warnings: tuple[str, ...]
     """Sentences for the operator."""
     tip_in_words: str
-    """What the free end will do, and whether the linear model holds there."""
+    """Description of the motion of the free end and of the validity of the linear model."""
     refused: str = ""
-    """Why it must not be run: a line for each limit that it would leave; empty if it may be run."""
+    """Reasons against running it, one line for each exceeded limit; empty if it may be run."""
     ending: Ending = field(default_factory=Ending)
-    """What follows the record, for the control process."""
+    """Motion after the record, for the control process."""
     clearance: Clearance = field(default_factory=Clearance)
-    """What the checks on paper found."""
+    """Results of the checks on paper."""
 
 
 class LoopPreview:
-    """Loop preview: what an excitation made for one rig may know of it.
+    """Preview of the closed loop of a rig, for the design of an excitation.
 
     Parameters
     ----------
     profile
         Profile of the rig. Its closed loop is computed when first needed.
     start_rad
-        Where the motor stands, from the rig's zero.
+        Motor angle at the start, from the rig's zero.
     """
 
     def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
@@ -112,7 +113,7 @@ class LoopPreview:
 
     @property
     def beam(self) -> Beam:
-        """The specimen as the profile has it."""
+        """Beam of the profile."""
         return self._profile.rig.beam
 
     @property
@@ -122,7 +123,7 @@ class LoopPreview:
 
     @property
     def stated_estimate(self) -> BeamEstimate:
-        """The specimen as the profile has it, with the noise of the sensor, all of it free."""
+        """Beam estimate with the values of the profile and the noise of the sensor, all free."""
         rig = self._profile.rig
         density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
         tip_mass_kg = self._profile.loop_model().tip_mass_kg
@@ -133,36 +134,35 @@ class LoopPreview:
         return stable_loop(self._profile.loop_model())[0]
 
     def tracking(self, frequency_hz: Real) -> Complex:
-        """Angle over reference at some frequencies, of the shape given."""
+        """Return the frequency response from reference to angle, in the shape of the input."""
         return self._loop.response(frequency_hz)
 
     def share_of_limits(self, reference_rad: Real) -> float:
-        """Largest share of a limit that a reference (n,) is predicted to take.
+        """Return the largest predicted peak of a reference (n,) as a fraction of its limit.
 
         Raises
         ------
         ControlDesignError
-            If the loop is unstable and the response grows beyond all numbers.
+            If the loop is unstable and the response overflows.
         """
         response = self._loop.simulate(reference_rad)
         firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
-        return _share(firm + forcible)
+        return _largest_fraction(firm + forcible)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the rig for planning a move.
+        """Return the rig model for the planning of a move.
 
         Parameters
         ----------
         path
-            Document of ``analyze --json``, whose beam takes the place of the profile's; empty: the
-            profile's.
+            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
         use
-            What the beam is for.
+            Purpose of the beam.
 
         Raises
         ------
         IdentifiedBeamError
-            If the document is not what it should be, or has what this use does not account for.
+            If the document is invalid, or has an effect that this use does not model.
         ControlDesignError
             If the loop is unstable with that beam.
         RealisationError
@@ -173,22 +173,22 @@ class LoopPreview:
         return move_plant_of(self._profile, model, _sensor_limit_nm(self._profile), found)
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
-        """Largest slope of the free end that is predicted for a reference (n,)."""
+        """Return the largest predicted slope of the free end for a reference (n,)."""
         angle_rad = self._loop.simulate(reference_rad).angle_rad
         rig = self._profile.rig
         return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
 
     def plant_with(self, beam: LoadedBeam) -> MovePlant:
-        """Return the rig with an estimated beam, for the design of excitation.
+        """Return the rig model with an estimated beam, for the design of excitation.
 
-        Where the loop cannot be computed with its damping, that of the profile is taken: the motor
-        hardly moves otherwise for it, since the coupling torque is fed forward. The last one is
-        kept: a decision asks for it several times.
+        If the loop cannot be computed with the estimated damping, that of the profile is used. The
+        effect on the motor is small, because the coupling torque is fed forward. The last model is
+        cached.
 
         Parameters
         ----------
         beam
-            The beam as estimated, with what is at its ends.
+            The estimated loaded beam.
 
         Raises
         ------
@@ -222,7 +222,7 @@ def excitation_for(
     kind, parameters
         Name and options of the excitation.
     start_rad
-        Where the motor stands, from the rig's zero; only a move asks for it.
+        Motor angle at the start, from the rig's zero; used only by a move.
     """
     if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
         parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
@@ -232,7 +232,7 @@ def excitation_for(
 def plan_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
-    """Predict a session and refuse one that the checks on paper or the profile's limits forbid.
+    """Predict a session; raise if the checks on paper or the limits of the profile forbid it.
 
     Parameters
     ----------
@@ -242,9 +242,9 @@ def plan_session(
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check on paper fails that is not accepted, or `accept` names no row.
+        If a check on paper fails and is not accepted, or `accept` has an unknown name.
     RefusedError
-        Naming every limit the session would leave, and the largest amplitude that passes.
+        If the session would exceed limits: names each of them and the largest possible amplitude.
     ControlDesignError, RealisationError, UnknownValueError
         As `predict_session`.
     """
@@ -265,15 +265,15 @@ def predict_session(
     profile, excitation
         Rig and excitation of the session.
     force
-        Let torques be clipped, of the motor or of the sensor. No other limit can be forced: leaving
-        it would end the session.
+        Allow clipped torques of the motor or the sensor. No other limit can be forced, because
+        exceeding it would end the session.
     accept
         Names of rows of `rigd check` that may fail.
 
     Raises
     ------
     UnknownRowError
-        If `accept` names none.
+        If `accept` has an unknown name.
     UnknownValueError
         If a value of the profile is unknown.
     ControlDesignError
@@ -314,7 +314,7 @@ def predict_session(
 
 
 def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
-    """Say what of an excitation is to be changed where it would leave the limits."""
+    """Return the remedy for an excitation that would exceed the limits."""
     if excitation.kind in NOT_IDENTIFYING:
         return "go less far or slower"
     largest_rad = largest_amplitude(profile, excitation, force=force)
@@ -322,7 +322,7 @@ def _remedy(profile: Profile, excitation: Excitation, *, force: bool) -> str:
 
 
 def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
-    """Plan what follows the record: a return that leaves the beam at rest, and active damping."""
+    """Plan the motion after the record: a vibration-free return and active damping."""
     if loop.model.beam is None:
         return Ending(stays=stays)
     return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), design_damper(loop))
@@ -331,26 +331,26 @@ def _ending(loop: ClosedLoop, *, stays: bool) -> Ending:
 def largest_amplitude(
     profile: Profile, excitation: Excitation, *, force: bool = False
 ) -> float | None:
-    """Return the largest amplitude that all limits allow, the other parameters as they are.
+    """Return the largest amplitude within all limits, with unchanged other parameters.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation, whatever its amplitude.
+        Rig and excitation. The amplitude is ignored.
     force
-        Torques may be clipped: only what cannot be forced counts.
+        Allow clipped torques, so that only the other limits count.
 
     Returns
     -------
     float or None
-        In rad, rounded down to three digits; None where the excitation has no amplitude of its own
-        (``hold``, ``file``), keeps it within the limits by itself (``modes``, ``until``), or none
-        would do.
+        Amplitude in rad, rounded down to three digits. None if the excitation has no amplitude
+        (``hold``, ``file``), limits it by itself (``modes``, ``until``), or no amplitude is
+        possible.
 
     Raises
     ------
     ControlDesignError
-        If the loop is unstable and the response grows beyond all numbers.
+        If the loop is unstable and the response overflows.
     RealisationError
         If the beam's damping cannot be realised.
     """
@@ -358,42 +358,42 @@ def largest_amplitude(
         return None
     loop, _ = stable_loop(profile.loop_model())
     given_rad = abs(float(excitation.parameters["amplitude_rad"]))
-    # Chirps count as all others here: what is offered keeps the range of the linear model.
+    # Chirps have no exemption here: the proposed amplitude is in the range of the linear model.
     steepest = _slope(profile, predict(loop, excitation))
 
-    def share_at(amplitude_rad: float) -> float:
+    def fraction_at(amplitude_rad: float) -> float:
         scale = amplitude_rad / given_rad
         reference_rad = excitation.reference_rad * scale
         firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
         if steepest is not None:
             firm += (replace(steepest, value=steepest.value * scale),)
-        return _share(firm if force else firm + forcible)
+        return _largest_fraction(firm if force else firm + forcible)
 
-    # All peaks are proportional to the amplitude, but for the friction compensation in the torque.
+    # All peaks are proportional to the amplitude, except for the friction compensation.
     amplitude_rad = min(given_rad, _MOST_RAD)
     for _ in range(_ROUNDS):
-        share = share_at(amplitude_rad)
-        if not 0.0 < share < math.inf:
+        fraction = fraction_at(amplitude_rad)
+        if not 0.0 < fraction < math.inf:
             return None
-        amplitude_rad = min(amplitude_rad / share, _MOST_RAD)
-        if 0.999 < share <= 1.0:
+        amplitude_rad = min(amplitude_rad / fraction, _MOST_RAD)
+        if 0.999 < fraction <= 1.0:
             break
     digit_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
     digits = math.floor(amplitude_rad / digit_rad)
-    while digits > 0 and not share_at(digits * digit_rad) <= 1.0:
+    while digits > 0 and not fraction_at(digits * digit_rad) <= 1.0:
         digits -= 1
     return float(f"{digits * digit_rad:.3g}") if digits else None
 
 
 def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
-    """Return a plan as JSON documents have it.
+    """Return a plan for JSON.
 
     Parameters
     ----------
     profile, excitation
-        Rig and excitation that the plan is for.
+        Rig and excitation of the plan.
     plan
-        What `predict_session` or `plan_session` returned.
+        Result of `predict_session` or `plan_session`.
     """
     return {
         "excitation": excitation.kind,
@@ -424,12 +424,12 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
 
 
 def _has_amplitude(kind: str) -> bool:
-    """Whether an excitation takes its amplitude as an option."""
+    """Return whether an excitation has an amplitude among its parameters."""
     return "amplitude_rad" in inspect.signature(KINDS[kind]).parameters
 
 
 def _sweep_in_words(excitation: Excitation) -> str:
-    """Say from where to where a chirp sweeps, and where a move or a search goes; else nothing."""
+    """Describe the sweep of a chirp or the path of a move or search; else return an empty text."""
     if excitation.kind == "move":
         return _move_in_words(excitation.parameters)
     if excitation.kind == "touch":
@@ -447,8 +447,8 @@ def _sweep_in_words(excitation: Excitation) -> str:
 
 
 def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
-    """Say where a move goes, how long it takes, and what vibration it is predicted to leave."""
-    by_rad, angle_rad, duration_s, share, residual_nm, floor_nm, off_nm, quintic_nm = (
+    """Describe target, duration and predicted residual vibration of a move."""
+    by_rad, angle_rad, duration_s, fraction, residual_nm, floor_nm, off_nm, quintic_nm = (
         float(parameters[name])
         for name in (
             *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
@@ -467,14 +467,14 @@ def _move_in_words(parameters: Mapping[str, float | int | str]) -> str:
         )
     return (
         f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
-        f"within 1 mrad {arrival} ({100 * share:.0f} % of the limits); vibration left {left}; "
+        f"within 1 mrad {arrival} ({100 * fraction:.0f} % of the limits); vibration left {left}; "
         f"a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
         f"{parameters['file'] or 'profile'})"
     )
 
 
 def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
-    """Say how far and how fast a search for an obstacle goes."""
+    """Describe range and speed of a search for an obstacle."""
     passes = int(parameters["passes"])
     return (
         f"goes to {float(parameters['angle_rad']):.4g} rad at {parameters['speed_rad_s']:g} rad/s"
@@ -485,20 +485,20 @@ def _search_in_words(parameters: Mapping[str, float | int | str]) -> str:
 
 
 def _scan_in_words(excitation: Excitation) -> str:
-    """Say what a session begins with that goes on until a precision is reached, and which."""
+    """Describe the first scan and the targets of a session with a precision search."""
     assert excitation.search is not None
     start_hz, stop_hz, scan_s, amplitude_rad = (
         float(excitation.parameters[name])
         for name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
     )
-    asked = ", ".join(str(target) for target in excitation.search.targets)
+    targets = ", ".join(str(target) for target in excitation.search.targets)
     return (
         f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_s:g} s at up to {amplitude_rad:.3g} rad, "
-        f"then excites what tells most until {asked} (standard deviation)"
+        f"then chooses the most informative excitation until {targets} (standard deviation)"
     )
 
 
-def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
+def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
     """Predict the peaks of a session.
 
     Parameters
@@ -511,7 +511,7 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     Raises
     ------
     ControlDesignError
-        If the loop is unstable and the response grows beyond all numbers.
+        If the loop is unstable and the response overflows.
     """
     response = loop.simulate(excitation.reference_rad)
     peaks = _peaks(excitation.reference_rad, response)
@@ -534,8 +534,8 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     return replace(peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
-def _peaks(reference_rad: Real, response: LoopResponse) -> Prediction:
-    return Prediction(
+def _peaks(reference_rad: Real, response: LoopResponse) -> SessionPrediction:
+    return SessionPrediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
         peak_torque_nm=_peak(response.torque_nm),
@@ -545,23 +545,23 @@ def _peaks(reference_rad: Real, response: LoopResponse) -> Prediction:
 
 
 def predicted_metadata(
-    profile: Profile, predicted: Prediction, excitation: Excitation
+    profile: Profile, predicted: SessionPrediction, excitation: Excitation
 ) -> dict[str, str]:
-    """Return the predicted peaks and their limits as a session's file has them.
+    """Return the predicted peaks and their limits as metadata of a session file.
 
     Parameters
     ----------
     profile
         Profile of the rig, with its limits.
     predicted
-        What the session is predicted to do.
+        Prediction of the session.
     excitation
-        Excitation of the session; what it plans while it runs keeps its own limit of the slope.
+        Excitation of the session. Segments planned during the session have their own slope limit.
 
     Returns
     -------
     dict of str to str
-        ``predicted_peak_…`` and ``limit_…``, their units in the names.
+        ``predicted_peak_…`` and ``limit_…``, with units in the names.
     """
     firm, forcible = _limited(profile, predicted)
     metadata = {}
@@ -582,12 +582,12 @@ _KEYS = {
     "torque": "torque_nm",
     "tip slope": "tip_slope_rad",
 }
-"""Names of the limited peaks as keys of metadata."""
+"""Metadata keys of the limited peaks."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Limited:
-    """A predicted peak and its limit; a peak that is not a number violates it."""
+    """Predicted peak and its limit; a NaN peak violates the limit."""
 
     name: str
     value: float
@@ -605,9 +605,9 @@ class _Limited:
 
 
 def _limited(
-    profile: Profile, predicted: Prediction
+    profile: Profile, predicted: SessionPrediction
 ) -> tuple[tuple[_Limited, ...], tuple[_Limited, ...]]:
-    """Return what no session may exceed, and what clips a torque."""
+    """Return the firm limits with their peaks, and those that only clip a torque."""
     limits, motor = profile.limits, profile.rig.motor
     firm = (
         _Limited("angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"),
@@ -641,24 +641,24 @@ def _limited(
     return firm, forcible
 
 
-def _slope(profile: Profile, predicted: Prediction) -> _Limited | None:
-    """Return the slope of the tip with its limit for an identification; None without a beam."""
+def _slope(profile: Profile, predicted: SessionPrediction) -> _Limited | None:
+    """Return the predicted tip slope with its limit for an identification; None without a beam."""
     if predicted.tip is None:
         return None
     key, limit_rad = "limits.tip_slope_rad", profile.limits.tip_slope_rad
     return _Limited("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
 
 
-def _share(channels: tuple[_Limited, ...]) -> float:
-    """Return the largest predicted peak as a share of its limit; NaN if one is not a number."""
-    shares = [channel.value / channel.limit for channel in channels]
-    return math.nan if any(map(math.isnan, shares)) else max(shares)
+def _largest_fraction(channels: tuple[_Limited, ...]) -> float:
+    """Return the largest predicted peak as a fraction of its limit; NaN if a peak is NaN."""
+    fractions = [channel.value / channel.limit for channel in channels]
+    return math.nan if any(map(math.isnan, fractions)) else max(fractions)
 
 
 def _sensor_limit_nm(profile: Profile) -> float:
-    """Coupling torque at which the first axis of the sensor reaches its limit, or its range.
+    """Return the coupling torque at which an axis of the sensor first reaches limit or range.
 
-    The wrench of a coupling torque is taken as the smallest one that projects to it.
+    The wrench of a coupling torque is the smallest one that projects to it.
     """
     sensor = profile.rig.sensor
     weight = sum(p * p for p in sensor.projection)

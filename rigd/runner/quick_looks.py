@@ -1,9 +1,8 @@
-"""Quick looks: a program that looks at each session that has ended, and never while one runs.
+"""Quick looks: a separate program analyses each session after its end.
 
-The program is ``python -m analysis.quick_look``, a separate process at a low priority. One runs at
-a time. It is suspended before a session begins and goes on when that has ended; one that takes too
-long is killed, and all end with the process that started them. The time for which it waits for a
-processor that others use does not count.
+The program is ``python -m analysis.quick_look``, a process at low priority. One runs at a time. It
+is suspended during a session. It is killed if it takes too long, and ends with the process that
+started it. Time in which it waits for a processor does not count.
 """
 
 import contextlib
@@ -25,31 +24,30 @@ from rigd.session.quick_look import look_path, read_look
 
 _PROGRAM: Final = "analysis.quick_look"
 _LONGEST_S: Final = 60.0
-"""Time in which a look has to be done, without that for which it was suspended or waited for a
-processor."""
+"""Longest run time of a quick look, without suspensions and waits for a processor."""
 _END_S: Final = 0.5
-"""Longest wait, when this process ends, for a look that was killed."""
+"""Longest wait for a killed quick look at the end of this process."""
 _MOST_WAITING: Final = 3
-"""Looks that wait; of more, the oldest is left out. Only sessions on each other's heels need it."""
-_MOST_SAID: Final = 500
+"""Largest number of waiting quick looks; the oldest one beyond it is skipped."""
+_LONGEST_ERROR: Final = 500
 
 
 @dataclass(frozen=True, slots=True)
 class QuickLook:
-    """What became of the look at one session."""
+    """Result of the quick look at one session."""
 
     session: Path
     """Path of the session file."""
     path: Path | None
-    """Path of the look's own file; None: there is none."""
-    look: dict[str, Any] | None
-    """Content of that file."""
+    """Path of the file of the quick look; None if it failed."""
+    content: dict[str, Any] | None
+    """Content of that file; None if it failed."""
     error: str
-    """Why there is none, a sentence; else empty."""
+    """Why it failed, a sentence; else empty."""
 
     @classmethod
     def failed(cls, session: Path, error: str) -> "QuickLook":
-        """Return that there is none.
+        """Return a failed quick look.
 
         Parameters
         ----------
@@ -62,77 +60,78 @@ class QuickLook:
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
-        """Return what an event of the daemon tells."""
-        session, look = Path(event["path"]), event["look"]
-        return cls(session, None if look is None else look_path(session), look, event["error"])
+        """Return the quick look of an event of the daemon."""
+        session, content = Path(event["path"]), event["look"]
+        return cls(
+            session, None if content is None else look_path(session), content, event["error"]
+        )
 
     @property
     def lines(self) -> list[str]:
-        """Text of it for a terminal."""
-        if self.look is None:
+        """Lines of text for a terminal."""
+        if self.content is None:
             return [f"No quick look at {self.session.name}: {self.error}"]
-        return [printable(str(line)) for line in self.look["text"]]
+        return [printable(str(line)) for line in self.content["text"]]
 
     def note(self, results: list[SessionResult]) -> None:
-        """Note its file in the result of its session, if that is among these."""
-        for place, result in enumerate(results):
+        """Add the path of the file to the result of its session, if it is in the list."""
+        for index, result in enumerate(results):
             if result.path == self.session:
-                results[place] = replace(result, look=self.path)
+                results[index] = replace(result, quick_look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as the event of the daemon has it."""
-        return {"path": str(self.session), "look": self.look, "error": self.error}
+        """Return the event of the daemon."""
+        return {"path": str(self.session), "look": self.content, "error": self.error}
 
 
 class QuickLooks:
-    """Looks at sessions, one after the other, while none runs.
+    """Make quick looks at sessions, one at a time, while no session runs.
 
     Parameters
     ----------
-    tell
-        Called with what became of each look, by the caller of :meth:`attend`.
-
+    on_result
+        Called with the result of each quick look, in the thread that calls :meth:`attend`.
     """
 
-    def __init__(self, tell: Callable[[QuickLook], None]) -> None:
-        self._tell = tell
+    def __init__(self, on_result: Callable[[QuickLook], None]) -> None:
+        self._on_result = on_result
         self._lock = threading.Lock()
         self._waiting: deque[Path] = deque()
         self._process: subprocess.Popen[str] | None = None
         self._session = Path()
         self._held = False
         self._spent_s = 0.0
-        """Time that the running look has taken, at `_looked_s`."""
-        self._looked_s = 0.0
+        """Run time of the present quick look at `_counted_s`."""
+        self._counted_s = 0.0
         self._processor_s = 0.0
-        """Processor time that it had used then."""
+        """Processor time that it had used at `_counted_s`."""
 
     @property
     def busy(self) -> bool:
-        """Whether a look is still to be told."""
+        """Whether a quick look is running or waiting."""
         return self._process is not None or bool(self._waiting)
 
     @property
     def spent_s(self) -> float:
-        """Time that the present look has taken, without its waits for a processor."""
+        """Run time of the present quick look, without waits for a processor."""
         return self._spent_s
 
     def begin(self, session: Path) -> None:
-        """Look at a session as soon as that is possible."""
+        """Request a quick look at a session."""
         with self._lock:
             self._waiting.append(session)
         self.attend()
 
     def attend(self) -> None:
-        """See how far the looks are, and tell; call it some times a second between sessions."""
+        """Check progress and report results; call this several times a second between sessions."""
         with self._lock:
-            told = [*self._see(), *self._go_on()]
-        for each in told:
-            self._tell(each)
+            ended = [*self._see(), *self._go_on()]
+        for each in ended:
+            self._on_result(each)
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Suspend whatever runs, for the time of a session."""
+        """Suspend quick looks during a session."""
         with self._lock:
             self._held = True
             self._signal(signal.SIGSTOP)
@@ -141,11 +140,11 @@ class QuickLooks:
         finally:
             with self._lock:
                 self._held = False
-                self._looked_s = time.monotonic()
+                self._counted_s = time.monotonic()
                 self._signal(signal.SIGCONT)
 
     def close(self) -> None:
-        """Leave out what was not done."""
+        """End the running quick look and cancel those that wait."""
         with self._lock:
             self._held = True
             self._waiting.clear()
@@ -156,22 +155,22 @@ class QuickLooks:
                 self._process = None
 
     def _see(self) -> Iterator[QuickLook]:
-        """Look after the running process; yield what became of it once it has ended."""
+        """Check the running process; yield its result after its end."""
         if self._process is None or self._held:
             return
         self._count(self._process.pid)
         slow = self._spent_s >= _LONGEST_S
         if self._process.poll() is None:
             if slow:
-                # Not waited for: at a low priority it ends when others leave it the time.
+                # Not awaited: at low priority it may end late.
                 self._process.kill()
             return
-        said = self._process.communicate()[1]
+        errors = self._process.communicate()[1]
         code, self._process = self._process.returncode, None
         if slow and code == -signal.SIGKILL:
             yield QuickLook.failed(self._session, f"it took longer than {_LONGEST_S:g} s.")
         elif code != 0:
-            words = said.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MOST_SAID]
+            words = errors.strip().rpartition("\n")[2].removeprefix("Error: ")[:_LONGEST_ERROR]
             yield QuickLook.failed(
                 self._session, words or f"its program ended with exit code {code}."
             )
@@ -179,9 +178,9 @@ class QuickLooks:
             yield self._done()
 
     def _count(self, pid: int) -> None:
-        """Count the time that the running look has taken since the last call."""
+        """Add the run time since the last call."""
         now_s = time.monotonic()
-        passed_s, self._looked_s = now_s - self._looked_s, now_s
+        passed_s, self._counted_s = now_s - self._counted_s, now_s
         if (found := processor_use(pid)) is not None:
             wants, processor_s = found
             used_s, self._processor_s = processor_s - self._processor_s, processor_s
@@ -190,13 +189,13 @@ class QuickLooks:
         self._spent_s += passed_s
 
     def _go_on(self) -> Iterator[QuickLook]:
-        """Start the next look; yield those that cannot be."""
+        """Start the next quick look; yield those that are skipped or cannot be started."""
         while len(self._waiting) > _MOST_WAITING:
             yield QuickLook.failed(self._waiting.popleft(), "skipped in favour of later sessions.")
         if self._held or self._process is not None or not self._waiting:
             return
         self._session = self._waiting.popleft()
-        self._spent_s, self._processor_s, self._looked_s = 0.0, 0.0, time.monotonic()
+        self._spent_s, self._processor_s, self._counted_s = 0.0, 0.0, time.monotonic()
         try:
             self._process = subprocess.Popen(
                 [
@@ -209,7 +208,7 @@ class QuickLooks:
                 text=True,
                 errors="replace",
                 env=os.environ | SINGLE_THREADED,
-                start_new_session=True,  # Ctrl-C is for the session; it ends with this process
+                start_new_session=True,  # so that Ctrl-C does not reach it
             )
         except OSError as error:
             yield QuickLook.failed(
@@ -218,10 +217,10 @@ class QuickLooks:
 
     def _done(self) -> QuickLook:
         path = look_path(self._session)
-        look = read_look(path)
-        if look is None:
+        content = read_look(path)
+        if content is None:
             return QuickLook.failed(self._session, f"{path} cannot be read.")
-        return QuickLook(self._session, path, look, "")
+        return QuickLook(self._session, path, content, "")
 
     def _signal(self, number: signal.Signals) -> None:
         if self._process is not None:

@@ -1,7 +1,6 @@
-"""Session request: rig, excitation, file and room for it, and the file's metadata.
+"""Session request: rig, excitation, session file with its disk space and metadata.
 
-These are the steps from what the operator asks for to a session that can be run. Sessions in the
-foreground and those of the daemon share them.
+The module prepares a session for sessions in the foreground and for those of the daemon.
 """
 
 import json
@@ -47,33 +46,33 @@ _GIT_PATIENCE_S = 2.0
 
 
 class NoRoomError(RefusedError):
-    """A session's file cannot be put where it is to go."""
+    """A session file cannot be written to its folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A session to run, already checked against the profile's limits."""
+    """A session to run, already checked against the limits of the profile."""
 
     profile: Profile
     """Profile of the rig."""
     excitation: Excitation
-    """Reference, tick by tick."""
+    """Excitation with its reference."""
     path: Path
     """Final name of the session file."""
     notes: tuple[tuple[str, str], ...] = ()
-    """Operator, specimen, note, number in a series, added metadata: metadata as given."""
+    """Metadata from the user: operator, specimen, note, number in a series and others."""
     predicted: tuple[tuple[str, str], ...] = ()
     """Predicted peaks and their limits, as metadata."""
     ending: Ending = field(default_factory=Ending)
-    """What follows the record."""
+    """Motion after the record."""
     touch: TouchSearch | None = None
-    """What the loop looks for; None: nothing."""
+    """Search for an obstacle; None: no search."""
     watch_fit: bool = False
     """Fit the record while it is recorded."""
     seed: int | None = None
-    """Seed of a simulated rig's noise; None: a fresh one."""
+    """Seed of a simulated rig's noise; None: a random seed."""
     accepted: tuple[FailedCheck, ...] = ()
-    """Rows of `rigd check` that failed and that the operator accepted."""
+    """Failed rows of `rigd check` that the operator accepted."""
 
 
 def load_rig(
@@ -84,32 +83,32 @@ def load_rig(
     hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, WhatMoves]:
-    """Load a profile and see what would move.
+    """Load a profile and find its actuation target: hardware or a simulated rig.
 
     Parameters
     ----------
     name
         Name of the profile, or its file.
     fast
-        Not in real time.
+        The session does not run in real time.
     seed
-        Seed of a simulated rig's noise; None: that of the profile, if it states one.
+        Seed of a simulated rig's noise; None: the seed of the profile, if any.
     hardware
-        The operator says that the hardware is to move.
+        The operator requests a motion of the hardware.
     obstacles
-        What a simulated beam meets, beside the obstacles of the profile.
+        Obstacles of a simulated beam, in addition to those of the profile.
 
     Raises
     ------
     ObstacleError
-        If an obstacle is not written as it should be, or cannot be simulated on this rig.
+        If an obstacle has a wrong syntax, or cannot be simulated on this rig.
     ProfileError, UnknownDeviceError
         If the profile cannot be used.
     RefusedError
-        If its devices cannot share their bus, an option does not go with what would move, or a
-        simulated rig is running that cannot be reached, so that the hardware may not be meant.
+        If the devices cannot use one bus, an option does not fit the actuation target, or an
+        unreachable simulated rig is running, so that the hardware may not be meant.
     """
-    software_commit()  # which takes its time: not while the motor is held for the file's header
+    software_commit()  # early, because it is slow: the motor is held while the header is made
     profile = load_profile(name)
     check_selection(profile.rig.devices, profile.path)
     refusals = objections(profile.rig)
@@ -158,7 +157,7 @@ def load_rig(
 
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
-    """Refuse to move the hardware while somebody simulates it where this command does not look."""
+    """Raise if a simulated rig is running that this command cannot reach."""
     for path in unreachable_simulators(profile.rig.name):
         remedy, whose = "run this command as its user to use it", "by another user"
         with suppress(OSError, ValueError):
@@ -167,7 +166,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
             if uid == os.getuid():
                 whose = "in another environment"
                 remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-        shown = printable(str(path))  # its name was chosen by the user who made it
+        shown = printable(str(path))  # another user may have chosen any name
         raise RefusedError(
             f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
             f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
@@ -176,19 +175,19 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
 
 
 def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
-    """Check that a session is given all that its profile requires.
+    """Check that a session has all metadata that its profile requires.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     notes
-        What was given, by its keys in the session file.
+        Metadata by their keys in the session file.
 
     Raises
     ------
     RefusedError
-        Naming what is missing, and the options for it.
+        If metadata are missing: names them and their options.
     """
     missing = [
         name
@@ -211,12 +210,12 @@ def _in_unit(name: str) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of the session files, unless it is there.
+    """Create the folder of the session files if it does not exist.
 
     Raises
     ------
     NoRoomError
-        If it cannot be made, or nothing can be written into it.
+        If it cannot be created or is not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -231,21 +230,21 @@ def make_folder(folder: Path) -> None:
 
 
 def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
-    """Make the folder, and check that a session fits on its disk and leaves room there.
+    """Create the folder, and check that its disk has space for a session.
 
     Parameters
     ----------
     folder
         Folder of the session files.
     excitation
-        Reference, whose length sets the size of the file.
+        Excitation; its length determines the size of the file.
     limits
-        The profile's, with the space that has to stay free.
+        Limits of the profile, with the space that must remain free.
 
     Raises
     ------
     NoRoomError
-        If the folder cannot be made or written to, or the disk is too full.
+        If the folder cannot be created or is not writable, or the disk is too full.
     """
     make_folder(folder)
     try:
@@ -265,9 +264,9 @@ def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
 
 
 def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
-    """Name a new session file: time, excitation, and its number in a series.
+    """Return the path of a new session file, from time, excitation and number in a series.
 
-    Nothing is created; the recorder refuses a name that is taken.
+    The file is not created; the recorder refuses an existing name.
 
     Parameters
     ----------
@@ -276,7 +275,7 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     kind
         Name of the excitation.
     number
-        Number in a series; None: it is the only one.
+        Number in a series; None for a single session.
     """
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
     if number is not None:
@@ -286,7 +285,7 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
 
 
 def part_of(path: Path) -> Path:
-    """Name the file that is to become another when it is whole."""
+    """Return the path of the incomplete file, which is renamed at the end of the session."""
     return path.with_name(path.name + PART_SUFFIX)
 
 
@@ -297,7 +296,7 @@ def _free(path: Path) -> Path:
 
 
 def another_path(path: Path) -> Path:
-    """Name a session file in place of one whose name somebody else took: X.mcap, X_2.mcap, …."""
+    """Return the next name for a session file whose name is taken: X.mcap, X_2.mcap, …."""
     stem, _, number = path.stem.rpartition("_")
     if stem and number.isdecimal():
         return path.with_name(f"{stem}_{int(number) + 1}{path.suffix}")
@@ -305,12 +304,12 @@ def another_path(path: Path) -> Path:
 
 
 def what_is_kept(path: Path | None) -> str:
-    """Say what is kept of a session that failed, once its processes have ended.
+    """Return a sentence on the remaining file of a failed session, after its processes have ended.
 
     Parameters
     ----------
     path
-        The file that was begun for it, if any.
+        File of the session, if it was begun.
     """
     from rigd.session import holds_samples
 
@@ -318,10 +317,10 @@ def what_is_kept(path: Path | None) -> str:
         return "It has no file."
     part = part_of(path)
     try:
-        kept, whole = part.exists(), path.exists()
+        unfinished, whole = part.exists(), path.exists()
     except OSError as error:
         return f"Its folder {path.parent} cannot be read ({error.strerror})."
-    if not kept:
+    if not unfinished:
         return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
     if not holds_samples(part):
         return f"Nothing was recorded; {part} holds no sample and can be removed."
@@ -340,9 +339,9 @@ def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> 
     Parameters
     ----------
     order
-        Session that is run.
+        The session.
     connected
-        What the control process told of the devices and of its real-time settings.
+        Devices and real-time settings, as reported by the control process.
     tare
         Metadata of the tare, and the seed of a simulated rig's noise.
     """
@@ -365,7 +364,7 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "rate_hz": repr(rig.rate_hz),
         "excitation": order.excitation.kind,
         "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
-        # A session may state another uniformity among its parameters.
+        # The parameters of a session may override the uniformity.
         **{name: _text(value) for name, value in order.excitation.parameters.items()},
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
@@ -419,9 +418,9 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
 
 @cache
 def software_commit() -> dict[str, str]:
-    """Return the commit of the checkout that this program runs from, as metadata; else nothing.
+    """Return the commit of this program's checkout as metadata; empty without a checkout.
 
-    It is asked for once: what runs is what was there then.
+    The result is cached: the running code is that of the first call.
     """
     checkout = Path(__file__).resolve().parents[2]
     if not (checkout / ".git").exists():
@@ -439,7 +438,7 @@ def software_commit() -> dict[str, str]:
 
 
 def _text(value: float | str) -> str:
-    # A file's name may not be text; nothing of it may keep the session from being written.
+    # A file name may not be valid text; the session file must be written nevertheless.
     return (
         value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
     )

@@ -1,8 +1,8 @@
-"""One session in the processes of a rig, watched from its start to its file.
+"""One session in the processes of a rig, supervised from its start to its file.
 
-It moves nothing itself. It has the file opened before the drive is enabled, lets tick 0 happen when
-the recorder is ready, shows the progress, passes a stop on, sees that every process is running, and
-has the file closed with the outcome.
+The supervisor moves nothing itself. It has the file opened before the drive is enabled, permits
+tick 0 when the recorder is ready, reports the progress, forwards a stop request, checks that every
+process is running, and has the file closed with the outcome.
 """
 
 import json
@@ -33,17 +33,17 @@ from rigd.engine.reference import is_whole, put_reference
 from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
-from rigd.runner._online_fit import OnlineFit
+from rigd.runner._online_fit import FitSupervisor
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._touch_search import TouchEstimates
 from rigd.runner.request import Order, another_path, file_header, part_of
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
-"""How late what another process tells may reach the operator."""
+"""Longest delay of a message from another process to the operator."""
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
-"""Time for enabling a drive and for switching it off, which may be slow."""
+"""Time for enabling or disabling a drive, which may be slow."""
 _START_PATIENCE_S = 30.0
 """Time for a recorder to start on a busy computer; nothing moves yet."""
 _MOST_NAMES = 100
@@ -56,40 +56,40 @@ _COUNTED = {
     "stale_angles": Word.STALE_ANGLES,
     "stale_wrenches": Word.STALE_WRENCHES,
 }
-"""Words that the control process counts in, by the names in the outcome."""
+"""Counters of the control process in the shared state, by their names in the result."""
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
 
 
 class SessionFailedError(FailureError):
-    """A session could not be run or ended; the message says why, in the operator's words.
+    """A session could not be run or closed; the message states the reason for the operator.
 
     Attributes
     ----------
     path
         File of the session, if one was begun.
-    kept
+    saved_path
         Path where the record was saved, if that is not the ``.part`` of the file.
     counts
-        Counts of ticks, as far as known: ``scheduled``, ``missed``, ``late``,
+        Known counts of ticks: ``scheduled``, ``missed``, ``late``,
         ``stale_angles``, ``stale_wrenches``.
     """
 
     path: Path | None = None
-    kept: Path | None = None
+    saved_path: Path | None = None
     counts: Mapping[str, int] = _NO_TICKS
     hardware: bool | None = None
 
     def result(self) -> "SessionResult":
-        """Return how the session ended, once its processes have."""
-        part, whole = self.kept, None
+        """Return the result of the session, after its processes have ended."""
+        part, whole = self.saved_path, None
         if part is None and self.path is not None:
             try:
                 if part_of(self.path).exists():
                     part = part_of(self.path)
                 elif self.path.exists():
-                    whole = self.path  # by a recorder that was only slow
+                    whole = self.path  # the recorder was only slow
             except OSError:
-                part = part_of(self.path)  # as far as is known
+                part = part_of(self.path)  # the folder cannot be read
         return SessionResult(
             path=whole,
             outcome="fault",
@@ -99,7 +99,7 @@ class SessionFailedError(FailureError):
             fault=True,
             part=part,
             hardware=self.hardware,
-            look=None,
+            quick_look=None,
             touches=None,
             fit=None,
             **self.counts,
@@ -107,7 +107,7 @@ class SessionFailedError(FailureError):
 
 
 class _NameTakenError(SessionFailedError):
-    """The file is there already, and is somebody else's."""
+    """A file of this name exists already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,47 +115,47 @@ class SessionResult:
     """Result of a session."""
 
     path: Path | None
-    """Path of the file; None: it ended before tick 0, or no complete file could be made."""
+    """Path of the file; None if the session ended before tick 0 or the file is incomplete."""
     outcome: str
     """``complete``, ``stopped``, ``fault`` or ``unknown``."""
     reason: str
-    """Why it ended, a sentence; empty if it is complete."""
+    """Why the session ended early, a sentence; empty if it is complete."""
     scheduled: int
     """Ticks that were due."""
     recorded: int | None
-    """None, as `lost`, where it is not known before the file is recovered."""
+    """Samples in the file; None if this is unknown until the file is recovered."""
     missed: int
     """Ticks that the loop skipped."""
     late: int
     """Ticks that woke late."""
     lost: int | None
-    """Samples that were taken and not recorded."""
+    """Samples that were taken but not recorded; None as for `recorded`."""
     fault: bool
-    """Something failed, in the record or after it, whatever was asked for meanwhile."""
+    """Whether something failed during or after the record, even if a stop was requested."""
     stale_angles: int = 0
-    """Recorded ticks with a stale angle; `stale_wrenches` counts stale wrenches."""
+    """Recorded ticks with a stale angle."""
     stale_wrenches: int = 0
     """Recorded ticks with a stale wrench."""
     live_dropped: int = 0
-    """Samples that the live view did not get."""
+    """Samples that the live view did not receive."""
     part: Path | None = None
     """Path of an incomplete file that could not be completed."""
     hardware: bool | None = None
-    """Whether it was the hardware that moved, and nothing simulated; None: not known."""
-    look: Path | None = None
-    """Path of the quick look at it; None: there is none, or none yet."""
+    """Whether the hardware moved and nothing was simulated; None: not known."""
+    quick_look: Path | None = None
+    """Path of the quick look at the session; None: there is none yet."""
     touches: tuple[Mapping[str, Any], ...] | None = None
-    """Touches in the order in which they happened; None: none was looked for."""
+    """Touches in the order of their times; None if the session had no touch search."""
     fit: Mapping[str, Any] | None = None
-    """Fit of the record made while it ran, as in JSON documents; None: none was asked for."""
+    """Fit of the record during the session, as in JSON documents; None if not requested."""
 
     @property
     def went_well(self) -> bool:
-        """Whether nothing at all is to be said against it."""
+        """Whether the session is complete, without any objection."""
         return self.outcome == "complete" and not self.reason
 
     def as_dict(self) -> dict[str, object]:
-        """Return it as JSON documents have it."""
+        """Return the result for JSON."""
         touches = {} if self.touches is None else {"touches": list(self.touches)}
         fit = {} if self.fit is None else {"fit": dict(self.fit)}
         return {
@@ -171,7 +171,7 @@ class SessionResult:
             "stale_angles": self.stale_angles,
             "stale_wrenches": self.stale_wrenches,
             "hardware": self.hardware,
-            "look": None if self.look is None else str(self.look),
+            "look": None if self.quick_look is None else str(self.quick_look),
             **touches,
             **fit,
         }
@@ -182,7 +182,7 @@ class SessionProgress:
     """Progress of a running session."""
 
     phase: Phase
-    """Where the session is."""
+    """Phase of the session."""
     tick: int
     """Number of the last tick."""
     missed: int
@@ -190,15 +190,15 @@ class SessionProgress:
     late: int
     """Ticks that woke late so far."""
     fits: tuple[Mapping[str, Any], ...] = ()
-    """Fits of the record that came since the last time, as in JSON documents."""
+    """Fits of the record since the last call, as in JSON documents."""
 
 
 Watcher = Callable[[SessionProgress, list[Event]], None]
 T = TypeVar("T")
 
 
-class Session:
-    """One session; :meth:`run` may be called once.
+class SessionRun:
+    """Run of one session; :meth:`run` may be called once.
 
     Parameters
     ----------
@@ -207,19 +207,19 @@ class Session:
     group
         Processes of the rig; its control process is connected and idle.
     connected
-        Message of that process when it had connected.
+        Message of the control process after its connection.
     live
-        The view to keep up, or None.
+        Live view to supervise, or None.
     watcher
-        Called some fifty times a second with the progress and the events since the last call.
+        Called about fifty times a second with the progress and the events since the last call.
     listens
-        Whether a stop would be heard. Where it would not, the control process is to take this one
-        for hung.
+        Whether this process can receive a stop request. If it cannot, its heartbeat ends, so that
+        the control process takes it for hung.
 
     Attributes
     ----------
     device_failed
-        A device failed: the control process has let go of all.
+        Whether a device failed, so that the control process has closed all devices.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class Session:
         self._group = group
         self._connected = connected
         self._live = live
-        self._board = group.channels.board
+        self._shared_state = group.channels.board
         self._events = Observer(group.channels.events)
         self._watcher = watcher
         self._listens = listens
@@ -243,12 +243,12 @@ class Session:
         self._pulse = Pulse()
         self._recorder_lost: str | None = None
         self._control_at_work = False
-        # Until it is enabled it is off; then the control process has to have seen that it is.
+        # The drive is off until it is enabled; afterwards only the control process can confirm it.
         self._drive_at_end = "The drive is disabled."
         self._opened: Path | None = None
-        self._kept: Path | None = None
+        self._saved_path: Path | None = None
         self._touches: TouchEstimates | None = None
-        self._fit: OnlineFit | None = None
+        self._fit: FitSupervisor | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -267,17 +267,17 @@ class Session:
         except (ChildError, SessionFailedError) as error:
             self._recorder_lost = self._recorder_lost or str(error)
             if self._control_at_work:
-                self._board[Word.STOP] = Stop.NO_RECORDER
+                self._shared_state[Word.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
             failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
-            failure.path, failure.kept = self._opened, self._kept
+            failure.path, failure.saved_path = self._opened, self._saved_path
             failure.counts = self._counts()
             raise failure from None
         finally:
             stop.on_request = _nothing
 
     def _stop(self) -> None:
-        self._board[Word.STOP] = Stop.OPERATOR
+        self._shared_state[Word.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
         group, search = self._group, self._order.excitation.search
@@ -299,7 +299,7 @@ class Session:
             self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
             self._touches.await_ready(self._reports)
         if search is not None or order.watch_fit:
-            self._fit = OnlineFit(group, profile, reference, search, realtime)
+            self._fit = FitSupervisor(group, profile, reference, search, realtime)
             lost = self._fit.await_ready(self._reports)
             if lost and search is not None:
                 raise SessionFailedError(lost)
@@ -324,7 +324,7 @@ class Session:
             if self._fit is not None:
                 self._fit.begin(header)
             self._ask_recorder(Armed)
-            self._board[Word.GO] = 1
+            self._shared_state[Word.GO] = 1
             answer = self._listen_to_control()
         if self._recorder_lost is not None:
             raise SessionFailedError(self._recorder_lost)
@@ -332,12 +332,12 @@ class Session:
         return self._close(answer)
 
     def _reports(self) -> bool:
-        """Report while nothing moves yet; return whether the session is still wanted."""
+        """Report before any motion; return whether the session is still requested."""
         self._report()
-        return self._board[Word.STOP] == Stop.NO
+        return self._shared_state[Word.STOP] == Stop.NO
 
     def _open_file(self) -> None:
-        """Have the file made, under another name if somebody else has just taken the one chosen."""
+        """Have the file created, under another name if the chosen name is already taken."""
         group = self._group
         realtime = None if self._virtual else self._order.profile.realtime
         for _ in range(_MOST_NAMES):
@@ -357,7 +357,7 @@ class Session:
         raise taken
 
     def _refused_to_supervision(self) -> dict[str, str]:
-        """Return what the scheduler did not grant supervisor and recorder, and why."""
+        """Return the real-time settings refused to supervisor and recorder, with the reasons."""
         return {
             name: text
             for name, text in self._connected.realtime.items()
@@ -365,10 +365,10 @@ class Session:
         }
 
     def _listen_to_control(self) -> Ready | Finished:
-        """Wait for the control process's next message, watching everybody meanwhile."""
+        """Wait for the next message of the control process while supervising all processes."""
         deadline, phase = 0.0, -1
         while True:
-            # Of the two, an estimate of a touch is what somebody waits for.
+            # An estimate of a touch is more urgent than a message of the control process.
             waited = self._touches is not None and self._touches.listen(_POLL_S)
             try:
                 answer = self._group.control.poll(0.0 if waited else _POLL_S)
@@ -376,17 +376,17 @@ class Session:
                 return self._control_died(str(error))
             self._report()
             now_s = time.monotonic()
-            # In lock-step with a simulated rig each tick may wait for replies that do not come.
-            torque = self._board[Word.PHASE] in _TORQUE_PHASES and not self._virtual
-            if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
-                phase = self._board[Word.PHASE]
+            # In lock-step with a simulated rig, a tick may wait for missing replies.
+            torque = self._shared_state[Word.PHASE] in _TORQUE_PHASES and not self._virtual
+            if self._shared_state[Word.STOP] == Stop.NO or self._shared_state[Word.PHASE] != phase:
+                phase = self._shared_state[Word.PHASE]
                 patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
                 deadline = now_s + patience_s
             elif answer is None and now_s > deadline:
                 return self._kill_control(f"did not stop within {patience_s:g} s")
             assert CONTROL.hung_after_s is not None
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
-            still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
+            still_s = self._pulse.look(self._shared_state[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
@@ -394,7 +394,7 @@ class Session:
             if self._recorder_lost is None:
                 self._recorder_lost = self._recorder_trouble()
                 if self._recorder_lost is not None:
-                    self._board[Word.STOP] = Stop.NO_RECORDER
+                    self._shared_state[Word.STOP] = Stop.NO_RECORDER
 
     def _understood(self, answer: object) -> Ready | Finished:
         match answer:
@@ -402,7 +402,7 @@ class Session:
                 finished = self._control_died(reason)
                 if reason:
                     return finished
-                # The signal for a stop reached it between two sessions.
+                # A stop signal reached the control process between two sessions.
                 return replace(
                     finished, outcome="stopped", reason="Stopped by the operator.", fault=False
                 )
@@ -417,7 +417,7 @@ class Session:
         raise SessionFailedError(f"The control process answers {answer}.")
 
     def _kill_control(self, why: str) -> Finished:
-        """End a control process that hangs: the drive's own watch is what switches off then."""
+        """End a hung control process; the watchdog of the drive switches the torque off."""
         self._group.control.kill()
         return self._control_died(
             f"The control process {why} and was killed: without its heartbeat the drive switches "
@@ -431,10 +431,10 @@ class Session:
         return self._as_finished(reason)
 
     def _as_finished(self, reason: str) -> Finished:
-        """Make up the control process's result from its words on the board."""
+        """Construct the result of a dead control process from the shared state."""
         counts = self._counts()
         whole = is_whole(
-            self._board, counts["scheduled"], self._order.excitation.reference_rad.size
+            self._shared_state, counts["scheduled"], self._order.excitation.reference_rad.size
         )
         return Finished(
             outcome="complete" if whole else "fault",
@@ -444,9 +444,12 @@ class Session:
         )
 
     def _counts(self) -> dict[str, int]:
-        board = self._board
-        # Before this session's record they stand where the last one left them.
-        return {name: board[word] if board[Word.GO] else 0 for name, word in _COUNTED.items()}
+        shared_state = self._shared_state
+        # Before the record of this session the counters are those of the previous one.
+        return {
+            name: shared_state[word] if shared_state[Word.GO] else 0
+            for name, word in _COUNTED.items()
+        }
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -454,12 +457,12 @@ class Session:
         except ChildError as error:
             return str(error)
         if isinstance(message, Failed):
-            self._kept = message.kept
+            self._saved_path = message.kept
             return message.reason
         return None if message is None else str(message)
 
     def _ask_recorder(self, expected: type[T], patience_s: float = _PATIENCE_S) -> T:
-        """Wait for its answer, going on watching: the motor may be held meanwhile."""
+        """Wait for an answer of the recorder while supervising: the motor may be held."""
         deadline = time.monotonic() + patience_s
         message = None
         while message is None and time.monotonic() < deadline:
@@ -471,35 +474,35 @@ class Session:
                 "disk."
             )
         if isinstance(message, Failed):
-            self._kept = message.kept
+            self._saved_path = message.kept
             raise (_NameTakenError if message.taken else SessionFailedError)(message.reason)
         if not isinstance(message, expected):
             raise SessionFailedError(f"The recorder process answers {message}.")
         return message
 
     def _report(self) -> None:
-        board = self._board
+        shared_state = self._shared_state
         if self._listens():
-            board.beat(Word.SUPERVISOR_BEAT)
+            shared_state.beat(Word.SUPERVISOR_BEAT)
         events = read_events(self._events.take(16))
         if self._live is not None:
-            events += self._live.attend()
+            events += self._live.poll()
         if self._touches is not None:
-            events += self._touches.attend()
+            events += self._touches.poll()
             if self._live is not None:
                 self._live.touched(self._touches.news())
         fits: Sequence[Mapping[str, Any]] = ()
         if self._fit is not None:
-            events += self._fit.attend()
+            events += self._fit.poll()
             fits = self._fit.news()
             if self._live is not None:
                 self._live.fitted(fits)
         self._watcher(
             SessionProgress(
-                Phase(board[Word.PHASE]),
-                board[Word.SCHEDULED],
-                board[Word.MISSED],
-                board[Word.LATE],
+                Phase(shared_state[Word.PHASE]),
+                shared_state[Word.SCHEDULED],
+                shared_state[Word.MISSED],
+                shared_state[Word.LATE],
                 tuple(fits),
             ),
             events,
@@ -515,7 +518,7 @@ class Session:
             **finished.results,
         }
         if self._touches is not None:
-            touches = self._touches.finish(self._board[Word.TOUCHES], self._report)
+            touches = self._touches.finish(self._shared_state[Word.TOUCHES], self._report)
             outcome["touches"] = json.dumps(touches)
             self._report()
         fit: dict[str, Any] | None = None
@@ -528,15 +531,15 @@ class Session:
             if finished.outcome == "complete" and not finished.reason:
                 outcome["reason"] = self._fit.shortcoming
             elif self._fit.failure:
-                # The session was about to end for it: a stop that came before is not the cause.
+                # This failure ends the session, even if a stop was requested before.
                 outcome["reason"] = f"{self._fit.failure} {finished.reason}"
         self._group.recorder.wake()
         packed = b"" if self._touches is None else self._touches.packed()
         self._group.recorder.send(Close(outcome, packed, segments))
-        # A disk may stall at the end of a record for as long as within it.
+        # A disk may stall at the end of a record as long as during it.
         stall_s = self._order.profile.limits.recorder_lag_s
         closed = self._ask_recorder(Closed, stall_s + 2 * _PATIENCE_S)
-        # What the recorder counted in the file has the last word.
+        # The count of the recorder takes precedence.
         counts = {**_NO_TICKS, **finished.counts, **closed.counts}
         ended, reason = finished.outcome, outcome["reason"]
         if closed.path is not None:
@@ -555,19 +558,19 @@ class Session:
             fault=finished.fault
             or ended == "fault"
             or (self._fit is not None and bool(self._fit.failure)),
-            live_dropped=self._board[Word.LIVE_DROPPED],
+            live_dropped=self._shared_state[Word.LIVE_DROPPED],
             touches=None if touches is None else tuple(touches),
             fit=fit,
         )
 
 
 def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
-    """Return the results of a series as the JSON document of its command.
+    """Return the results of a series as a JSON document.
 
     Parameters
     ----------
     results
-        How its sessions ended.
+        Results of its sessions.
     """
     found = [result.touches for result in results if result.touches is not None]
     touches = {"touches": [touch for each in found for touch in each]} if found else {}
@@ -575,9 +578,9 @@ def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
 
 
 def always() -> bool:
-    """Answer for somebody whose stop comes as a signal."""
+    """Return True: a stop always arrives, because it is a signal."""
     return True
 
 
 def _nothing() -> None:
-    """Answer a stop request that comes between two sessions: its being noted is enough."""
+    """Do nothing at a stop request between two sessions: its flag is enough."""

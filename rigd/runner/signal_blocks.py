@@ -1,4 +1,4 @@
-"""Signals of a running record for viewers of the daemon, and how near they are to their limits."""
+"""Signals of a running record for viewers of the daemon, with gauges of their limits."""
 
 import time
 from collections.abc import Iterator
@@ -18,26 +18,26 @@ from rigd.view import Gauge, Gauges
 
 _FIELDS: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _MOST_TICKS: Final = 2500
-"""Most ticks of a block: in base64 its signals take less than a line of the socket."""
+"""Largest number of ticks of a block: in base64 its signals fit a line of the socket."""
 _GAUGES_S: Final = 0.095
-"""Least time from gauges to the next: they cost more than the signals, and are read by eyes."""
+"""Shortest time between gauges, which cost more than the signals and are read by people."""
 _ABANDONED_S: Final = 1.0
-"""Time without a reader after which the samples in between are left out."""
+"""Time without a reader after which the samples in between are skipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalBlock:
-    """Ticks of a record, one after the other."""
+    """Consecutive ticks of a record."""
 
     first_tick: int
-    """Number of the first one."""
+    """Number of the first tick."""
     t_ns: int
-    """Its time since the start of the session."""
+    """Time of the first tick since the start of the session."""
     signals: dict[str, npt.NDArray[np.float32]]
-    """Angle, its reference and the coupling torque by name, (n,) each; missed ticks are NaN. No
-    tick at all between records."""
+    """Angle, its reference and the coupling torque by name, (n,) each; NaN at missed ticks. Between
+    records n is 0."""
     gauges: dict[str, Gauge] | None = None
-    """Peaks over all ticks since the last gauges; None where these are recent."""
+    """Peaks over all ticks since the last gauges; None if the last gauges are recent."""
 
     @property
     def count(self) -> int:
@@ -46,12 +46,12 @@ class SignalBlock:
 
     @property
     def last_tick(self) -> int:
-        """Number of the last one."""
+        """Number of the last tick."""
         return self.first_tick + self.count - 1
 
 
 class SignalReader:
-    """Reads the samples in the ring as viewers want them; it may miss some and delays no loop.
+    """Reader of the samples in the ring for viewers; it may miss samples and never delays the loop.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class SignalReader:
         time_constant_s = rig.motor.thermal_time_constant_s
         self._gauges = Gauges(rig.rate_hz, gauge_limits(profile), time_constant_s)
         self._seen: tuple[Ring, Observer] | None = None
-        self._looked_s = 0.0
+        self._read_s = 0.0
         self._gauged_s = 0.0
         self._ungauged: list[npt.NDArray[Any]] = []
         """Samples of the record since the last gauges."""
@@ -75,31 +75,31 @@ class SignalReader:
         """Tick of the last sample of the record."""
 
     def take(self, channels: Channels) -> list[SignalBlock]:
-        """Return what has come since the last look; the last block has gauges where they are due.
+        """Return the blocks since the last call; the last block has gauges if they are due.
 
         Parameters
         ----------
         channels
-            The rings and words of the rig's processes.
+            Rings and shared state of the rig's processes.
         """
         now_s = time.monotonic()
-        ring, board = channels.samples, channels.board
-        if self._seen is None or self._seen[0] is not ring or now_s > self._looked_s + _ABANDONED_S:
+        ring, shared_state = channels.samples, channels.board
+        if self._seen is None or self._seen[0] is not ring or now_s > self._read_s + _ABANDONED_S:
             self._seen = ring, Observer(ring)
             self._last = None
             self._ungauged = []
             self._gauges.forget_angle()
-        self._looked_s = now_s
+        self._read_s = now_s
         blocks = list(self._blocks(self._seen[1], ring.written))
         if now_s - self._gauged_s < _GAUGES_S:
             return blocks
         self._gauged_s = now_s
         gauges = self._take_gauges()
         if not blocks:
-            at_work = board[Word.PHASE] != Phase.PREPARING
+            at_work = shared_state[Word.PHASE] != Phase.PREPARING
             peaks = {
-                "angle": abs(board[Word.ANGLE_NRAD]) * 1e-9 if at_work else None,
-                "torque_command": abs(board[Word.TORQUE_COMMAND_NNM]) * 1e-9,
+                "angle": abs(shared_state[Word.ANGLE_NRAD]) * 1e-9 if at_work else None,
+                "torque_command": abs(shared_state[Word.TORQUE_COMMAND_NNM]) * 1e-9,
                 "i2t": self._cool(0.0),
             }
             nothing = dict.fromkeys(_FIELDS, np.empty(0, dtype=np.float32))
@@ -133,7 +133,7 @@ class SignalReader:
         first, last = int(ticks[0]), int(ticks[-1])
         before, self._last = self._last, last
         if before is None or before >= first:
-            self._take_gauges()  # what was left of the record before has heated the motor
+            self._take_gauges()  # the rest of the previous record has heated the motor
             self._gauges.forget_angle()
         # Ticks missed between two blocks belong to the second one.
         elif first - before <= _MOST_TICKS:
@@ -149,9 +149,9 @@ class SignalReader:
         return SignalBlock(first, t_ns, signals)
 
     def _cool(self, covered_s: float) -> float:
-        """Let the motor cool for the time since the last call that samples do not cover."""
+        """Cool the thermal model for the time since the last call that samples do not cover."""
         now_s = time.monotonic()
-        # Not in real time, a record has more time in it than has passed.
+        # Under the virtual clock a record is longer than the elapsed time.
         passed_s = max(0.0, now_s - self._heated_s - covered_s)
         self._heated_s = now_s
         return self._gauges.cool(passed_s)

@@ -25,10 +25,10 @@ _WINDOW_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class SignalStatus:
-    """Figures of a record that is being made, or of the last one."""
+    """Statistics of the running record, or of the last one."""
 
     rate_hz: float
-    """Ticks a second over the last second, without those that were missed."""
+    """Ticks per second over the last second, without missed ticks."""
     lateness_p50_us: float
     """Wake-up latency over the last second: median."""
     lateness_p99_us: float
@@ -36,7 +36,7 @@ class SignalStatus:
     work_p99_us: float
     """Execution time of a tick over the last second: 99th percentile."""
     tracking_error_rad: float
-    """Reference less angle, now."""
+    """Present reference less angle."""
     peak_tracking_error_rad: float
     """Largest magnitude since the record began."""
     peak_coupling_torque_nm: float
@@ -46,7 +46,7 @@ class SignalStatus:
 
 
 class SignalWatch:
-    """Observes the samples in the ring; it may miss some and never delays the loop.
+    """Observer of the samples in the ring; it may miss samples and never delays the loop.
 
     Parameters
     ----------
@@ -60,10 +60,10 @@ class SignalWatch:
         self._recent: deque[npt.NDArray[Any]] = deque()
         self._peaks = np.zeros(3)
 
-    def look(self, ring: Ring) -> Callable[[], SignalStatus] | None:
-        """Take what has come since the last look; None as long as nothing has.
+    def poll(self, ring: Ring) -> Callable[[], SignalStatus] | None:
+        """Read the samples since the last call; return a function for the statistics, or None.
 
-        The figures are computed when they are asked for: there are more looks than questions.
+        The statistics are computed on request, which is less frequent than the calls.
         """
         if self._seen is None or self._seen[0] is not ring:
             recent = max(0, ring.written - round(_WINDOW_S * self._rate_hz))
@@ -127,7 +127,7 @@ class ProcessStatus:
     state: str
     """``running``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
-    """Time without a heartbeat, as far as somebody looked."""
+    """Time without a heartbeat, as observed by the last calls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +139,11 @@ class TopicStatus:
     written: int
     """Records written since the memory was laid out."""
     rate_hz: float | None
-    """Since the last look; None where there was none."""
+    """Rate since the last call; None at the first call."""
     expected_hz: float | None
-    """While a session is recorded."""
+    """Rate expected during a record; None if none is expected."""
     waiting: int
-    """Records that the recorder has yet to take."""
+    """Records that the recorder has not yet read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,15 +151,15 @@ class RigStatus:
     """Status of the rig, as read from shared memory."""
 
     phase: Phase
-    """Where the session is."""
+    """Phase of the session."""
     activity: Activity
     """State of the session for its operator."""
     angle_rad: float
     """Angle from the rig's zero."""
     coupling_torque_nm: float
-    """Measured torque, tared."""
+    """Measured torque after the tare."""
     torque_command_nm: float
-    """Last command."""
+    """Last torque command."""
     tick: int
     """Number of the last tick."""
     missed: int
@@ -169,27 +169,27 @@ class RigStatus:
     lost: int
     """Samples lost so far."""
     bus_load_percent: float | None
-    """Load of the busiest line; None where there is none."""
+    """Load of the busiest bus line; None without a bus."""
     bus_errors: int | None
-    """Errors on all lines; None where they are not known."""
+    """Errors on all bus lines; None: not known."""
     sensor_status: int | None
-    """Status word of the sensor; None where it is not known."""
+    """Status word of the sensor; None: not known."""
     disk_free_mb: int | None
     """Free space on the disk of the session file; None before it is known."""
     view_dropped: int
-    """Samples that the live view did not get."""
+    """Samples that the live view did not receive."""
     signals: Callable[[], SignalStatus] | None
-    """Returns the figures of the record; None before its first sample."""
+    """Returns the statistics of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     """Processes of the rig."""
     topics: tuple[TopicStatus, ...]
     """Traffic to the recorder."""
     live_view: LiveAddress | None = None
-    """Address at which the sessions are shown, if they are."""
+    """Address of the live view; None: there is none."""
 
 
 class StatusWatch:
-    """Looks at a rig now and again; what moves between two looks is known by them.
+    """Observer of a rig; it derives rates from consecutive calls.
 
     Parameters
     ----------
@@ -203,26 +203,26 @@ class StatusWatch:
         self._written: tuple[float, tuple[int, ...]] | None = None
         self._signals = SignalWatch(rate_hz)
 
-    def look(self, group: ProcessGroup) -> RigStatus:
-        """Return the status now."""
-        board = group.channels.board
-        load_ppm = board.known(Word.BUS_LOAD_PPM)
+    def read(self, group: ProcessGroup) -> RigStatus:
+        """Return the present status."""
+        shared_state = group.channels.board
+        load_ppm = shared_state.known(Word.BUS_LOAD_PPM)
         return RigStatus(
-            phase=Phase(board[Word.PHASE]),
-            activity=activity(board),
-            angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
-            coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
-            torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,
-            tick=board[Word.SCHEDULED],
-            missed=board[Word.MISSED],
-            late=board[Word.LATE],
-            lost=board[Word.LOST],
+            phase=Phase(shared_state[Word.PHASE]),
+            activity=activity(shared_state),
+            angle_rad=shared_state[Word.ANGLE_NRAD] * 1e-9,
+            coupling_torque_nm=shared_state[Word.COUPLING_TORQUE_NNM] * 1e-9,
+            torque_command_nm=shared_state[Word.TORQUE_COMMAND_NNM] * 1e-9,
+            tick=shared_state[Word.SCHEDULED],
+            missed=shared_state[Word.MISSED],
+            late=shared_state[Word.LATE],
+            lost=shared_state[Word.LOST],
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=board.known(Word.BUS_ERRORS),
-            sensor_status=board.known(Word.SENSOR_STATUS),
-            disk_free_mb=board[Word.DISK_FREE_MB] or None,
-            view_dropped=board[Word.LIVE_DROPPED],
-            signals=self._signals.look(group.channels.samples),
+            bus_errors=shared_state.known(Word.BUS_ERRORS),
+            sensor_status=shared_state.known(Word.SENSOR_STATUS),
+            disk_free_mb=shared_state[Word.DISK_FREE_MB] or None,
+            view_dropped=shared_state[Word.LIVE_DROPPED],
+            signals=self._signals.poll(group.channels.samples),
             processes=tuple(self._processes(group)),
             topics=tuple(self._topics(group)),
         )
@@ -234,15 +234,15 @@ class StatusWatch:
         self._written = now_s, written
         passed_s = now_s - before_s
         for topic, ring, now, first in zip(TOPICS, rings, written, before, strict=True):
-            # Other processes, other rings: they begin at 0 again.
+            # New processes have new rings, whose counts start at 0.
             rate_hz = (now - first) / passed_s if passed_s > 0.0 and now >= first else None
             expected_hz = topic.expected_hz(self._rate_hz)
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
     def _processes(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
-        board, now_s = group.channels.board, time.monotonic()
+        shared_state, now_s = group.channels.board, time.monotonic()
         for process in PROCESSES:
-            still_s = self._pulses[process].look(board[process.beat], now_s)
+            still_s = self._pulses[process].look(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue

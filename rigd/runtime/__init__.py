@@ -1,12 +1,12 @@
-"""What the processes of a user share with the system: folder, addresses, locks, signals.
+"""System resources of the processes: runtime folder, addresses, locks, signals, process table.
 
-Offers the folder for sockets and addresses, addresses in it and whether a process is still there
-(module `addresses`), the kernel's tables of processes and sockets (module `processes`), a lock that
-names its holder (`HeldFile`), one program at a time on a rig (`RigLock`, `holds_rig`), background
-work that gives way (`begin_background`, `give_way`), opening a file that a user names
-(`open_plain_file`), and the signals that ask for an end (`raise_on` for commands; `StopRequest`,
-`ignore`, `held_back` for the processes of a rig). The ground floor: it knows nothing of rigs but
-their names.
+The package offers the folder for sockets and addresses, addresses and the detection of dead
+processes (module `addresses`), the kernel's tables of processes and sockets (module `processes`), a
+lock with the name of its holder (`HeldFile`), the lock of a rig (`RigLock`, `holds_rig`),
+background work at low priority (`begin_background`, `give_way`), opening of files named by users
+(`open_plain_file`), and the signals that request an end: `raise_on` for commands; `StopRequest`,
+`ignore`, `held_back` for the processes of a rig. The package depends on no other package. It
+knows rigs by name only.
 """
 
 import lazy_loader as lazy

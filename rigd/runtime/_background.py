@@ -1,4 +1,4 @@
-"""Background work: gives way to all else, takes one thread, ends with whoever started it."""
+"""Background work: lowest priority, one thread, ends with the process that started it."""
 
 import os
 import signal
@@ -15,39 +15,35 @@ if TYPE_CHECKING:
 SINGLE_THREADED: Final = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
-"""Environment in which numpy starts no threads."""
+"""Environment variables that stop numpy from starting threads."""
 
 OWN_PYTHON: Final = (sys.executable, "-P")
-"""Begins the command line of a program of this project: a file where the operator works may have
-the name of any module, and is none of it."""
+"""Start of the command line of a program of this project. With -P no file of the working folder is
+imported by mistake."""
 
 _LOWEST_PRIORITY: Final = 19
 
 
 def use_one_thread() -> None:
-    """Let numpy start no threads, in this process and in those that it starts.
+    """Stop numpy from starting threads, in this process and its children.
 
-    They gain nothing on matrices as small as ours, and cost a tenth of a fit's time. With a
-    real-time priority they do harm: the threads of one calculation, all kept off the loop's core,
-    wait for each other by turning in a circle, so that what takes a second took a minute and
-    nothing else ran on that core.
+    Threads do not speed up small matrices, and cost a tenth of the time of a fit. With real-time
+    priority they are harmful: threads of one calculation wait for each other in busy loops and
+    block their core, so that one second becomes one minute.
 
-    numpy looks at the environment once, when it is imported: this has to come before.
+    Call this before the first import of numpy, which reads the environment only once.
     """
     os.environ.update(SINGLE_THREADED)
 
 
 def killed_first() -> None:
-    """Have the system kill this process before any other when memory runs out (OOM killer).
-
-    What it starts inherits that.
-    """
+    """Make this process and its children the first victims of the OOM killer."""
     with suppress(OSError):  # not on Linux
         Path("/proc/self/oom_score_adj").write_text("1000")
 
 
 def give_way(pid: int = 0) -> None:
-    """Have a process, and what it starts, run only while nothing else wants the processor.
+    """Run a process and its children only while no other process needs the processor.
 
     Parameters
     ----------
@@ -61,7 +57,7 @@ def give_way(pid: int = 0) -> None:
 
 
 def processor_use(pid: int) -> tuple[bool, float] | None:
-    """Return how a process stands with the processors.
+    """Return the scheduling state and processor time of a process.
 
     Parameters
     ----------
@@ -71,12 +67,12 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
     Returns
     -------
     tuple of bool and float, or None
-        Whether it runs or waits for a processor, rather than for anything else; and the processor
-        time that it has used, in s. None if that is not known: it has ended, or is not on Linux.
+        Whether the process runs or waits for a processor, and its processor time in s. None if this
+        is not known: the process has ended, or the system is not Linux.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
-        # After the program's name, which may hold anything: state, and from there on numbers.
+        # The state and numbers follow the program's name, which may contain any character.
         fields = stat.rpartition(")")[2].split()
         ticks = int(fields[11]) + int(fields[12])
     except (OSError, ValueError, IndexError):
@@ -85,12 +81,12 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
 
 
 def end_with(parent: int) -> None:
-    """Have this process end with the one that started it, however that ends.
+    """End this process when its parent ends, in whatever way.
 
     Parameters
     ----------
     parent
-        Number of that process. If it has ended by now, so does this one.
+        Process id of the parent. If it has already ended, this process ends at once.
     """
     signal_when_orphaned(signal.SIGKILL)
     if os.getppid() != parent:
@@ -98,22 +94,23 @@ def end_with(parent: int) -> None:
 
 
 def begin_background(parser: "ArgumentParser") -> "Namespace":
-    """Begin a program that works for another one: it is killed first, and takes one thread.
+    """Set up a background program: one thread, first victim of the OOM killer; parse its options.
 
     Parameters
     ----------
     parser
-        Command line of the program; ``--parent`` is added, with which it ends.
+        Command line of the program. The option ``--parent`` is added: the program ends with that
+        process.
 
     Returns
     -------
     argparse.Namespace
-        What the command line says.
+        The parsed options.
     """
     parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    asked = parser.parse_args()
-    if asked.parent is not None:
-        end_with(asked.parent)
+    arguments = parser.parse_args()
+    if arguments.parent is not None:
+        end_with(arguments.parent)
     killed_first()
     use_one_thread()
-    return asked
+    return arguments

@@ -1,4 +1,4 @@
-"""Locks: a file that one program holds at a time, and one program at a time on a rig."""
+"""Locks: a file with one holder at a time, and the lock of a rig."""
 
 import errno
 import fcntl
@@ -19,19 +19,19 @@ _RIG_LOCK = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$")
 
 
 class HeldError(Exception):
-    """Another program holds the file; carries its own description."""
+    """Another program holds the file; the message is the description of that program."""
 
 
 class HeldFile:
-    """A lock with its holder's name in it.
+    """Lock file that contains the name of its holder.
 
     Parameters
     ----------
     name
-        Name of what is locked; other characters than letters and digits count alike.
+        Name of the locked resource; all characters except letters and digits are equivalent.
     everybody
-        It is hardware, which all users of this computer share: the lock is in ``/run/lock`` where
-        there is one. Otherwise it is in the user's own runtime folder.
+        The resource is hardware, common to all users of this computer: the lock is in
+        ``/run/lock`` if this folder exists. Otherwise it is in the user's own runtime folder.
     """
 
     def __init__(self, name: str, *, everybody: bool) -> None:
@@ -41,21 +41,21 @@ class HeldFile:
         self._fd: int | None = None
 
     def acquire(self, holder: str, *, alone: bool = True) -> None:
-        """Take it, or share it with others that do not want it alone.
+        """Acquire the lock, either exclusively or together with other non-exclusive holders.
 
         Parameters
         ----------
         holder
-            What others are told of who has it.
+            Name of the holder, for the messages of other programs.
         alone
             Whether the lock is exclusive.
 
         Raises
         ------
         HeldError
-            If somebody else has it.
+            If another program holds the lock.
         OSError
-            If the file cannot be made.
+            If the file cannot be created.
         """
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         fd = self._open()
@@ -69,18 +69,18 @@ class HeldFile:
         self._fd = fd
 
     def release(self) -> None:
-        """Give it up; harmless when repeated."""
+        """Release the lock; repeated calls do nothing."""
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
 
     def _open(self) -> int:
-        """Open it for reading and writing, whichever user made it."""
+        """Open the file for reading and writing, whichever user created it."""
         with suppress(FileExistsError):
             fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-            os.fchmod(fd, 0o666)  # whatever the umask: the next holder may be another user
+            os.fchmod(fd, 0o666)  # despite the umask: the next holder may be another user
             return fd
-        # In a folder that others may write to the name may be a link to anything.
+        # In a folder that is writable for others the name may be a link to any file.
         fd = os.open(self.path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
@@ -92,14 +92,14 @@ def _lock(fd: int, *, alone: bool) -> None:
     try:
         fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
-        said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
-        raise HeldError(said + _others(fd, said)) from None
+        holder = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
+        raise HeldError(holder + _others(fd, holder)) from None
 
 
-def _others(fd: int, said: str) -> str:
-    """Name who holds the file by the kernel's table, if that is not who the file says it is.
+def _others(fd: int, holder: str) -> str:
+    """Return the holders in the kernel's table that the file does not name.
 
-    Any user may write to the file, and hold the lock.
+    Any user can write to the file and hold the lock.
     """
     inode = os.fstat(fd).st_ino
     try:
@@ -108,7 +108,7 @@ def _others(fd: int, said: str) -> str:
         return ""
     found = ""
     for pid in holders:
-        if re.search(rf"\bprocess {pid}\b", said):
+        if re.search(rf"\bprocess {pid}\b", holder):
             return ""
         with suppress(OSError):
             found = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
@@ -116,13 +116,7 @@ def _others(fd: int, said: str) -> str:
 
 
 def _held_inodes() -> set[tuple[int, int]]:
-    """Return process and inode of each file lock on this computer, by the kernel's table.
-
-    Raises
-    ------
-    OSError
-        If the system has no such table.
-    """
+    """Return process id and inode of each file lock in the kernel's table."""
     # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
     rows = [line.split() for line in _LOCKS.read_text("ascii").splitlines()]
     return {
@@ -136,11 +130,11 @@ def _held_inodes() -> set[tuple[int, int]]:
 
 
 class RigBusyError(FailureError):
-    """Another program runs the rig; the message says which."""
+    """Another program uses the rig; the message names it."""
 
 
 class RigLock:
-    """Held as long as its context lasts.
+    """Lock of a rig, held within its context.
 
     Parameters
     ----------
@@ -149,10 +143,10 @@ class RigLock:
     holder
         Name of this program, for messages to a second one.
     hardware
-        The rig is none of a user's own: all users of this computer have to be asked.
+        The rig is hardware, common to all users of this computer.
     alone
-        Refuse everybody else; otherwise only those who want to be alone: sessions on simulated rigs
-        of their own, each in its own process and time, do not disturb each other.
+        Hold the lock exclusively. Otherwise only exclusive holders are excluded: sessions on
+        simulated rigs of their own do not disturb each other.
     """
 
     def __init__(self, rig: str, holder: str, *, hardware: bool, alone: bool = True) -> None:
@@ -162,12 +156,12 @@ class RigLock:
         self._file = HeldFile(f"rig-{rig}", everybody=hardware)
 
     def acquire(self) -> None:
-        """Take the rig.
+        """Acquire the rig.
 
         Raises
         ------
         RigBusyError
-            If another program has it, or it cannot be told.
+            If another program holds it, or this cannot be determined.
         """
         try:
             self._file.acquire(self._holder, alone=self._alone)
@@ -183,7 +177,7 @@ class RigLock:
             ) from None
 
     def release(self) -> None:
-        """Give the rig up."""
+        """Release the rig."""
         self._file.release()
 
     def __enter__(self) -> Self:
@@ -195,7 +189,7 @@ class RigLock:
 
 
 def holds_rig(pid: int, rig: str, folder: Path) -> bool:
-    """Whether a process holds the lock of a rig, by the kernel's table of locks.
+    """Return whether a process holds the lock of a rig, from the kernel's table of locks.
 
     Parameters
     ----------
@@ -204,7 +198,8 @@ def holds_rig(pid: int, rig: str, folder: Path) -> bool:
     rig
         Name of the rig.
     folder
-        Runtime folder in which the lock is looked for, apart from where the process opened it.
+        Runtime folder to search for the lock, in addition to the folder where the process opened
+        it.
 
     Raises
     ------
@@ -223,7 +218,7 @@ def holds_rig(pid: int, rig: str, folder: Path) -> bool:
 
 
 def held_rig(pid: int) -> str | None:
-    """Return the name of the rig whose lock a process has open, as file names have it.
+    """Return the rig whose lock file a process has open, as spelled in file names.
 
     Parameters
     ----------
@@ -233,13 +228,13 @@ def held_rig(pid: int) -> str | None:
     Returns
     -------
     str or None
-        The name; None if it has none, or the system does not show its files.
+        The name; None if there is none, or the system does not show the files of the process.
     """
     return next((name for name, _ in _open_locks(pid)), None)
 
 
 def _open_locks(pid: int) -> list[tuple[str, Path]]:
-    """Return the rigs' locks that a process has open: name of the rig, and way to the file."""
+    """Return the rig locks that a process has open: name of the rig and path in /proc."""
     found = []
     with suppress(OSError):
         for entry in Path("/proc", str(pid), "fd").iterdir():

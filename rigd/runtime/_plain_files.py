@@ -1,4 +1,4 @@
-"""Files that a user names, of whatever kind they may turn out to be."""
+"""Safe opening of files named by users, which may be of any kind."""
 
 import errno
 import os
@@ -9,44 +9,44 @@ from typing import Final, TextIO
 _FLAGS: Final = os.O_RDONLY | sum(
     getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NONBLOCK", "O_BINARY")
 )
-"""Windows has not all of them."""
+"""Flags for opening; some do not exist on Windows."""
 
 
 def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
-    """Open a text file of limited size; a pipe without a writer is not waited for.
+    """Open a regular text file of limited size, without blocking on a pipe.
 
     Parameters
     ----------
     path
         Name of the file.
     most_bytes
-        The limit.
+        Largest permitted size.
     newline
         Argument of `open`.
 
     Raises
     ------
     OSError
-        If it cannot be opened, or is not of that kind.
+        If the file cannot be opened, is not a regular file, or is too large.
     """
     fd = _open(path, most_bytes)
     return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
 
 
 def read_plain_file(path: Path, most_bytes: int) -> bytes:
-    """Return the content of a file of limited size; a pipe without a writer is not waited for.
+    """Return the content of a regular file of limited size, without blocking on a pipe.
 
     Parameters
     ----------
     path
         Name of the file.
     most_bytes
-        The limit.
+        Largest permitted size.
 
     Raises
     ------
     OSError
-        If it cannot be read, or is not of that kind.
+        If the file cannot be read, is not a regular file, or is too large.
     """
     with open(_open(path, most_bytes), "rb") as file:
         return file.read(most_bytes)

@@ -1,10 +1,10 @@
-r"""Signals that ask for an end, and what each process makes of them.
+r"""Signals that request an end, and the reaction of each process.
 
-Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal reach every process in it; a service manager
-sends SIGTERM to all at once. A command ends by an exception (`raise_on`). To the supervisor and to
-the control process each of the signals means: stop safely (`StopRequest`); a suspended control
-process would leave its last torque on. The recorder and the live publisher let them pass
-(`ignore`): they end when the supervisor has no more use for them.
+Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal reach all its processes; a service manager
+sends SIGTERM to all processes. A command ends by an exception (`raise_on`). For the supervisor and
+the control process each of the signals means a safe stop (`StopRequest`); a suspended control
+process would leave its last torque on. The recorder and the live publisher ignore them (`ignore`)
+and are ended by the supervisor.
 """
 
 import contextlib
@@ -21,16 +21,15 @@ _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
 class Interruption(KeyboardInterrupt):
-    """A signal that asks for the end; its number is the argument.
+    """Signal that requests the end; its number is the argument.
 
-    `python -m` ends by the signal, whatever exit code it is asked for, once a plain
-    `KeyboardInterrupt` has passed through an `exec` of text; what defines a named tuple or a
-    dataclass is one.
+    After a plain `KeyboardInterrupt` has passed through an `exec` of text, as in the definition of
+    a named tuple or dataclass, `python -m` ends by the signal and ignores the exit code.
     """
 
 
 def raise_on(*numbers: int) -> None:
-    """Have these signals raise an :class:`Interruption`, wherever the program is."""
+    """Make these signals raise an :class:`Interruption`."""
     if hasattr(signal, "SIGALRM"):  # not on Windows
         sys.unraisablehook = _unraisable
     for number in numbers:
@@ -38,15 +37,15 @@ def raise_on(*numbers: int) -> None:
 
 
 def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
-    """Handle a signal as Ctrl-C."""
+    """Raise an :class:`Interruption` for a signal."""
     raise Interruption(number)
 
 
 def let_pass() -> None:
-    """Ignore what has been handled so far: a user may press once more, and has been heard.
+    """Ignore the signals handled so far, so that another Ctrl-C does not interrupt the cleanup.
 
-    Python gives each signal that is handled its default action back before it has cleaned up, and
-    would end by it.
+    Otherwise Python restores the default action of handled signals before its cleanup has ended,
+    and a signal would end the process.
     """
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
@@ -54,11 +53,10 @@ def let_pass() -> None:
 
 
 def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
-    """Repeat a signal whose exception Python has dropped, as it does at the end of an object.
+    """Repeat a signal whose exception Python dropped, as in the finalizer of an object.
 
-    Objects end anywhere; the locks of the import system, for one, have callbacks for it. What is
-    raised in here would be dropped as well, so the signal comes again a little later, to whatever
-    handles it by then.
+    Finalizers run anywhere, for example in callbacks of the locks of the import system. An
+    exception raised here would also be dropped, so the signal is sent again a little later.
     """
     lost = dropped.exc_value
     if not isinstance(lost, Interruption):
@@ -70,9 +68,9 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
 
 
 def signal_when_orphaned(number: int) -> None:
-    """Have the system send this process a signal when the one that started it ends.
+    """Make the system send a signal to this process when its parent ends.
 
-    A process that is suspended gets it too, because nothing else would wake it.
+    A suspended process is also continued, because nothing else would wake it.
     """
     with contextlib.suppress(AttributeError):  # Linux has it, others do without
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
@@ -81,10 +79,10 @@ def signal_when_orphaned(number: int) -> None:
 # In the processes of a rig
 
 STOP_SIGNAL: Final = signal.SIGUSR1
-"""Asks the process that runs sessions for their end, and for nothing else: a daemon goes on.
+"""Requests a stop of the sessions of a process; a daemon itself continues.
 
-The process table shows whether there can be any: by default they have not begun, a process that
-handles the signal may run one, a process that ignores it runs none any more.
+The process table shows whether there may be sessions: a process with the default action has not yet
+begun, a process that handles the signal may run one, a process that ignores it has finished.
 """
 
 _STOPPING = (
@@ -95,9 +93,9 @@ _STOPPING = (
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Delay these signals; a process started meanwhile goes on delaying them.
+    """Block these signals; a process started in this context inherits the block.
 
-    It has them delivered by :meth:`StopRequest.catch` or :func:`ignore`, once it can handle them.
+    It unblocks them with :meth:`StopRequest.catch` or :func:`ignore` when it can handle them.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
     try:
@@ -107,21 +105,21 @@ def held_back() -> Iterator[None]:
 
 
 def ignore() -> None:
-    """Ignore the signals that ask for an end."""
+    """Ignore the signals that request an end."""
     for number in _STOPPING:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
 
 
 class StopRequest:
-    """Remembers that a stop was asked for.
+    """Stop request of the operator, set by signals.
 
     Attributes
     ----------
     requested
-        Whether it was.
+        Whether a stop was requested.
     on_request
-        Called from the signal handler, each time.
+        Called from the signal handler at each request.
     """
 
     def __init__(self) -> None:
@@ -129,19 +127,19 @@ class StopRequest:
         self.on_request: Callable[[], None] = lambda: None
 
     def catch(self) -> None:
-        """Handle the signals from now on; one that was ignored before stays so (nohup)."""
+        """Handle the signals from now on, except those that were ignored before (nohup)."""
         for number in _STOPPING:
             if signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, lambda *_: self.request())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
 
     def sessions_are_over(self) -> None:
-        """Show in the process table that this process runs no session any more."""
+        """Show in the process table that this process runs no more sessions."""
         if callable(signal.getsignal(STOP_SIGNAL)):
             with contextlib.suppress(ValueError):  # not in the main thread
                 signal.signal(STOP_SIGNAL, signal.SIG_IGN)
 
     def request(self) -> None:
-        """Ask for a stop."""
+        """Request a stop."""
         self.requested = True
         self.on_request()

@@ -1,8 +1,7 @@
-"""Addresses: where a process of this user is found, and whether it is still there.
+"""Addresses of the processes of this user, and detection of dead processes.
 
-A process is found in the runtime folder: by a Unix socket on which it listens, or by a small JSON
-file that it announces. What a dead process left is recognised by nobody listening (`answers`), or
-by that process being gone (`started_at`).
+A process has a Unix socket or a small JSON file in the runtime folder. A socket of a dead process
+is recognised because nobody listens (`answers`), a file because the process is gone (`started_at`).
 """
 
 import itertools
@@ -20,7 +19,7 @@ from typing import Any, Final
 from rigd.errors import FailureError
 
 _LOGINS: Final = Path("/run/user")
-"""Holds the runtime folder of each user who is logged in."""
+"""Parent of the runtime folders of all logged-in users."""
 _FALLBACK: Final = re.compile(r"rigd-(\d{1,10})(?:-(\d{1,9}))?")
 _PROBE_S: Final = 1.0
 _MOST_BYTES: Final = 65_536
@@ -30,11 +29,11 @@ _MOST_BYTES: Final = 65_536
 
 
 class UnsafeFolderError(FailureError):
-    """Other users can change what is in the runtime folder; the message names the remedy."""
+    """Other users can modify the runtime folder; the message names the remedy."""
 
 
 def runtime_folder() -> Path:
-    """Return the folder for sockets and addresses: of this user, gone after a restart.
+    """Return this user's folder for sockets and addresses, which a restart removes.
 
     Raises
     ------
@@ -53,12 +52,12 @@ def runtime_folder() -> Path:
 
 
 def folder_fault(folder: Path, *, shared: bool = False) -> str:
-    """Say why other users can replace what is in a runtime folder; empty if they cannot.
+    """Return why other users can replace files in a runtime folder; empty if they cannot.
 
     Parameters
     ----------
     folder
-        The folder; one that does not exist is sound if its parent is.
+        The folder. A folder that does not exist is safe if its parent is.
     shared
         The folder may belong to any user, as that of a group does.
     """
@@ -69,7 +68,7 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
             continue
         writable = status.st_mode & 0o022
         if path == folder.parent and status.st_mode & stat.S_ISVTX:
-            writable = 0  # in a sticky folder a user can remove only what is that user's own
+            writable = 0  # in a sticky folder users can remove only their own files
         if writable:
             whom = "every user" if writable & 0o002 else "its group"
             return (
@@ -87,17 +86,17 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
 
 
 def known_folders(uid: int | None) -> list[Path]:
-    """Return where runtime folders of a user are, whatever the environment of its processes.
+    """Return all possible runtime folders of a user, for any environment of the processes.
 
     Parameters
     ----------
     uid
-        Number of the user; None: any user.
+        User id; None: any user.
 
     Returns
     -------
     list of Path
-        That of this environment, the login session's, and those in the folder for temporary files.
+        Folders of this environment, of the login session, and in the folder for temporary files.
     """
     base = os.environ.get("XDG_RUNTIME_DIR")
     found = [Path(base) / "rigd"] if base else []
@@ -112,9 +111,9 @@ def known_folders(uid: int | None) -> list[Path]:
 
 
 def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
-    """Return the folders that `_own_folder` has made for a user, or for all, lowest number first.
+    """Return the folders made by `_own_folder` for a user, or for all, by increasing number.
 
-    A folder of such a name that belongs to another user is left out.
+    A folder of such a name that belongs to another user is omitted.
     """
     found = []
     with suppress(OSError), os.scandir(base) as entries:
@@ -130,10 +129,10 @@ def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
 
 
 def _own_folder(base: Path) -> Path:
-    """Return the user's folder among those of all users; make it if there is none.
+    """Return the user's folder in the common folder; create it if there is none.
 
-    A name that another user took is passed over. A folder made while that was so is found again
-    after the other user has given the name up.
+    A name taken by another user is skipped. The folder is found again even after the other user has
+    released the name.
     """
     uid = os.getuid()
     own = _fallback_folders(base, uid)
@@ -154,7 +153,7 @@ def _own_folder(base: Path) -> Path:
 
 
 def file_name(rig: str) -> str:
-    """Return a rig's name as file names have it: all but letters and digits as ``-``."""
+    """Return a rig's name for file names, with ``-`` for all but letters and digits."""
     return "".join(c if c.isalnum() else "-" for c in rig).strip("-")
 
 
@@ -166,8 +165,7 @@ def address_files(pattern: str, *folders: Path) -> list[Path]:
     pattern
         Pattern of file names, as of :meth:`pathlib.Path.glob`.
     *folders
-        Folders to search; one that cannot be read is left out. Without any, the user's runtime
-        folder is searched.
+        Folders to search; unreadable ones are skipped. Default: the user's runtime folder.
     """
     found: list[Path] = []
     for folder in folders or (runtime_folder(),):
@@ -177,16 +175,16 @@ def address_files(pattern: str, *folders: Path) -> list[Path]:
 
 
 def announce(path: Path, address: Mapping[str, object]) -> None:
-    """Write down an address for this user only, until it is withdrawn.
+    """Write an address to a file that only this user can read.
 
-    A reader meanwhile gets the old or the new one. The folder is created.
+    The file is replaced atomically. The folder is created if necessary.
 
     Parameters
     ----------
     path
-        File to write; an older one is replaced.
+        File to write; an existing one is replaced.
     address
-        What JSON can represent, by name.
+        Values that JSON can represent, by name.
 
     Raises
     ------
@@ -202,9 +200,9 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
 
 
 def read_address(path: Path) -> dict[str, Any]:
-    """Return what was announced; empty if nothing was, or something else lies there."""
+    """Return an announced address; empty if there is no valid file."""
     try:
-        # Anything may lie there, even what blocks the process that opens it.
+        # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         with os.fdopen(descriptor, "rb") as file:
             found = json.loads(file.read(_MOST_BYTES))
@@ -214,26 +212,26 @@ def read_address(path: Path) -> dict[str, Any]:
 
 
 def answers(path: str | Path) -> bool:
-    """Whether a process listens on a Unix socket; on that of a dead process none does."""
+    """Return whether a process listens on a Unix socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(_PROBE_S)
         try:
             probe.connect(os.fspath(path))
         except (BlockingIOError, TimeoutError):
             return True  # its queue is full
-        except (OSError, ValueError):  # the latter where it is not a path
+        except (OSError, ValueError):  # ValueError if it is not a valid path
             return False
     return True
 
 
 def started_at(pid: int) -> int | None:
-    """Return when a process was started, in clock ticks since the computer was.
+    """Return the start time of a process in clock ticks after that of the computer.
 
-    No other process has both numbers. None if it does not run.
+    Process id and start time together are unique. None if the process does not run.
     """
     try:
         text = Path(f"/proc/{pid}/stat").read_text("utf-8")
     except OSError:
         return None
-    state, *rest = text.rpartition(")")[2].split()  # the name before may hold anything
+    state, *rest = text.rpartition(")")[2].split()  # the name before may contain any character
     return None if state in "ZX" else int(rest[18])

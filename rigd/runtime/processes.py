@@ -1,7 +1,7 @@
-"""Process table of this computer, read from the kernel: what runs, listens and holds a lock.
+"""Process table of this computer from the kernel: running processes, sockets and locks.
 
-It does not depend on the environment of who asks, nor on the folder in which another process of
-the same user made its socket.
+The table does not depend on the environment of the calling process, nor on the folder in which
+another process of the same user created its socket.
 """
 
 import os
@@ -16,7 +16,7 @@ from rigd.runtime.addresses import started_at
 _PROC: Final = Path("/proc")
 _SOCKETS: Final = Path("/proc/net/unix")
 _LISTENER: Final = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
-"""Any user may give a socket any name, even with a line break in it."""
+"""Line of the table of sockets; any user can choose any name, even with a line break."""
 _LISTENS: Final = 0x10000
 
 
@@ -25,44 +25,44 @@ class RunningProcess:
     """One row of the process table."""
 
     pid: int
-    """Its number."""
+    """Process id."""
     parent: int
-    """Number of the process that started it, or has taken it over."""
+    """Process id of the parent or, after its end, of the adopting process."""
     uid: int
-    """Its user; -1 while it changes users (a setuid program)."""
+    """User id; -1 while the process changes users (a setuid program)."""
     name: str
-    """Its short name (`name_this_process`)."""
+    """Short name (`name_this_process`)."""
     command: tuple[str, ...]
-    """Its command line."""
+    """Command line."""
     caught: int
-    """Signals that it handles: bit n-1 for signal n; likewise the next two."""
+    """Mask of handled signals: bit n-1 for signal n, also in the next two masks."""
     ignored: int
-    """Signals that it ignores."""
+    """Mask of ignored signals."""
     pending: int
-    """Signals that were sent and not yet taken."""
+    """Mask of pending signals."""
     suspended: bool
-    """It is stopped by a signal or a debugger."""
+    """Whether the process is stopped by a signal or a debugger."""
 
     @property
     def born(self) -> int | None:
-        """Start of the process in clock ticks since that of the computer; None: it has ended."""
+        """Start time in clock ticks after that of the computer; None: the process has ended."""
         return started_at(self.pid)
 
     def handles(self, number: int) -> bool:
-        """Whether the process has a handler for a signal."""
+        """Return whether the process has a handler for a signal."""
         return bool(self.caught >> (number - 1) & 1)
 
     def ignores(self, number: int) -> bool:
-        """Whether the process ignores a signal."""
+        """Return whether the process ignores a signal."""
         return bool(self.ignored >> (number - 1) & 1)
 
     def awaits(self, number: int) -> bool:
-        """Whether a signal was sent that the process has not taken yet."""
+        """Return whether a signal is pending."""
         return bool(self.pending >> (number - 1) & 1)
 
 
 def read_processes() -> list[RunningProcess]:
-    """Return all processes that this user can see, by number; those that have ended are left out.
+    """Return all running processes that this user can see, by process id.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def read_process(pid: int) -> RunningProcess | None:
     Parameters
     ----------
     pid
-        Number of the process.
+        Process id.
     """
     try:
         status = Path(_PROC, str(pid), "status").read_text("utf-8", errors="replace")
@@ -94,20 +94,20 @@ def read_process(pid: int) -> RunningProcess | None:
 
 def _row(pid: int, status: str, command: bytes) -> RunningProcess | None:
     rows = [line.partition(":\t") for line in status.split("\n")]
-    told = {key: value for key, _, value in reversed(rows)}  # the first of a name counts
-    state = told["State"][:1]
+    fields = {key: value for key, _, value in reversed(rows)}  # the first value of a name is used
+    state = fields["State"][:1]
     if state in "ZX":
         return None
-    users = {int(number) for number in told["Uid"].split()}
+    users = {int(number) for number in fields["Uid"].split()}
     return RunningProcess(
         pid=pid,
-        parent=int(told["PPid"]),
+        parent=int(fields["PPid"]),
         uid=users.pop() if len(users) == 1 else -1,
-        name=told["Name"],
+        name=fields["Name"],
         command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        caught=int(told["SigCgt"], 16),
-        ignored=int(told["SigIgn"], 16),
-        pending=int(told["SigPnd"], 16) | int(told["ShdPnd"], 16),
+        caught=int(fields["SigCgt"], 16),
+        ignored=int(fields["SigIgn"], 16),
+        pending=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
         suspended=state in "Tt",
     )
 
@@ -120,7 +120,7 @@ def send_signal(process: RunningProcess, born: int, number: int) -> bool:
     process
         The process.
     born
-        Its start: another process may have its number by now.
+        Its start time, because its process id may have been reused.
     number
         The signal.
     """
@@ -147,8 +147,8 @@ def name_this_process(name: str) -> None:
 def listening_sockets() -> list[Path]:
     """Return the paths of the Unix sockets on which any process of this computer listens.
 
-    The kernel lists them whoever made them, and wherever; each only once, sorted. Any user may
-    give a socket any path.
+    The list contains the sockets of all users in all folders, each once, sorted. Any user can
+    choose any path for a socket.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Tables in text files of other programs: their layout, their numbers, and what does not fit.
+"""Tables in text files of other programs: detection of the layout, numbers, and errors.
 
-`read_table` finds separator, decimal sign, titles, row of units and first line of numbers, reads
-some columns, and refuses every line that is not of that table, with its number. `decode_text` reads
-a text that may begin with a byte order mark. The public module `titles` has what titles of columns
-state of units and times. The ground floor: it knows nothing of rigs.
+`read_table` detects separator, decimal sign, titles, row of units and first line of numbers, reads
+some columns, and reports every invalid line with its number. `decode_text` decodes a text with or
+without a byte order mark. The public module `titles` finds units and times in the titles of
+columns. The package depends on no other package.
 """
 
 import lazy_loader as lazy

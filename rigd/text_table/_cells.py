@@ -30,22 +30,22 @@ _COMMENT: Final = re.compile(r"\s*[#%]\s*")
 
 
 def is_number(cell: str, mark: str) -> bool:
-    """Whether a cell is a number with that decimal sign, or NaN or an infinity by name."""
+    """Return whether a cell is a number with that decimal sign, NaN or infinity."""
     return _NUMBERS[mark].fullmatch(cell.strip()) is not None
 
 
 def is_any_number(cell: str) -> bool:
-    """Whether a cell is a number with a decimal point or a decimal comma."""
+    """Return whether a cell is a number with a decimal point or a decimal comma."""
     return is_number(cell, POINT) or is_number(cell, COMMA)
 
 
 def number_of(cell: str, mark: str) -> float:
-    """Return the number of a cell; NaN where it is empty.
+    """Return the number of a cell; NaN for an empty cell.
 
     Raises
     ------
     ValueError
-        If it is not a number with that decimal sign.
+        If the cell is not a number with that decimal sign.
     """
     text = cell.strip()
     if not text:
@@ -56,7 +56,7 @@ def number_of(cell: str, mark: str) -> float:
 
 
 def quick_reader(mark: str) -> Callable[[str], float]:
-    """Return the quickest function from a cell to its number; it raises ValueError if in doubt."""
+    """Return the fastest converter of a cell to a number; it raises ValueError if in doubt."""
     return float if mark == POINT else _with_comma
 
 
@@ -67,15 +67,15 @@ def _with_comma(cell: str) -> float:
 
 
 def is_date(cell: str) -> bool:
-    """Whether a cell looks like a date or a time of day."""
+    """Return whether a cell resembles a date or a time of day."""
     return _DATE.fullmatch(cell.strip()) is not None
 
 
 class ThousandsWatch:
-    """Watch over one column whose decimal signs could be separators between thousands.
+    """Check of one column whose decimal signs could be thousands separators.
 
-    Every cell that has the sign has exactly three digits behind it, and none a leading zero. Such a
-    column is in doubt if other cells of it, below 1000, have no sign.
+    Every cell with the sign has exactly three digits after it and no leading zero. Such a column is
+    ambiguous if other cells, below 1000, have no sign.
     """
 
     def __init__(self, mark: str) -> None:
@@ -84,7 +84,7 @@ class ThousandsWatch:
         self.plain = False
 
     def settles(self, cell: str, line: int) -> bool:
-        """Take a cell; return whether it shows that the sign is a decimal sign."""
+        """Add a cell; return whether it shows that the sign is a decimal sign."""
         text = cell.strip()
         if self._mark not in text:
             self.plain = self.plain or _UP_TO_THREE_DIGITS.fullmatch(text) is not None
@@ -96,10 +96,10 @@ class ThousandsWatch:
 
 
 def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
-    """Whether cells between commas are halves of numbers with decimal commas: 0,025 as 0 and 025.
+    """Return whether cells between commas are halves of numbers with decimal commas (0,025).
 
-    In every line there is an even number of cells without a decimal sign, the second of each pair
-    without a sign and somewhere with a leading zero, which no whole number is written with.
+    Every line then has an even number of cells without a decimal sign. The second cell of each pair
+    has no sign, and somewhere a leading zero, which no integer has.
     """
     zeros = False
     for row in rows:
@@ -116,18 +116,18 @@ def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def without_comment_mark(cell: str) -> str:
-    """Return a title without the mark that numpy or MATLAB put in front of the line."""
+    """Return a title without the comment mark of numpy or MATLAB at the start of the line."""
     return _COMMENT.sub("", cell, count=1) if _COMMENT.match(cell) else cell
 
 
 def is_comment(row: Sequence[str]) -> bool:
-    """Whether a line is a comment, or a rule of dashes or the like below the titles."""
+    """Return whether a line is a comment, or a rule such as dashes below the titles."""
     text = "".join(row).strip()
     return _COMMENT.match(text) is not None or set(text) <= set("-=_+|*: ")
 
 
 def is_row_of_units(row: Sequence[str], columns: Sequence[int]) -> bool:
-    """Whether a line below the titles has units: one at least is known, and none is a number."""
+    """Return whether a line below the titles has units: at least one known unit and no number."""
     cells = [cell.strip() for cell in row]
     if any(is_any_number(cell) for cell in cells if cell and cell != "1"):
         return False

@@ -1,11 +1,11 @@
-"""Encoding of a text file: by its byte order mark, else UTF-8, else Windows' own."""
+"""Encoding of a text file: by its byte order mark, else UTF-8, else Windows-1252."""
 
 import codecs
 from typing import Final
 
 _MARKS: Final = (
     (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),  # begins as UTF-16's mark does
+    (codecs.BOM_UTF32_LE, "utf-32"),  # first, because the mark of UTF-16 is its prefix
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
@@ -14,10 +14,10 @@ _LONGEST_MARK: Final = 4
 
 
 def encodings(head: bytes) -> tuple[str, ...]:
-    """Return the encodings to try, the likeliest first, from the first bytes of a file.
+    """Return the possible encodings from the first bytes of a file, the most probable first.
 
-    Without a mark a file that is not UTF-8 is taken for Windows-1252, which most programs write
-    that know no UTF-8. Numbers have the same bytes in both; only titles and units could differ.
+    Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
+    only titles and units can differ.
     """
     marked = _marked(head)
     if marked is not None:
@@ -30,7 +30,7 @@ def encodings(head: bytes) -> tuple[str, ...]:
 
 
 def decode_text(data: bytes) -> str:
-    r"""Decode text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark, which is left out.
+    r"""Decode text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark; omit the mark.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def decode_text(data: bytes) -> str:
     Raises
     ------
     UnicodeDecodeError
-        If it is no such text.
+        If the data are in another encoding.
 
     Examples
     --------
@@ -52,5 +52,5 @@ def decode_text(data: bytes) -> str:
 
 
 def _marked(head: bytes) -> str | None:
-    """Return the encoding that a byte order mark states, None without one."""
+    """Return the encoding of a byte order mark, None without a mark."""
     return next((name for mark, name in _MARKS if head.startswith(mark)), None)

@@ -1,4 +1,4 @@
-"""Errors of tables: what is wrong with which line."""
+"""Errors of tables."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -17,7 +17,7 @@ class TableError(Exception):
     message : str
         Sentence without the file's name.
     cell : str
-        Text of the file that is wrong, "" if none.
+        Invalid text of the file, "" if none.
     """
 
     def __init__(self, message: str, cell: str = "") -> None:
@@ -26,7 +26,7 @@ class TableError(Exception):
         self.cell = cell
 
     def __str__(self) -> str:
-        """Return the message with the text of the file that it is about."""
+        """Return the message with the invalid text of the file."""
         shown = f" ('{printable(self.cell, _CELL_SHOWN)}')" if self.cell else ""
         return self.message.replace("{cell}", shown)
 
@@ -36,16 +36,16 @@ class TableError(Exception):
 
 
 class MissingColumnError(TableError):
-    """The table has no column of that title.
+    """The table has no column with that title.
 
     Parameters
     ----------
     name : str
-        Title that is missing.
+        Missing title.
     titles : sequence of str
-        Titles that the file seems to have.
+        Probable titles of the file.
     line : int
-        Their line, 0 if there are none.
+        Line of the titles, 0 if there are none.
     """
 
     def __init__(self, name: str, titles: Sequence[str], line: int) -> None:

@@ -1,4 +1,4 @@
-"""Rate that the lines above a table state in words: ``Sampling rate: 500 Hz``, ``Delta: 2 ms``."""
+"""Sampling rate in the lines above a table, such as ``Sampling rate: 500 Hz``, ``Delta: 2 ms``."""
 
 import re
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ _PERIOD: Final = re.compile(
 
 
 def stated_rate_hz(lines: Iterable[str]) -> float | None:
-    """Return the rate that a line of the head states, None if none does; without a unit in Hz."""
+    """Return the rate in a line of the head, None if there is none; the default unit is Hz."""
     for line in lines:
         rate = _RATE.search(line)
         if rate:

@@ -17,13 +17,13 @@ _OF_CHANNELS: Final = ("Delta_X", "X0", "Y_Unit_Label", "X_Dimension", "Date", "
 
 @dataclass(frozen=True, slots=True)
 class LabviewHead:
-    """What the head states.
+    """Head of a LabVIEW measurement file.
 
     Attributes
     ----------
     separator : str
     last_line : int
-        Number of the line that ends the head.
+        Number of the last line of the head.
     channels : mapping of str to tuple of str
         Key such as ``Delta_X`` → its cell for each column.
     """
@@ -33,12 +33,12 @@ class LabviewHead:
     channels: Mapping[str, tuple[str, ...]]
 
     def text(self, key: str, column: int) -> str:
-        """Return what a key of the head has for a column, "" if nothing."""
+        """Return the text of a key of the head for a column, "" if none."""
         cells = self.channels.get(key, ())
         return cells[column] if 0 < column < len(cells) else ""
 
     def number(self, key: str, column: int) -> float | None:
-        """Return the number that a key of the head has for a column, None if it has none."""
+        """Return the number of a key of the head for a column, None if none."""
         try:
             return float(self.text(key, column).replace(",", "."))
         except ValueError:
@@ -62,7 +62,7 @@ class LabviewHead:
 
 
 def head_of(lines: Sequence[str]) -> LabviewHead | None:
-    """Return the head that a text begins with, None if it is no file of that kind.
+    """Return the head of a text, None if it is not a LabVIEW measurement file.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def head_of(lines: Sequence[str]) -> LabviewHead | None:
         if key == "Separator" and cells:
             mark = _SEPARATORS.get(cells[0].lower(), mark)
         elif key.startswith(_END):
-            channels.clear()  # what comes before the first one is of the file, not of channels
+            channels.clear()  # earlier keys belong to the file and not to a channel
         elif key in _OF_CHANNELS:
             channels[key] = ("", *cells)
     return LabviewHead(mark, ends[-1], channels)

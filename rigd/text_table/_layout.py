@@ -21,29 +21,29 @@ from rigd.text_table._stamps import is_stamp
 from rigd.text_table.titles import bare_unit, is_unit
 
 HEAD_LINES: Final = 500
-"""Lines in which the first line of numbers must come."""
+"""Largest line number of the first line of numbers."""
 
 BLANKS: Final = " "
 _SEPARATORS: Final = ("\t", ";", ",", "|")
 _NAMES: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", BLANKS: "blanks"}
 _EXCEL: Final = "sep="
 _BETWEEN: Final = 6
-"""Most lines between the titles and the first line of numbers."""
+"""Largest number of lines between the titles and the first line of numbers."""
 _NUMBERING_LINES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """A line of the file, or several where a quoted cell has ends of lines.
+class TextRow:
+    """A row of cells: one line of the file, or several with line breaks in a quoted cell.
 
     Attributes
     ----------
     line : int
-        Number of its first line, from 1 on.
+        Number of its first line, from 1.
     cells : list of str
-        Without blanks around them.
+        Cells without surrounding blanks.
     index : int
-        Rows before it, empty ones included.
+        Number of rows before it, including empty ones.
     """
 
     line: int
@@ -52,33 +52,33 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Where in a text the numbers are.
+class TableLayout:
+    """Layout of a table in a text.
 
     Attributes
     ----------
     separator : str
-        Character between cells; a blank for any number of blanks.
+        Character between cells; a blank means any number of blanks.
     titles : tuple of str
-        One for each column, empty without titles.
+        Title of each column, empty without titles.
     titles_line : int
-        Their line, 0 without titles.
+        Line of the titles, 0 without titles.
     units : tuple of str
-        The row of units below the titles, "" where a cell is empty.
+        Units of the row below the titles, "" for an empty cell.
     width : int
-        Cells of each line.
+        Number of cells of each line.
     optional : int
-        Columns at the end that a line may lack: the comment of LabVIEW's text files.
+        Number of optional columns at the end: the comment of LabVIEW's text files.
     skip : int
-        Rows before the first row of numbers.
+        Number of rows before the first row of numbers.
     columns : tuple of int
-        Places of the columns asked for, in their order.
+        Indices of the requested columns, in their order.
     first : tuple of str
         Cells of the first row of numbers.
     labview : LabviewHead or None
         Head of a LabVIEW measurement file.
     rate_hz : float or None
-        Rate that another head states.
+        Sampling rate in another head.
     """
 
     separator: str
@@ -95,7 +95,7 @@ class Layout:
 
 
 def stated_separator(first_line: str) -> str | None:
-    """Return the separator of Excel's line ``sep=;``, None if it is another line."""
+    """Return the separator of Excel's line ``sep=;``, None for another line."""
     text = first_line.rstrip("\r\n").strip('"')
     is_statement = text[: len(_EXCEL)].lower() == _EXCEL and len(text) == len(_EXCEL) + 1
     return text[-1] if is_statement else None
@@ -115,7 +115,7 @@ def rows_of(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[st
 
 
 def fitted(row: Sequence[str], width: int) -> list[str]:
-    """Return a row without the empty cells behind the last column."""
+    """Return a row without the empty cells after the last column."""
     cells = list(row)
     while len(cells) > width and not cells[-1].strip():
         cells.pop()
@@ -123,7 +123,7 @@ def fitted(row: Sequence[str], width: int) -> list[str]:
 
 
 def wrong_width(line: int, cells: int, layout_width: int, titles_line: int, separator: str) -> str:
-    """Say that a line has too many or too few cells, and what to do."""
+    """Return the message for a line with too many or too few cells."""
     table = (
         f"line {titles_line} has {_counted(layout_width, 'title')}"
         if titles_line
@@ -151,7 +151,7 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
+def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     """Find the table in the first lines of a file.
 
     Parameters
@@ -159,7 +159,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
     lines : sequence of str
         At most `HEAD_LINES`, with their ends.
     names : sequence of str
-        Titles of the columns asked for, or ``#3`` for the third.
+        Titles of the requested columns, or ``#3`` for the third.
 
     Raises
     ------
@@ -177,11 +177,11 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
     present = [mark for mark in _SEPARATORS if any(mark in line for line in lines)]
     candidates = [stated] if stated else [*present, BLANKS]
     failures: list[_UnlikelyError] = []
-    found: Layout | None = None
+    found: TableLayout | None = None
     for separator in candidates:
         try:
             rows = [
-                Row(line, [cell.strip() for cell in cells], index)
+                TextRow(line, [cell.strip() for cell in cells], index)
                 for index, (line, cells) in enumerate(rows_of(lines, separator))
             ]
         except csv.Error as error:
@@ -201,7 +201,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
         if found is None or layout.skip < found.skip:
             found = layout
     worst = max(failures, key=lambda failure: failure.rank, default=None)
-    # What is a table from a late line on only, though an earlier one nearly was one, is none.
+    # A table that starts late does not count if earlier lines nearly form a table.
     early = any(
         each.rank == _TITLES and found and each.index < found.skip and each.separator != BLANKS
         for each in failures
@@ -215,7 +215,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> Layout:
 
 
 class _UnlikelyError(Exception):
-    """A separator with which the text is not the table asked for, and how near it comes."""
+    """Separator with which the text is not the requested table; `rank`: how near it is."""
 
     def __init__(self, rank: int, error: TableError, index: int = HEAD_LINES) -> None:
         super().__init__()
@@ -226,27 +226,27 @@ class _UnlikelyError(Exception):
 
 
 _NO_ROWS, _NO_TITLES, _SOME_TITLES, _TITLES = range(4)
-"""How near a failure comes: the message of the nearest is shown."""
+"""Ranks of failures: the message of the highest rank is shown."""
 
 
 def _layout(
-    rows: Sequence[Row],
+    rows: Sequence[TextRow],
     separator: str,
     names: Sequence[str],
     labview: "_labview.LabviewHead | None",
-) -> Layout:
+) -> TableLayout:
     numbers = [_number(name) for name in names]
     titled = [name for name, number in zip(names, numbers, strict=True) if number is None]
     if not rows:
         raise _UnlikelyError(_NO_ROWS, TableError("has no lines below its head."))
     failure: _UnlikelyError | None = None
-    for place, row in enumerate(rows):
+    for index, row in enumerate(rows):
         if titled and not _has_titles(row, titled):
             continue
         try:
             if titled:
-                return _below_titles(rows, place, separator, names, labview)
-            found = _with_numbers(rows, place, separator, [n or 0 for n in numbers], labview)
+                return _below_titles(rows, index, separator, names, labview)
+            found = _with_numbers(rows, index, separator, [n or 0 for n in numbers], labview)
             if found is not None:
                 return found
         except _UnlikelyError as unlikely:
@@ -271,30 +271,30 @@ def _number(name: str) -> int | None:
     return int(digits) if name != digits and digits.isdecimal() and int(digits) > 0 else None
 
 
-def _plain_titles(row: Row) -> list[str]:
-    """Return the titles of a row without the mark of a comment, and without empty ones behind."""
+def _plain_titles(row: TextRow) -> list[str]:
+    """Return the titles of a row without comment mark and without empty titles at the end."""
     cells = fitted(row.cells, 0)
-    if cells and cells[0] in ("#", "%"):  # between blanks, the mark is a cell of its own
+    if cells and cells[0] in ("#", "%"):  # with blanks as separator the mark is a separate cell
         return cells[1:]
-    return [without_comment_mark(cell) if not place else cell for place, cell in enumerate(cells)]
+    return [without_comment_mark(cell) if not index else cell for index, cell in enumerate(cells)]
 
 
-def _has_titles(row: Row, names: Iterable[str]) -> bool:
+def _has_titles(row: TextRow, names: Iterable[str]) -> bool:
     return all(name in row.cells or name in _plain_titles(row) for name in names)
 
 
 def _below_titles(
-    rows: Sequence[Row],
-    place: int,
+    rows: Sequence[TextRow],
+    index: int,
     separator: str,
     names: Sequence[str],
     labview: "_labview.LabviewHead | None",
-) -> Layout:
+) -> TableLayout:
     """Return the layout of the table whose titles are in one row."""
-    head = rows[place]
+    head = rows[index]
     raw, plain = fitted(head.cells, 0), _plain_titles(head)
     titles = raw if all(name in raw for name in names if _number(name) is None) else plain
-    if len(plain) < len(raw):  # a mark by itself may be one of a comment, or the title of an index
+    if len(plain) < len(raw):  # a single mark may be that of a comment or the title of an index
         below = _next(rows, head)
         titles = raw if below is None or len(below.cells) == len(raw) else plain
     width = len(titles)
@@ -317,15 +317,15 @@ def _below_titles(
             raise _UnlikelyError(_TITLES, MissingColumnError(name, titles, head.line))
     optional = int(labview is not None and titles[-1] == _labview.COMMENT)
     units: Sequence[str] = ()
-    above = rows[place - 1].cells if place else []
+    above = rows[index - 1].cells if index else []
     if len(fitted(above, width)) == width and all(is_unit(cell) for cell in above if cell):
         units = above
-    for row in rows[place + 1 : place + 2 + _BETWEEN]:
+    for row in rows[index + 1 : index + 2 + _BETWEEN]:
         cells = fitted(row.cells, width)
         fits = width - optional <= len(cells) <= width
         if fits and _is_data(cells, columns, _next(rows, row)):
             _check_single(row.line, cells)
-            return Layout(
+            return TableLayout(
                 separator=separator,
                 titles=tuple(titles),
                 titles_line=head.line,
@@ -356,19 +356,19 @@ def _check_single(line: int, cells: Sequence[str]) -> None:
 
 
 def comma_in_single(line: int) -> str:
-    """Say why a column by itself has no decimal commas."""
+    """Return the message for a single column with decimal commas."""
     return (
         f"line {line} has a comma, which separates two cells, and the table has one column; save "
         "the file with decimal points."
     )
 
 
-def _next(rows: Sequence[Row], row: Row) -> Row | None:
+def _next(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
     return next((each for each in rows if each.index > row.index), None)
 
 
-def _is_data(cells: Sequence[str], columns: Sequence[int], below: Row | None) -> bool:
-    """Whether a row has numbers in the columns asked for, and no text where the next has none."""
+def _is_data(cells: Sequence[str], columns: Sequence[int], below: TextRow | None) -> bool:
+    """Return whether a row has numbers in the requested columns and no text unlike the next row."""
     if max(columns) >= len(cells):
         return False
     own = [cells[column] for column in columns if cells[column]]
@@ -383,15 +383,15 @@ def _is_data(cells: Sequence[str], columns: Sequence[int], below: Row | None) ->
 
 
 def _not_data(
-    row: Row,
+    row: TextRow,
     cells: Sequence[str],
     columns: Sequence[int],
     names: Sequence[str],
-    head: Row,
+    head: TextRow,
     width: int,
     separator: str,
 ) -> TableError:
-    """Make the error for the first row below the titles that is not one of numbers."""
+    """Return the error for a first row below the titles without numbers."""
     if len(cells) != width:
         return TableError(wrong_width(row.line, len(cells), width, head.line, separator))
     for name, column in zip(names, columns, strict=True):
@@ -404,7 +404,7 @@ def _not_data(
 
 
 def not_a_number(line: int, name: str, cell: str) -> TableError:
-    """Make the error for a cell that is not a number."""
+    """Return the error for a cell that is not a number."""
     if is_date(cell):
         return TableError(
             f"line {line}: '{name}' is a date or a time of day{{cell}} that is not understood; "
@@ -420,18 +420,18 @@ def not_a_number(line: int, name: str, cell: str) -> TableError:
 
 
 def _with_numbers(
-    rows: Sequence[Row],
-    place: int,
+    rows: Sequence[TextRow],
+    index: int,
     separator: str,
     numbers: Sequence[int],
     labview: "_labview.LabviewHead | None",
-) -> Layout | None:
-    """Return the layout if this row is the first of numbers, by the columns' numbers alone."""
-    row, above = rows[place], list(takewhile(lambda each: each.index < rows[place].index, rows))
+) -> TableLayout | None:
+    """Return the layout if this row is the first row of numbers, for columns given by number."""
+    row, above = rows[index], list(takewhile(lambda each: each.index < rows[index].index, rows))
     columns = [number - 1 for number in numbers]
     if is_comment(row.cells):
         return None
-    if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, place):
+    if not _is_data(row.cells, columns, _next(rows, row)) or _numbers_the_columns(rows, index):
         partly = [c for c in columns if c < len(row.cells) and row.cells[c]]
         known = [c for c in partly if is_any_number(row.cells[c])]
         following = _next(rows, row)
@@ -440,7 +440,7 @@ def _with_numbers(
             and len(known) < len(partly)
             and following is not None
             and len(following.cells) == len(row.cells)
-            and not _numbers_the_columns(rows, place)
+            and not _numbers_the_columns(rows, index)
         ):
             column = next(c for c in partly if c not in known)
             raise _UnlikelyError(
@@ -466,10 +466,10 @@ def _with_numbers(
                 _TITLES,
                 TableError(wrong_width(row.line, len(cells), len(titles), titles_line, separator)),
             )
-        titles, titles_line = (), 0  # several words each: nothing says which belong together
+        titles, titles_line = (), 0  # titles of several words cannot be separated
     width = len(titles) if titles else len(cells)
     _check_single(row.line, cells)
-    return Layout(
+    return TableLayout(
         separator=separator,
         titles=tuple(titles),
         titles_line=titles_line,
@@ -485,10 +485,10 @@ def _with_numbers(
     )
 
 
-def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
-    """Whether the first row numbers the columns: no row below has whole numbers only."""
-    cells = [cell for cell in rows[place].cells if cell]
-    if place or len(cells) < 2:
+def _numbers_the_columns(rows: Sequence[TextRow], index: int) -> bool:
+    """Return whether the first row numbers the columns: no row below has only integers."""
+    cells = [cell for cell in rows[index].cells if cell]
+    if index or len(cells) < 2:
         return False
     counted = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
     below = rows[1 : 1 + _NUMBERING_LINES]
@@ -501,10 +501,10 @@ def _numbers_the_columns(rows: Sequence[Row], place: int) -> bool:
     )
 
 
-def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
-    """Say which title is missing, from the line that has most of them or seems to have titles."""
+def _missing(rows: Sequence[TextRow], names: Sequence[str]) -> _UnlikelyError:
+    """Return the error for a missing title, with the most probable line of titles."""
 
-    def found(row: Row) -> int:
+    def found(row: TextRow) -> int:
         return sum(name in row.cells or name in _plain_titles(row) for name in names)
 
     best = max(rows, key=found)
@@ -512,20 +512,20 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
         titles = _plain_titles(best)
         name = next(each for each in names if each not in titles and each not in best.cells)
         return _UnlikelyError(_SOME_TITLES, MissingColumnError(name, titles, best.line))
-    place = next(
+    index = next(
         (
-            place
-            for place, row in enumerate(rows)
+            index
+            for index, row in enumerate(rows)
             if all(map(is_any_number, filter(None, row.cells)))
         ),
         None,
     )
-    if place is None:
+    if index is None:
         return _UnlikelyError(
             _NO_ROWS, MissingColumnError(names[0], _plain_titles(rows[0]), rows[0].line)
         )
-    width = len(rows[place].cells)
-    above = [row for row in rows[:place] if len(_plain_titles(row)) == width]
+    width = len(rows[index].cells)
+    above = [row for row in rows[:index] if len(_plain_titles(row)) == width]
     if above:
         best = (
             above[-2]
@@ -540,8 +540,8 @@ def _missing(rows: Sequence[Row], names: Sequence[str]) -> _UnlikelyError:
     )
 
 
-def _no_numbers(rows: Sequence[Row], names: Sequence[str]) -> TableError:
-    """Say that no row has numbers in the columns asked for."""
+def _no_numbers(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
+    """Return the error for a table without numbers in the requested columns."""
     width = max(len(row.cells) for row in rows)
     for name in names:
         if (_number(name) or 0) > width:
@@ -552,7 +552,7 @@ def _no_numbers(rows: Sequence[Row], names: Sequence[str]) -> TableError:
     )
 
 
-def _check_split_decimals(rows: Sequence[Row], layout: Layout) -> None:
+def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
     written = [fitted(row.cells, layout.width) for row in rows if any(row.cells)]
     if are_split_decimals(written):
         raise TableError(

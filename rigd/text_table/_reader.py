@@ -1,4 +1,4 @@
-"""Columns of a table: every line has the same cells, and every number the same decimal sign."""
+"""Reader of the columns of a table, with checks of the cells and the decimal sign."""
 
 import csv
 from array import array
@@ -26,7 +26,7 @@ from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
     HEAD_LINES,
-    Layout,
+    TableLayout,
     comma_in_single,
     find_layout,
     fitted,
@@ -39,7 +39,7 @@ from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
 MAX_LINE: Final = 65_536
-"""Longest line, characters: hundreds of columns. A longer one is not split into its cells."""
+"""Longest line, characters, enough for hundreds of columns; longer lines are not split."""
 
 _HEAD_BYTES: Final = 4
 _HEAD_CHARACTERS: Final = 1_000_000
@@ -53,15 +53,15 @@ class TableColumn:
     Attributes
     ----------
     values : ndarray of float, shape (n,)
-        NaN where a cell is empty.
+        NaN for an empty cell.
     title : str
         "" if the table has no titles.
     unit : str
-        What the file states of the unit, "" if nothing.
+        Unit in the file, "" if none.
     rate_hz : float or None
-        Samples per second by the head of the file, None if it states none.
+        Sampling rate in the head of the file, None if there is none.
     start_ns : int or None
-        Time of the first sample by the head of the file, ns.
+        Time of the first sample in the head of the file, ns; None if there is none.
     """
 
     values: npt.NDArray[np.float64]
@@ -73,16 +73,16 @@ class TableColumn:
 
 @dataclass(frozen=True, slots=True)
 class TableTimes:
-    """A column of times that nobody asked for.
+    """A column of times in addition to the requested columns.
 
     Attributes
     ----------
     title : str
-        Its title, or ``#1``.
+        Title of the column, or ``#1``.
     values : ndarray of float, shape (n,)
-        As the file has them.
+        Times in the unit of the file.
     unit_s : float or None
-        Size of the unit in seconds, None if the file does not state it.
+        Unit in seconds, None if the file does not state it.
     """
 
     title: str
@@ -92,20 +92,20 @@ class TableTimes:
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """Some columns of a text file.
+    """Requested columns of a text file.
 
     Attributes
     ----------
     columns : mapping of str to TableColumn
-        Name as asked for → column; all of one length.
+        Columns by requested name; all of the same length.
     lines : ndarray of uint32, shape (n,)
-        Number of each row's line in the file, from 1 on.
+        Line number of each row in the file, from 1.
     width : int
-        Columns of the table.
+        Number of columns of the table.
     times : TableTimes or None
-        A column of times in addition to those asked for.
+        A column of times in addition to the requested ones, if any.
     remark : str
-        What the user should know of the file, "" if nothing.
+        Remark on the file for the user, "" if none.
     """
 
     columns: Mapping[str, TableColumn]
@@ -118,19 +118,19 @@ class TextTable:
 def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> TextTable:
     r"""Read some columns of a text file.
 
-    The separator is a tab, a semicolon, a comma, a bar or blanks; the decimal sign a point or a
-    comma, one of them in the whole file. The titles are the first line that has all names and as
-    many cells as the lines of numbers below it; a line of units may follow. Every line of numbers
-    has the same number of cells, but for empty ones behind the last column.
+    The separator is a tab, a semicolon, a comma, a bar or blanks. The decimal sign is a point or a
+    comma, the same in the whole file. The titles are the first line with all names and as many
+    cells as the lines of numbers below it. A line of units may follow. Every line of numbers has
+    the same number of cells, except for empty ones after the last column.
 
     Parameters
     ----------
     stream : file, open for reading bytes
-        It can be rewound, and stays open.
+        The file must be seekable; it is not closed.
     names : sequence of str
         Titles, or ``#3`` for the third column.
     most_rows : int
-        Rows after which reading ends; one more than that is returned if there are more.
+        Number of rows after which reading ends; one more row is returned if there are more.
 
     Returns
     -------
@@ -139,7 +139,7 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     Raises
     ------
     TableError
-        If a line is not of the table, with its number and the remedy.
+        If a line does not fit the table; the message has its number and the remedy.
 
     Examples
     --------
@@ -170,12 +170,12 @@ def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int)
     try:
         return _columns(stream, encoding, layout, names, most_rows, mark)
     except _DecimalCommaError:
-        # Anew, as a point in what was read so far may not be a decimal point.
+        # Read again from the start: a point in earlier lines may not be a decimal point.
         return _columns(stream, encoding, layout, names, most_rows, COMMA)
 
 
 def _head(lines: Iterator[str]) -> list[str]:
-    """Return the lines in which the layout is found."""
+    """Return the first lines, for the detection of the layout."""
     head: list[str] = []
     characters = 0
     for line in islice(lines, HEAD_LINES):
@@ -187,12 +187,12 @@ def _head(lines: Iterator[str]) -> list[str]:
 
 
 class _DecimalCommaError(Exception):
-    """A decimal comma in a file that is being read as one with decimal points."""
+    """A decimal comma was found while reading with decimal points."""
 
 
 @contextmanager
 def _lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
-    """Yield the lines of a text with their ends; Excel's statement of a separator is left empty."""
+    """Yield the lines of a text; Excel's statement of the separator becomes an empty line."""
     stream.seek(0)
     text = TextIOWrapper(stream, encoding, newline="")
     try:
@@ -214,21 +214,21 @@ def _bounded(text: TextIOWrapper) -> Iterator[str]:
 
 
 @dataclass(slots=True)
-class _Rows:
-    """Rows of numbers of a table as they are read, each checked against the layout."""
+class _NumberRows:
+    """Reader of rows of numbers, each checked against the layout."""
 
-    layout: Layout
+    layout: TableLayout
     names: Sequence[str]
     mark: str
     wanted: Sequence[int]
-    """Columns that are returned."""
+    """Requested columns."""
     stamps: Mapping[int, StampReader] = field(default_factory=dict)
     """Columns of `wanted` with times of day."""
     checked: Sequence[int] = ()
-    """Columns that are numbers in the first row: those of `wanted` and others."""
+    """Columns with a number in the first row, requested or not."""
     watches: dict[int, ThousandsWatch] = field(default_factory=dict)
     settled: bool = False
-    """Whether some cell shows that the mark is the decimal sign."""
+    """Whether a cell has shown that the mark is the decimal sign."""
     blank_line: int = 0
     blank_count: int = 0
 
@@ -240,13 +240,13 @@ class _Rows:
         self.watches = {c: ThousandsWatch(self.mark) for c in self.checked if c in self.wanted}
 
     def title(self, column: int) -> str:
-        """Return what messages call a column of those wanted."""
+        """Return the name of a requested column for messages."""
         if column in self.layout.columns:
             return self.names[self.layout.columns.index(column)]
         return f"#{column + 1}"
 
     def fit(self, row: Sequence[str], line: int) -> list[str]:
-        """Return a row with as many cells as the table, or raise."""
+        """Return a row with the number of cells of the table, or raise."""
         width = self.layout.width
         cells = fitted(row, width)
         if width - self.layout.optional <= len(cells) < width:
@@ -258,7 +258,7 @@ class _Rows:
         return cells
 
     def numbers(self, row: Sequence[str], line: int) -> list[float]:
-        """Read the checked cells of a row one by one; say what is wrong with one that is none."""
+        """Return the numbers of the checked cells of a row; raise for an invalid cell."""
         found = []
         for column in self.checked:
             cell = row[column].strip()
@@ -278,7 +278,7 @@ class _Rows:
         return found
 
     def stamp(self, row: Sequence[str], column: int, line: int) -> float:
-        """Read a time of day, as seconds after the first."""
+        """Return a time of day in seconds after the first one."""
         try:
             return self.stamps[column](row[column])
         except ValueError:
@@ -306,14 +306,14 @@ class _Rows:
         return not_a_number(line, self.title(column), cell)
 
     def watch(self, row: Sequence[str], line: int) -> None:
-        """Look for separators between thousands."""
+        """Check a row for thousands separators."""
         for column in tuple(self.watches):
             if self.watches[column].settles(row[column], line):
                 del self.watches[column]
                 self.settled = True
 
     def check_thousands(self) -> None:
-        """Refuse columns whose decimal signs could as well be separators between thousands."""
+        """Raise for columns whose decimal signs could be thousands separators."""
         for column, watch in self.watches.items():
             doubtful = watch.plain or (self.mark == COMMA and not self.settled)
             if watch.grouped_line and doubtful:
@@ -329,14 +329,14 @@ class _Rows:
 def _columns(
     stream: BinaryIO,
     encoding: str,
-    layout: Layout,
+    layout: TableLayout,
     names: Sequence[str],
     most_rows: int,
     mark: str,
 ) -> TextTable:
     times = _times_column(layout)
     wanted = sorted({*layout.columns, *(() if times is None else (times,))})
-    rows = _Rows(layout, names, mark, wanted)
+    rows = _NumberRows(layout, names, mark, wanted)
     values = {column: array("d") for column in wanted}
     appends = [
         (values[column].append, rows.checked.index(column))
@@ -383,8 +383,8 @@ def _columns(
                     values[column].extend(len(empty) * [float("nan")])
                 numbers_of_lines.extend(empty)
                 empty = []
-            for append, place in appends:
-                append(numbers[place])
+            for append, index in appends:
+                append(numbers[index])
             for append, column in stamps:
                 append(rows.stamp(row, column, line))
             numbers_of_lines.append(line)
@@ -395,13 +395,13 @@ def _columns(
 
 
 def _without_statement(lines: Iterator[str]) -> Iterator[str]:
-    """Leave Excel's statement of the separator empty, so that lines are counted as they are."""
+    """Replace Excel's statement of the separator by an empty line to preserve line numbers."""
     first = next(lines, "")
     yield "\n" if stated_separator(first) else first
     yield from lines
 
 
-def _remark(rows: _Rows) -> str:
+def _remark(rows: _NumberRows) -> str:
     if not rows.blank_count:
         return ""
     return (
@@ -410,8 +410,8 @@ def _remark(rows: _Rows) -> str:
     )
 
 
-def _times_column(layout: Layout) -> int | None:
-    """Find a column of times beside those asked for."""
+def _times_column(layout: TableLayout) -> int | None:
+    """Return the index of a column of times that is not requested, or None."""
     for column, cell in enumerate(layout.first):
         if column in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
             continue
@@ -425,15 +425,15 @@ def _times_column(layout: Layout) -> int | None:
     return None
 
 
-def _time_unit_s(layout: Layout, column: int) -> float | None:
+def _time_unit_s(layout: TableLayout, column: int) -> float | None:
     unit = time_unit_s(_unit(layout, column))
     if unit is None and layout.titles and is_title_of_times(layout.titles[column]):
         unit = time_unit_s(layout.titles[column].rpartition("_")[2])
     return unit
 
 
-def _unit(layout: Layout, column: int) -> str:
-    """Return what the file states of a column's unit; times of day are read in seconds."""
+def _unit(layout: TableLayout, column: int) -> str:
+    """Return the unit of a column in the file; seconds for times of day."""
     if is_stamp(layout.first[column]):
         return "s"
     in_row = layout.units[column] if layout.units else ""
@@ -443,12 +443,12 @@ def _unit(layout: Layout, column: int) -> str:
 
 
 def _table(
-    layout: Layout,
+    layout: TableLayout,
     names: Sequence[str],
     values: Mapping[int, "array[float]"],
     lines: npt.NDArray[np.uint32],
     times: int | None,
-    rows: _Rows,
+    rows: _NumberRows,
 ) -> TextTable:
     columns = {}
     for name, column in zip(names, layout.columns, strict=True):

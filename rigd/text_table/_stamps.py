@@ -14,12 +14,12 @@ _DAY_S: Final = 86_400
 
 
 def is_stamp(cell: str) -> bool:
-    """Whether a cell is a time of day with hours, minutes and seconds, with a date or without."""
+    """Return whether a cell is a time with hours, minutes and seconds, with or without a date."""
     return _STAMP.fullmatch(cell.strip()) is not None
 
 
 class StampReader:
-    """Read the stamps of one column, as seconds after the first."""
+    """Reader of the time stamps of one column, in seconds after the first one."""
 
     def __init__(self) -> None:
         self._first: re.Match[str] | None = None
@@ -30,7 +30,7 @@ class StampReader:
         Raises
         ------
         ValueError
-            If it is no stamp, or of another day while the order of its date is not clear.
+            If the cell is not a time stamp, or is of another day with an ambiguous date.
         """
         text = cell.strip()
         if not text:
@@ -58,7 +58,7 @@ def _nanoseconds(stamp: re.Match[str]) -> int:
 
 
 def _ordinal(day: str | None) -> int:
-    """Return the number of a day whose order is clear: year first, or day first between points."""
+    """Return the ordinal of an unambiguous date: year first, or day first with points."""
     parts = re.split(r"[-/.]", day or "")
     if len(parts) == 3 and len(parts[0]) == 4:
         return date(int(parts[0]), int(parts[1]), int(parts[2])).toordinal()

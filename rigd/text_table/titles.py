@@ -1,4 +1,4 @@
-"""Titles of columns: units that they state, and whether a column is of times."""
+"""Titles of columns: their units, and the recognition of columns of times."""
 
 import re
 from typing import Final
@@ -45,17 +45,17 @@ _OTHER_UNITS: Final = (
     "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc",
     "k", "pa", "bar", "pu", "w",
 )  # fmt: skip
-"""Other units that a row of units may have, in small letters and without signs of a product."""
+"""Other units, in lower case and without product signs."""
 
 
 def stated_unit_of(title: str) -> str:
-    """Return what a title states of the unit, "" if nothing: ``Angle [deg]``, ``t/ms``.
+    """Return the unit in a title such as ``Angle [deg]`` or ``t/ms``, "" if there is none.
 
     Parameters
     ----------
     title : str
-        Title of a column. What stands in square brackets counts; in round ones, or behind a slash,
-        a comma or the word "in", only what is known as a unit.
+        Title of a column. Any text in square brackets is a unit. In parentheses, or after a slash,
+        a comma or the word "in", only known units count.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def stated_unit_of(title: str) -> str:
 
 
 def is_unit(cell: str) -> bool:
-    """Return whether a cell of a row of units is one, with brackets or without."""
+    """Return whether a cell is a known unit, with or without brackets."""
     return _plain_unit(cell) in TIME_UNITS_S or _plain_unit(cell) in _OTHER_UNITS
 
 
@@ -91,5 +91,5 @@ def is_title_of_times(title: str) -> bool:
 
 
 def time_unit_s(unit: str) -> float | None:
-    """Return the size of a unit of time in seconds, None if it is not one that is known."""
+    """Return a unit of time in seconds, None if it is unknown."""
     return TIME_UNITS_S.get(_plain_unit(unit))

@@ -87,7 +87,7 @@ def bench(computer):
             rate_hz=rate_hz,
             seconds=10.0,
             spin_us=0.0,
-            tell=lambda what, left_s: told.append((what, left_s)),
+            on_progress=lambda what, left_s: told.append((what, left_s)),
         )
         return program.run()
 

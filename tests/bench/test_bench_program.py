@@ -145,7 +145,7 @@ def test_the_neighbour_works_beside_the_loop(monkeypatch):
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
 def test_no_profile_leads_to_its_hardware(computer, name):
     Bench(
-        load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, tell=lambda *_: None
+        load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, on_progress=lambda *_: None
     ).run()
     assert computer.profiles[0].rig.rate_hz == 2000.0
     for profile in computer.profiles:

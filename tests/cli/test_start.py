@@ -50,7 +50,7 @@ class Client:
 def follow(monkeypatch):
     """Follow series 7; returns what it comes to, and what was done with lines of progress."""
 
-    def run(*events, looks=True):
+    def run(*events, quick_looks=True):
         done = []
 
         class Line:
@@ -64,7 +64,7 @@ def follow(monkeypatch):
         interrupts = start._Interrupts()
         client = Client(interrupts, *events)
         try:
-            ended = start._follow(client, 7, interrupts, as_json=True, looks=looks)
+            ended = start._follow(client, 7, interrupts, as_json=True, quick_looks=quick_looks)
         except typer.Exit as ending:
             ended = ending.exit_code
         return ended, done, client.sent
@@ -93,7 +93,7 @@ def look(number, text="Quick look"):
 
 def test_no_bar_is_drawn_after_a_session_before_the_next(follow):
     events = (progress(1), session(1), progress(1), progress(2), session(2), progress(2))
-    _, done, _ = follow(*events, series(1, 2), looks=False)
+    _, done, _ = follow(*events, series(1, 2), quick_looks=False)
     updates = [each[0] for each in done if each[0] == "update"]
     assert len(updates) == 2
     first = done.index(("say", "Complete: 1200 of 1200 samples, 0 missed, 0 late."))
@@ -139,7 +139,9 @@ def test_what_is_notable_is_told_and_the_fit_is_in_the_document(follow):
     ]
     told.append({"event": "message", "level": "error", "text": "Fault: no record.", "session": 1})
     fit = {"duration_s": 9.5, "modes": []}
-    ended, done, _ = follow(*told, session(1) | {"fit": fit}, session(2), series(1, 2), looks=False)
+    ended, done, _ = follow(
+        *told, session(1) | {"fit": fit}, session(2), series(1, 2), quick_looks=False
+    )
     said = [each[1] for each in done if each[0] == "say"]
     assert said[0] == "  8.0 s 0.910 ± 0.010 %"
     assert not any("Next" in each for each in said)

@@ -221,8 +221,8 @@ def test_one_that_is_only_starting_has_time_on_a_busy_computer(monkeypatch, hear
     monkeypatch.setattr(live_view.time, "monotonic", lambda: now_s[0])
     group = StillGroup()
     view = live_view.LiveView(group, "rig")
-    view._heard = heard
+    view._answered = heard
     while group.started == 1:
         now_s[0] += 0.1
-        view.look()
+        view.check()
     assert now_s[0] == pytest.approx(patience_s, abs=0.5)

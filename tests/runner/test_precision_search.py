@@ -13,7 +13,12 @@ from rigd.engine.shared_state import SharedState, Word
 from rigd.excitation import ExcitationError, Forecast, Piece, until
 from rigd.excitation.targets import Precision, parse_target
 from rigd.profile import load_profile
-from rigd.runner._precision_search import Search, in_words, stated, targets_json
+from rigd.runner._precision_search import (
+    ExcitationPlanner,
+    in_words,
+    target_estimates,
+    targets_json,
+)
 from rigd.runner.planning import LoopPreview
 
 NAMES = ("zeta", "alpha", "gamma", "lambda", "density_over_stiffness", "bending_stiffness_n_m2")
@@ -86,14 +91,14 @@ class Bench:
         spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
         self.board = SharedState.create(shared_memory_fd())
         self.writer = PieceWriter(spec, self.board)
-        self.search = Search(excitation.search, profile, self.writer)
+        self.search = ExcitationPlanner(excitation.search, profile, self.writer)
 
     def told(self, share, held=0, before=None, **more):
         document = answer(self.profile, self.search.due + held, share, **more)
-        return list(self.search.answered(document, held, held if before is None else before))
+        return list(self.search.decide(document, held, held if before is None else before))
 
     def problem(self, text="Nothing is excited yet."):
-        return list(self.search.answered({"tick": self.search.due, "problem": text}, 0, 0))
+        return list(self.search.decide({"tick": self.search.due, "problem": text}, 0, 0))
 
 
 def test_a_search_may_state_the_uniformity_of_the_beam():
@@ -174,17 +179,17 @@ def test_before_the_first_judgement_all_structures_are_fitted_to_what_there_is(
 ):
     """So that it has a start; later ones have that of the one before."""
     bench = Bench(profile)
-    assert not bench.search.looks_ahead
+    assert not bench.search.needs_early_fit
     bench.told(CERTAIN)
     assert bench.search.may_be_last
-    assert bench.search.looks_ahead
+    assert bench.search.needs_early_fit
     bench.told(CERTAIN, flag="part of the record is unexplained")
     while not bench.search.may_be_last:
         bench.told(CERTAIN)
-    assert not bench.search.looks_ahead
+    assert not bench.search.needs_early_fit
     bench.told(CERTAIN)
     assert bench.search.due is None
-    assert not bench.search.looks_ahead
+    assert not bench.search.needs_early_fit
 
 
 @pytest.mark.further  # as a doubtful record
@@ -303,17 +308,17 @@ def test_damping_that_is_absent_cannot_be_told(profile):
         document["plant"]["damping"] |= {"zeta": 0.0}
         document["covariance"]["names"].remove("zeta")
         document["parameters"] = {}
-        found = bench.search.answered(document, 0, 0)
+        found = bench.search.decide(document, 0, 0)
         ends = [m for m in found if isinstance(m, SearchEnded)]
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
 
 def test_an_absent_mode_is_not_stated(profile):
-    (found,) = stated(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
+    (found,) = target_estimates(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
     assert found.ratio == np.inf
     assert in_words([found]) == "damping of mode 7: no such mode was found in the band"
     none = answer(profile, 1, CERTAIN) | {"modes": []}
-    (found,) = stated(none, [parse_target("frequency", "1%")])
+    (found,) = target_estimates(none, [parse_target("frequency", "1%")])
     assert in_words([found]) == "frequency of any mode: no such mode was found in the band"
 
 
@@ -325,7 +330,7 @@ def test_a_flag_on_what_is_asked_never_counts_as_reached(profile, quick_pauses):
         document = answer(profile, bench.search.due, CERTAIN)
         damping = document["modes"][1]["damping_ratio"]
         damping["flag"] = "part of the record is unexplained"
-        told = list(bench.search.answered(document, 0, 0))
+        told = list(bench.search.decide(document, 0, 0))
         ends = [m for m in told if isinstance(m, SearchEnded)]
     assert not ends[0].reached
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
@@ -336,7 +341,7 @@ def test_modes_that_are_not_those_of_a_uniform_beam_are_excited_where_they_are(p
     bench = Bench(profile, "damping 2:0.1%", at_most_s=40.0)
     document = answer(profile, bench.search.due, ON_THE_WAY)
     document["plant"]["stiffness_offsets"] = [0.04, 0.0]
-    *_, piece = bench.search.answered(document, 0, 0)
+    *_, piece = bench.search.decide(document, 0, 0)
     bands_hz = [
         (float(low) + float(high)) / 2 for low, high in re.findall(r"([\d.]+)–([\d.]+)", piece.name)
     ]
@@ -382,13 +387,13 @@ def test_modes_above_the_band_are_not_asked_for(profile):
     document = answer(profile, 1, CERTAIN)
     document["modes"][2]["frequency_hz"]["value"] = 51.0
     document["modes"][2]["shown"] = False
-    found = stated(document, [parse_target("damping", "1%")])
+    found = target_estimates(document, [parse_target("damping", "1%")])
     assert [each.mode for each in found] == [1, 2]
 
 
 def test_an_absolute_deviation_is_not_a_share(profile):
     targets = [parse_target("frequency", "1:0.002Hz"), parse_target("damping", "2:1%")]
-    found = frequency, damping = stated(answer(profile, 1, 0.02), targets)
+    found = frequency, damping = target_estimates(answer(profile, 1, 0.02), targets)
     told = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
     assert told == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
     assert frequency.asked_std == 0.002

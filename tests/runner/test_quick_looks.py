@@ -97,7 +97,7 @@ def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path, started):
 def test_a_look_that_fails_says_why(looks, tmp_path, name, error):
     looks.begin(tmp_path / f"{name}.mcap")
     (told,) = done(looks)
-    assert (told.path, told.look) == (None, None)
+    assert (told.path, told.content) == (None, None)
     assert told.error.endswith(error)
     assert told.lines == [f"No quick look at {name}.mcap: {told.error}"]
 
@@ -208,7 +208,7 @@ def test_a_look_is_noted_and_told_as_an_event():
     other = replace(result, path=Path("out/b.mcap"))
     results = [other, result]
     look.note(results)
-    assert results == [other, replace(result, look=look.path)]
+    assert results == [other, replace(result, quick_look=look.path)]
     assert results[1].as_dict()["look"] == "out/a.look.json"
     assert other.as_dict()["look"] is None
     event = json.loads(json.dumps({"event": "quick_look", **look.as_dict()}))

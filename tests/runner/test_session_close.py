@@ -10,7 +10,7 @@ from shipped_profile import load_shipped
 from rigd.engine.messages import Closed, Connected, Finished
 from rigd.excitation import hold
 from rigd.runner.request import Order
-from rigd.runner.session import Session, SessionFailedError, always
+from rigd.runner.session import SessionFailedError, SessionRun, always
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -30,10 +30,10 @@ def close():
             oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
         connected = Connected({}, {}, {"clock": "virtual"}, simulated=True)
-        session = Session(order, group, connected, None, lambda *_: None, always)
+        session = SessionRun(order, group, connected, None, lambda *_: None, always)
         session._fit = MagicMock(failure=failure, shortcoming=shortcoming, segments={})
         session._fit.finish.return_value = {}
-        session._fit.attend.return_value = []
+        session._fit.poll.return_value = []
 
         def poll(_):
             (message,) = group.recorder.send.call_args.args

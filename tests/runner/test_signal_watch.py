@@ -28,16 +28,16 @@ def put(ring, ticks, *, error_rad=0.0, coupling_nm=0.0, command_nm=0.0, lateness
 
 
 def test_nothing_is_told_before_the_first_sample(ring):
-    assert SignalWatch(1000.0).look(ring) is None
+    assert SignalWatch(1000.0).poll(ring) is None
 
 
 def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
     watch = SignalWatch(1000.0)
-    watch.look(ring)
+    watch.poll(ring)
     put(ring, range(100), error_rad=-0.02, coupling_nm=-0.5, command_nm=0.3, lateness_ns=10**6)
-    assert watch.look(ring)().lateness_p50_us == 1000.0
+    assert watch.poll(ring)().lateness_p50_us == 1000.0
     put(ring, range(100, 2500), error_rad=0.001, coupling_nm=0.1)
-    status = watch.look(ring)()
+    status = watch.poll(ring)()
     assert status.lateness_p99_us == pytest.approx(50.0)
     assert status.work_p99_us == pytest.approx(80.0)
     assert status.rate_hz == 1000.0
@@ -48,14 +48,14 @@ def test_the_figures_are_of_the_last_second_and_the_peaks_of_the_record(ring):
         status.peak_torque_command_nm,
     )
     assert peaks == (0.02, 0.5, 0.3)
-    assert watch.look(ring)() == status  # nothing has come since
+    assert watch.poll(ring)() == status  # nothing has come since
 
 
 def test_another_record_begins_anew_and_missed_ticks_cost_rate(ring):
     watch = SignalWatch(1000.0)
-    watch.look(ring)
+    watch.poll(ring)
     put(ring, range(1000), error_rad=0.5)
     put(ring, np.delete(np.arange(1000), np.arange(100, 200)).tolist(), error_rad=0.1)
-    status = watch.look(ring)()
+    status = watch.poll(ring)()
     assert status.rate_hz == pytest.approx(900.0)
     assert status.peak_tracking_error_rad == 0.1

@@ -36,7 +36,7 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
     touches = estimates(lambda _: [])
     touches.await_ready(lambda: next(waits))
     assert time.monotonic() - begun_s < 2.0
-    assert touches.attend() == []
+    assert touches.poll() == []
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, word
     monkeypatch.setattr("rigd.runner._process_group._PREPARING_S", 0.0)
     touches = estimates(lambda _: messages)
     touches.await_ready(lambda: True)
-    told = [event.message for event in touches.attend()]
+    told = [event.message for event in touches.poll()]
     assert len(told) == len(words)
     assert all(each in text for each, text in zip(words, told, strict=True))
 
@@ -56,7 +56,7 @@ def test_a_first_estimate_that_no_better_one_followed_is_called_that(monkeypatch
     x = {"value": 0.6, "std": 0.01, "interval_95": [0.58, 0.62]}
     told = [TouchTold(1, 900, True, {"x_m": x}), TouchTold(2, 2900, False, {"x_m": x})]
     touches = estimates(lambda _: told)
-    touches.attend()
+    touches.poll()
     found = touches.finish(3, lambda: None)
     assert [touch.get("final") for touch in found] == [None, False, None]
     for each in (found, touches_of({"touches": json.dumps(found)})):

@@ -1,4 +1,4 @@
-"""Places of named profiles and specimens: the working folder, the user's own, those shipped."""
+"""Locations of profiles and specimens: working folder, user's own folder, shipped files."""
 
 import os
 from collections.abc import Iterator
@@ -11,12 +11,12 @@ WORKING_FOLDER: Final = Path("hw_profiles")
 SPECIMENS_HERE: Final = Path("specimens")
 _PACKAGE: Final = Path(__file__).resolve().parent
 _IN_WHEEL: Final = _PACKAGE / "shipped"
-"""Where the build puts the project's profiles (see pyproject.toml)."""
+"""Folder of the project's profiles in a wheel (see pyproject.toml)."""
 _IN_CHECKOUT: Final = _PACKAGE.parents[1] / "hw_profiles"
 
 
 class Origin(StrEnum):
-    """Where a profile comes from, in the order in which a name is looked for."""
+    """Origin of a profile, in the search order."""
 
     HERE = "working folder"
     USER = "per-user folder"
@@ -25,16 +25,16 @@ class Origin(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProfileFile:
-    """A file that a name may stand for.
+    """Profile file found by its name.
 
     Attributes
     ----------
     name
-        What ``--profile`` takes: the file's name without ``.toml``.
+        Value of ``--profile``: the file name without ``.toml``.
     path
         The file.
     origin
-        Where it comes from.
+        Origin of the file.
     """
 
     name: str
@@ -43,9 +43,9 @@ class ProfileFile:
 
 
 def profile_files() -> dict[str, list[ProfileFile]]:
-    """Return the files of each name, names in alphabetical order.
+    """Return the files by name, in alphabetical order.
 
-    The first file of a name is the one that is used; it hides the others.
+    The first file of a name is used and hides the others.
     """
     found: dict[str, list[ProfileFile]] = {}
     for origin, folder in _folders():
@@ -55,9 +55,9 @@ def profile_files() -> dict[str, list[ProfileFile]]:
 
 
 def specimen_files() -> dict[str, Path]:
-    """Return the file of each specimen by name, in alphabetical order.
+    """Return the specimen files by name, in alphabetical order.
 
-    It is that of ``specimens`` in the working folder, or else that of the user's own folder
+    Files in ``specimens`` of the working folder precede those of the user's own folder
     (``$XDG_CONFIG_HOME/rigd/specimens``).
     """
     own = user_folder()
@@ -69,12 +69,12 @@ def specimen_files() -> dict[str, Path]:
 
 
 def user_folder() -> Path | None:
-    """Return the user's own folder for profiles, there or not; None where no user has a home."""
+    """Return the user's own folder for profiles, existing or not; None without a home folder."""
     base = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    if not base.is_absolute():  # the XDG specification has such a value ignored
+    if not base.is_absolute():  # the XDG specification ignores relative paths
         try:
             base = Path.home() / ".config"
-        except RuntimeError:  # in a container, say, under a number that no user has
+        except RuntimeError:  # for example in a container, with an unknown user id
             return None
     return base / "rigd" / "profiles"
 
@@ -83,7 +83,7 @@ def _folders() -> Iterator[tuple[Origin, Path]]:
     shipped = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
     try:
         in_checkout = WORKING_FOLDER.samefile(shipped)
-    except OSError:  # mostly, there is none here
+    except OSError:  # usually the folder does not exist
         in_checkout = False
     if not in_checkout:
         yield Origin.HERE, WORKING_FOLDER
