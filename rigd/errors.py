@@ -36,7 +36,7 @@
      |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run
      |    +-- EdsError, UnusableDriveError    the file of a drive is none, or lacks what is needed
-     |    +-- EstimateError         the sessions do not determine the motor's data
+     |    +-- MotorEstimateError    the sessions do not determine the motor's data
      |    +-- LoopError, CyclictestError      rigd bench could not measure
      +-- CommandError, RefusedByDaemonError   of either kind, as the daemon says
 

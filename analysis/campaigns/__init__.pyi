@@ -13,8 +13,8 @@ from ._headlines import campaign_numbers as campaign_numbers
 from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity
+from ._session import SessionAnalysis as SessionAnalysis
 from ._session import SessionFailure as SessionFailure
-from ._session import SessionResult as SessionResult
 from ._session import SessionTask as SessionTask
 from ._session import analyse_session as analyse_session
 from ._statistics import NominalModel as NominalModel

@@ -19,8 +19,8 @@ from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
 from analysis.campaigns._orders import freest_estimate
 from analysis.campaigns._session import (
+    SessionAnalysis,
     SessionFailure,
-    SessionResult,
     SessionTask,
     analyse_session,
 )
@@ -90,7 +90,7 @@ class CampaignResult:
 
     settings: WelchSettings
     record_band_hz: tuple[float, float]
-    sessions: tuple[SessionResult, ...]
+    sessions: tuple[SessionAnalysis, ...]
     failures: tuple[SessionFailure, ...]
     statistics: tuple[ParameterStatistics, ...]
     nominal: tuple[NominalModel, ...]
@@ -226,7 +226,7 @@ def campaign(
 
 
 def campaign_result(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     failures: Sequence[SessionFailure] = (),
     validation: Sequence[LeftOutError] = (),
     lost: Sequence[LostTrial] = (),
@@ -276,23 +276,23 @@ def campaign_result(
 
 
 def _of_one_experiment(
-    results: Sequence[SessionResult | SessionFailure],
-) -> tuple[list[SessionResult], list[SessionFailure]]:
+    results: Sequence[SessionAnalysis | SessionFailure],
+) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
     """Set aside what failed, and what is not the experiment that most of the sessions are."""
-    usable = [result for result in results if isinstance(result, SessionResult)]
+    usable = [result for result in results if isinstance(result, SessionAnalysis)]
     if not usable:
         return [], [result for result in results if isinstance(result, SessionFailure)]
     results = _labelled(results)
-    usable = [result for result in results if isinstance(result, SessionResult)]
+    usable = [result for result in results if isinstance(result, SessionAnalysis)]
     common = usable[most_common([session.experiment for session in usable])]
     stated = [result.experiment for result in results if result.experiment]
     alike = sum(common.experiment.difference(each) is None for each in stated)
     as_in = ", as in most" if 2 * alike > len(stated) else ""
-    sessions: list[SessionResult] = []
+    sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
     for result in results:
         reason = _reason_against(result, common, as_in, sessions)
-        if reason is None and isinstance(result, SessionResult):
+        if reason is None and isinstance(result, SessionAnalysis):
             sessions.append(result)
         elif reason is None and isinstance(result, SessionFailure):
             failures.append(result)
@@ -304,8 +304,8 @@ def _of_one_experiment(
 
 
 def _alike_by_welch(
-    sessions: list[SessionResult], failures: list[SessionFailure]
-) -> tuple[list[SessionResult], list[SessionFailure]]:
+    sessions: list[SessionAnalysis], failures: list[SessionFailure]
+) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
     """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without.
 
     A search is never set aside: its record tells as much as any.
@@ -328,18 +328,18 @@ def _alike_by_welch(
 
 
 def _labelled(
-    results: Sequence[SessionResult | SessionFailure],
-) -> list[SessionResult | SessionFailure]:
+    results: Sequence[SessionAnalysis | SessionFailure],
+) -> list[SessionAnalysis | SessionFailure]:
     """Take the specimens' labels for what they say: see `labelled`."""
     stated = iter(labelled([each.experiment for each in results if each.experiment]))
     return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
 
 
 def _reason_against(
-    result: SessionResult | SessionFailure,
-    common: SessionResult,
+    result: SessionAnalysis | SessionFailure,
+    common: SessionAnalysis,
     as_in: str,
-    before: Sequence[SessionResult],
+    before: Sequence[SessionAnalysis],
 ) -> str | None:
     """Say why a session does not belong to those it came with, None if nothing speaks against.
 

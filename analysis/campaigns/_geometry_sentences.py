@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import TolerantEstimate
 
@@ -142,7 +142,7 @@ def _difference(each: ModeInSweeps) -> str:
 
 
 def experiments(
-    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionResult]
+    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
 ) -> list[str]:
     """Say which sweeps would decide whether something changes along the records."""
     if found is not None and found.changed:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
 Values = tuple[tuple[str, float, float], ...]
@@ -149,7 +149,7 @@ class Homogeneity:
 
 
 def homogeneity(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
@@ -195,7 +195,7 @@ def _of_modes(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple
 
 
 def _of_parameters(
-    sessions: Sequence[SessionResult], shared: PooledEstimate
+    sessions: Sequence[SessionAnalysis], shared: PooledEstimate
 ) -> Iterator[tuple[str, Values]]:
     for parameter in shared.parameters:
         name = parameter.name

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
 _FEWEST: Final = 2
@@ -106,7 +106,7 @@ class PooledModal(ModalEstimate):
         return tuple(found)
 
 
-def pooled_modal(sessions: Sequence[SessionResult]) -> PooledModal | None:
+def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     """Pool the modal constants of sessions; None unless two of them show a common mode.
 
     Parameters
@@ -231,7 +231,7 @@ class OppositeSweeps:
         return tuple(each for each in self.modes if each.changed)
 
 
-def opposite_sweeps(sessions: Sequence[SessionResult]) -> OppositeSweeps | None:
+def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
     """Compare the modes of rising with those of falling sweeps; None without both.
 
     Parameters

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
     from analysis.identify import Order, TolerantEstimate, Verdict
 
@@ -53,7 +53,7 @@ def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
     )
 
 
-def common_structure(sessions: Sequence[SessionResult]) -> str | None:
+def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     """Name the structure by which the modes of all sessions are compared.
 
     Parameters

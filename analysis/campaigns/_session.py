@@ -56,7 +56,7 @@ class SessionFailure:
 
 
 @dataclass(frozen=True, slots=True)
-class SessionResult:
+class SessionAnalysis:
     """One session of a campaign: some 200 kB for the paper's settings.
 
     Attributes
@@ -129,7 +129,7 @@ class SessionResult:
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
 
-    def without_welch(self) -> SessionResult:
+    def without_welch(self) -> SessionAnalysis:
         """Leave out what is there by Welch's method."""
         return replace(
             self,
@@ -173,7 +173,7 @@ class SessionTask:
     uniformity: float | None = None
 
 
-def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
+def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionFailure:
     """Read a session, analyse it by both routes, or by the whole record where that suits alone.
 
     A session that cannot be analysed is told, not raised: it is one of many.
@@ -224,7 +224,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
 
 def _session_result(
     result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
-) -> SessionResult:
+) -> SessionAnalysis:
     """Keep of a record's result what a campaign needs."""
     from analysis.suited import record_band_hz, welch_settings
 
@@ -235,7 +235,7 @@ def _session_result(
     modal = None if whole is None else whole.headline.modal
     if welch is not None:
         settings = replace(settings, **asdict(welch.segmentation))
-    return SessionResult(
+    return SessionAnalysis(
         path=record.path,
         experiment=experiment,
         beam=record.beam,

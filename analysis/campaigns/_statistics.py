@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.campaigns._estimates import WelchFit
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.models import Parameter
     from analysis.paper import Indices, Peak
@@ -59,14 +59,14 @@ class ParameterStatistics:
 
 
 def fits_by_model(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
     """All sessions' fits by type and weighting, session by session."""
     rows = zip(*(session.welch_fits for session in sessions), strict=True)
     return {(row[0].structure, row[0].weighting): row for row in rows}
 
 
-def parameter_statistics(sessions: Sequence[SessionResult]) -> tuple[ParameterStatistics, ...]:
+def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
     """Statistics of the free parameters of every type and weighting (Table 3)."""
     found = []
     for (structure, weighting), fits in fits_by_model(sessions).items():
@@ -154,7 +154,7 @@ def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
     return STRUCTURES[structure].damping(_means(fits))
 
 
-def nominal_models(sessions: Sequence[SessionResult]) -> tuple[NominalModel, ...]:
+def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
     """Nominal model of every type and weighting, compared with every session."""
     first = sessions[0]
     if not first.frequency_hz.size:
@@ -207,7 +207,7 @@ def _nominal(
     structure: str,
     weighting: str,
     fits: Sequence[WelchFit],
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     model: FrequencyResponseModel,
     frequency_hz: NDArray[np.float64],
     beam: Beam,
@@ -283,7 +283,7 @@ class RankedStructure:
 
 
 def ranked_structures(
-    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
+    sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
 ) -> tuple[RankedStructure, ...]:
     """Rank every structure fitted: those pooled, by BIC, then the others.
 

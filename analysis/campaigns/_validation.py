@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
 FEWEST: Final = 3
@@ -66,7 +66,7 @@ class LostTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class PlantPrediction:
     """What others say of a session: a model's name and its plant, the session's own beside it."""
 
     method: str
@@ -76,26 +76,26 @@ class Forecast:
     own: Plant | None
 
 
-def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecast, ...]:
+def forecasts(sessions: Sequence[SessionAnalysis], left_out: int) -> tuple[PlantPrediction, ...]:
     """Models of all sessions but one, to be tried on that one."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
     own = {each.name: each.plant for each in session.record_estimates}
     found = [
-        Forecast("record", each.name, None, each.plant, own[each.name])
+        PlantPrediction("record", each.name, None, each.plant, own[each.name])
         for each in pooled_estimates(others)
         if each.name in own
     ]
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
-        found.append(Forecast("welch", fit.structure, fit.weighting, plant, None))
+        found.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
     return tuple(found)
 
 
 def validate(
     workers: Workers,
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
@@ -121,7 +121,7 @@ def validate(
 
 
 def left_out_errors(
-    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float] | None
+    path: Path, tried: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
 ) -> tuple[LeftOutError, ...] | LostTrial:
     """Read a session and compare its torque with what each model predicts from its angle.
 

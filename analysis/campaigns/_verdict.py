@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._modal import PooledModal
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import WelchBias
     from analysis.campaigns.pooling import PooledEstimate
@@ -77,7 +77,7 @@ class CommonFinding:
         return f"{words} (Median session; range over all sessions: {span} {unit}.)"
 
 
-def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, ...]:
+def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding, ...]:
     """Count the findings of all sessions, the most common first.
 
     Two findings are of the same thing if their sentences are the same but for the figures in them.
@@ -175,7 +175,7 @@ class CampaignVerdict:
 
 
 def campaign_verdict(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
     alike: Homogeneity,
     validation: Sequence[LeftOutError],
@@ -301,7 +301,7 @@ def _withheld(*orders: PooledOrder) -> frozenset[str]:
     return frozenset(each.order for each in orders if (each.exact or each).reason is not None)
 
 
-def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:
+def _dissent(sessions: Sequence[SessionAnalysis], best: PooledEstimate) -> tuple[Dissent, ...]:
     found = []
     for session in sessions:
         by_name = {each.name: each for each in session.record_estimates}

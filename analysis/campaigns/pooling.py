@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.campaigns._estimates import RecordEstimate
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.identify import Damping, Order
 
 
@@ -273,7 +273,7 @@ class PooledEstimate:
         return {each.name: each for each in self.parameters}
 
 
-def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate, ...]:
+def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimate, ...]:
     """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
     by_name = by_structure(sessions)
     tried = max(map(len, by_name.values()), default=0)
@@ -281,7 +281,7 @@ def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate,
     return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
 
 
-def by_structure(sessions: Sequence[SessionResult]) -> dict[str, list[RecordEstimate]]:
+def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
     """Whole-record estimates of all sessions by the name of the structure."""
     found: dict[str, list[RecordEstimate]] = {}
     for session in sessions:

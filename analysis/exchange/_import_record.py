@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from analysis.exchange._channels import ChannelChoice, Timebase
     from analysis.exchange._source import SourceChannel
-    from analysis.exchange._specimen import Specimen
+    from analysis.exchange._specimen import SpecimenFile
 
 
 # Import
@@ -49,7 +49,7 @@ class ImportPlan:
     channels : mapping of str to ChannelChoice
         Field of a sample (`analysis.exchange._channels.QUANTITIES`) → channel and unit; those of
         `REQUIRED` must be among them.
-    specimen : Specimen
+    specimen : SpecimenFile
     time : ChannelChoice, optional
         Channel with the time of each sample.
     rate_hz : float, optional
@@ -67,7 +67,7 @@ class ImportPlan:
     """
 
     channels: Mapping[str, ChannelChoice]
-    specimen: Specimen
+    specimen: SpecimenFile
     time: ChannelChoice | None = None
     rate_hz: float | None = None
     segments_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -427,7 +427,7 @@ def unlikely_torque(
     angle_rad: NDArray[np.float64],
     torque_nm: NDArray[np.float64],
     rate_hz: float,
-    specimen: Specimen,
+    specimen: SpecimenFile,
 ) -> str | None:
     """Compare the torque with what the undamped beam would ask for, beside its first resonance.
 
@@ -436,7 +436,7 @@ def unlikely_torque(
     angle_rad, torque_nm : ndarray of float, shape (n,)
         The whole record, finite.
     rate_hz : float
-    specimen : Specimen
+    specimen : SpecimenFile
 
     Returns
     -------

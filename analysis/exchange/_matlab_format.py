@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.exchange._table import Table
+    from analysis.exchange._table import ExportTable
 
 
 # Reading
@@ -308,7 +308,7 @@ def _stored_elsewhere(path: Path, name: str) -> ExchangeError:
 # Writing
 
 
-def write_mat(table: Table, stream: BinaryIO) -> None:
+def write_mat(table: ExportTable, stream: BinaryIO) -> None:
     """Write each column as a variable of its name, n×1, and ``information``, a struct.
 
     Its fields are numbers where the information is one, rows where it is several with commas

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Specimen:
+class SpecimenFile:
     """What is moved.
 
     Attributes
@@ -51,7 +51,7 @@ class Specimen:
     axis_tilt_deg: float | None = None
 
 
-def read_specimen(path: Path) -> Specimen:
+def read_specimen(path: Path) -> SpecimenFile:
     """Read ``[beam]`` and, as far as they are stated, tool inertia, tilt and ``[uncertainty]``.
 
     A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
@@ -85,7 +85,7 @@ def read_specimen(path: Path) -> Specimen:
                 f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
                 "inertia cannot be negative."
             )
-    return Specimen(
+    return SpecimenFile(
         Beam(
             length_m=_positive(path, beam, "length_m"),
             density_kg_per_m=_positive(path, beam, "density_kg_per_m"),

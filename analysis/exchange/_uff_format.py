@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.exchange._table import Column, Table
+    from analysis.exchange._table import ExportColumn, ExportTable
 
 
 # Reading
@@ -240,7 +240,7 @@ _SI_UNITS: Final = (
 )
 
 
-def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
+def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     """Write the units (data set 164: SI) and a function for each column.
 
     Times and frequencies are given by first value and increment, or, where six digits of these are
@@ -248,7 +248,7 @@ def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
 
     Parameters
     ----------
-    table : Table
+    table : ExportTable
         Integer columns (ticks, flags) are left out: the format has no place for them.
     stream : file, open for writing bytes
     binary : bool
@@ -324,7 +324,11 @@ def _body(
 
 
 def _header(
-    table: Table, axis: NDArray[np.float64], column: Column, even: bool, size: int | None
+    table: ExportTable,
+    axis: NDArray[np.float64],
+    column: ExportColumn,
+    even: bool,
+    size: int | None,
 ) -> str:
     """Eleven lines, after the mark and the type; `size` is that of a binary body in bytes."""
     is_complex = column.values.dtype.kind == "c"
@@ -355,7 +359,7 @@ def _header(
     return "\n".join(lines) + "\n"
 
 
-def _identification(table: Table, column: Column) -> tuple[str, ...]:
+def _identification(table: ExportTable, column: ExportColumn) -> tuple[str, ...]:
     """Five lines of text: name, source, how, date (unknown), exporter."""
     how = ", ".join(
         f"{key} {table.information[key]}"

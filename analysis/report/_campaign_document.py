@@ -15,7 +15,7 @@ from analysis.results import finite
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from analysis.campaigns import CampaignResult, RecordEstimate, SessionResult, WelchFit
+    from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis, WelchFit
     from analysis.identify import ModeEstimate
 
 
@@ -93,13 +93,13 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     return content
 
 
-def _name(session: SessionResult, estimator: str, structure: str) -> dict[str, Any]:
+def _name(session: SessionAnalysis, estimator: str, structure: str) -> dict[str, Any]:
     return {
         "file": str(session.path), "estimator": estimator, "type": structure, "weighting": None,
     }  # fmt: skip
 
 
-def _welch_fit(session: SessionResult, fit: WelchFit) -> dict[str, Any]:
+def _welch_fit(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
     return {
         **_name(session, "welch", fit.structure),
         "weighting": fit.weighting,
@@ -111,7 +111,7 @@ def _welch_fit(session: SessionResult, fit: WelchFit) -> dict[str, Any]:
     }
 
 
-def _record_fit(session: SessionResult, fit: RecordEstimate) -> dict[str, Any]:
+def _record_fit(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
     return {
         **_name(session, "record", fit.structure),
         "candidate": fit.name,
@@ -128,6 +128,6 @@ def _of_free(std: Mapping[str, float | None], free: Collection[str]) -> dict[str
     return {name: value if name in free else None for name, value in std.items()}
 
 
-def _mode(session: SessionResult, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+def _mode(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
     values = asdict(mode)
     return _name(session, "record", fit.structure) | {"mode": values.pop("number"), **values}

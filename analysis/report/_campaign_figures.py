@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns import CampaignResult, NominalModel, SessionResult
+    from analysis.campaigns import CampaignResult, NominalModel, SessionAnalysis
     from analysis.campaigns.pooling import PooledParameter
 
 _PANELS: Final = (
@@ -267,7 +267,7 @@ def _response_panel(
     return handles
 
 
-def shown_sessions(campaign: CampaignResult) -> list[SessionResult]:
+def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
     """Choose sessions to be drawn beside each other, spread over the campaign."""
     last = len(campaign.sessions) - 1
     chosen = np.unique(np.linspace(0, last, _MOST_LINES).round().astype(int))

@@ -28,7 +28,7 @@ from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
-    from analysis.campaigns import CampaignResult, SessionResult
+    from analysis.campaigns import CampaignResult, SessionAnalysis
 
 
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
@@ -253,7 +253,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         if (each.method, each.name) == ("record", name)
     }
 
-    def row(session: SessionResult) -> tuple[Entry, ...]:
+    def row(session: SessionAnalysis) -> tuple[Entry, ...]:
         verdict, trial = session.verdict, tried.get(session.path)
         own = trial.own_error if trial else None
         found = [each.kind for each in verdict.findings] if verdict else []

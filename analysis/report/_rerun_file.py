@@ -81,7 +81,7 @@ _GROUPS: Final = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class ChartCurve:
     """A curve of a chart.
 
     Attributes
@@ -109,11 +109,11 @@ class Graph:
 
     title: str
     chart: Chart
-    curves: tuple[Curve, ...]
+    curves: tuple[ChartCurve, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class ChartPage:
     """Charts that are seen together: a wide one over two narrow ones.
 
     Attributes
@@ -137,7 +137,7 @@ class Page:
 # Welch fits
 
 
-def pages(analysis: WelchAnalysis) -> tuple[Page, ...]:
+def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     """Return the measured response with its coherence, and each model type with its residuals."""
     magnitude = _magnitude_axis(analysis)
     looks = line_keys(analysis.settings.weightings)
@@ -181,7 +181,7 @@ def tab(analysis: WelchAnalysis) -> rrb.Container:
     return rrb.Tabs(*map(_page_view, pages(analysis)), tables, name=TITLE)
 
 
-def _draw_page(page: Page, stream: RecordingStream) -> None:
+def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
     thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _GROUPS)
     for graph in page.graphs:
         graph.chart.draw_frame(stream)
@@ -199,7 +199,7 @@ def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
     stream.log(entity, document, static=True)
 
 
-def _page_view(page: Page) -> rrb.Container:
+def _page_view(page: ChartPage) -> rrb.Container:
     def view(graph: Graph) -> rrb.Spatial2DView:
         chart = graph.chart
         return chart_view(graph.title, chart.entity, (chart.width, chart.height))
@@ -207,31 +207,31 @@ def _page_view(page: Page) -> rrb.Container:
     return chart_page(*map(view, page.graphs), name=page.title)
 
 
-def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
+def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
     entity = f"{FITS}/measured"
-    return Page(
+    return ChartPage(
         MEASURED_PAGE,
         (
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
                 response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY),
-                (Curve("measured", MEASURED_KEY, magnitude_db(response.response)),),
+                (ChartCurve("measured", MEASURED_KEY, magnitude_db(response.response)),),
             ),
             Graph(
                 "Phase of torque over angle",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY),
-                (Curve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
+                (ChartCurve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
             ),
             Graph(
                 "Coherence of angle and torque",
                 response_chart(
                     f"{entity}/coherence", _HALF, band_hz, COHERENCE_AXIS, COHERENCE_KEY
                 ),
-                (Curve("coherence", COHERENCE_KEY, coherence),),
+                (ChartCurve("coherence", COHERENCE_KEY, coherence),),
             ),
         ),
         response.frequency_hz,
@@ -239,7 +239,9 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
     )
 
 
-def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[str, Key]) -> Page:
+def _type_page(
+    analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[str, Key]
+) -> ChartPage:
     models = [model for model in analysis.models if model.fit.structure.name == name]
     keys = [looks[model.fit.weighting] for model in models]
     # Shorter on the narrow charts: in full they would run into the title of the axis.
@@ -251,9 +253,9 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
     measured, band_hz = analysis.response.response, analysis.settings.band_hz
     entity = f"{FITS}/type_{name}"
 
-    def of_models(values: Callable[[FittedModel], Real]) -> list[Curve]:
+    def of_models(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
-            Curve(_plain(model.fit.weighting), key, values(model))
+            ChartCurve(_plain(model.fit.weighting), key, values(model))
             for key, model in zip(keys, models, strict=True)
         ]
 
@@ -261,7 +263,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
         f"{model.fit.weighting}: MSE {model.indices.mse:.3g}, WMSE {model.indices.wmse:.3g}"
         for model in models
     )
-    return Page(
+    return ChartPage(
         f"Type {name}",
         (
             Graph(
@@ -270,7 +272,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                     f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, *keys
                 ),
                 (
-                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
                     *of_models(lambda model: magnitude_db(model.response)),
                 ),
             ),
@@ -278,7 +280,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                 "Phase",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, *short),
                 (
-                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
                     *of_models(lambda model: phase_deg(model.response)),
                 ),
             ),
@@ -286,7 +288,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                 "Residual, measured − model",
                 response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, *short),
                 (
-                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
+                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
                     *of_models(lambda model: magnitude_db(measured - model.response)),
                 ),
             ),
@@ -368,7 +370,7 @@ _OVER_TIME: Final = (
 )
 
 
-def record_page(whole: WholeRecord) -> Page:
+def record_page(whole: WholeRecord) -> ChartPage:
     """Return response and residual of the fit that the numbers are of.
 
     Measured is the ratio of the whole record's transforms, without the model's delay.
@@ -384,31 +386,31 @@ def record_page(whole: WholeRecord) -> Page:
     key, name = Key(shown.name.removeprefix("the "), ORANGE, 2.0), "model"
     short = replace(key, label="model")
     entity = f"{RECORD}/response"
-    return Page(
+    return ChartPage(
         "Response",
         (
             Graph(
                 f"Magnitude of torque over angle, whole record, {shown.name.removeprefix('the ')}",
                 response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, key),
                 (
-                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
-                    Curve(name, key, magnitude_db(model)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve(name, key, magnitude_db(model)),
                 ),
             ),
             Graph(
                 "Phase",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, short),
                 (
-                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
-                    Curve(name, key, phase_deg(model)),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve(name, key, phase_deg(model)),
                 ),
             ),
             Graph(
                 "Residual, measured − model",
                 response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, short),
                 (
-                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
-                    Curve(name, key, magnitude_db(measured - model)),
+                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
+                    ChartCurve(name, key, magnitude_db(measured - model)),
                 ),
             ),
         ),

@@ -42,7 +42,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
+class ImpactSpecification:
     """Pulse of force on the beam: half a sine."""
 
     x_m: float
@@ -55,12 +55,12 @@ class Knock:
     """When it begins, from the first enabling of the drive."""
 
 
-Encounter = Obstacle | Knock
+Encounter = Obstacle | ImpactSpecification
 """What the beam may meet."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Key:
+class _ObstacleKey:
     field: str
     says: str
     fits: Callable[[float], bool]
@@ -75,30 +75,36 @@ def _time(value: float) -> bool:
     return 0 <= value <= _LONGEST_S
 
 
-_KEYS: dict[type[Encounter], dict[str, _Key]] = {
+_KEYS: dict[type[Encounter], dict[str, _ObstacleKey]] = {
     Obstacle: {
-        "x": _Key("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
-        "angle": _Key("angle_rad", "an angle in rad, -10 to 10", lambda v: abs(v) <= 10, True),
-        "stiffness": _Key(
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "angle": _ObstacleKey(
+            "angle_rad", "an angle in rad, -10 to 10", lambda v: abs(v) <= 10, True
+        ),
+        "stiffness": _ObstacleKey(
             "stiffness_n_per_m",
             f"a stiffness of 1 to {_MOST_STIFF:.0f} N/m, or rigid",
             lambda v: 1 <= v <= _MOST_STIFF or v == inf,
         ),
-        "damping": _Key(
+        "damping": _ObstacleKey(
             "damping_n_s_per_m", "a damping of 0 to 10000 N·s/m", lambda v: 0 <= v <= 1e4
         ),
-        "side": _Key("side", "1 or -1", lambda v: v in (1, -1)),
-        "rate": _Key("rate_rad_s", "a speed in rad/s, -100 to 100", lambda v: abs(v) <= 100),
-        "from": _Key("from_s", "a time in s, at least 0", _time),
-        "until": _Key("until_s", "a time in s, at least 0", _time),
+        "side": _ObstacleKey("side", "1 or -1", lambda v: v in (1, -1)),
+        "rate": _ObstacleKey(
+            "rate_rad_s", "a speed in rad/s, -100 to 100", lambda v: abs(v) <= 100
+        ),
+        "from": _ObstacleKey("from_s", "a time in s, at least 0", _time),
+        "until": _ObstacleKey("until_s", "a time in s, at least 0", _time),
     },
-    Knock: {
-        "x": _Key("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
-        "force": _Key("force_n", "a force in N, -1000 to 1000", lambda v: abs(v) <= 1e3, True),
-        "duration": _Key(
+    ImpactSpecification: {
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "force": _ObstacleKey(
+            "force_n", "a force in N, -1000 to 1000", lambda v: abs(v) <= 1e3, True
+        ),
+        "duration": _ObstacleKey(
             "duration_s", "a time in s, 0.0001 to 100", lambda v: 1e-4 <= v <= 100, True
         ),
-        "at": _Key("at_s", "a time in s, at least 0", _time, True),
+        "at": _ObstacleKey("at_s", "a time in s, at least 0", _time, True),
     },
 }
 _WORDS = {"rigid": inf}
@@ -136,7 +142,11 @@ def parse_obstacle(text: str) -> Encounter:
     3000.0
     """
     words = [word.strip() for word in text.split(",")]
-    kind = Knock if any(word.partition("=")[0].strip() == "force" for word in words) else Obstacle
+    kind = (
+        ImpactSpecification
+        if any(word.partition("=")[0].strip() == "force" for word in words)
+        else Obstacle
+    )
     keys = _KEYS[kind]
     values: dict[str, float] = {}
     for word in words:
@@ -156,8 +166,8 @@ def parse_obstacle(text: str) -> Encounter:
     for name, key in keys.items():
         if key.needed and key.field not in values:
             raise _complaint(text, f"'{name}' is missing; give {name}=…, {key.says}")
-    if kind is Knock:
-        return Knock(**values)
+    if kind is ImpactSpecification:
+        return ImpactSpecification(**values)
     side = int(values.pop("side", _side_of(values["angle_rad"])))
     obstacle = Obstacle(**values, side=side)
     if obstacle.until_s <= obstacle.from_s:

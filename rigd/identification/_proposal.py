@@ -5,7 +5,7 @@ from math import floor, inf, log10
 from typing import Any
 
 from rigd.control import ControlDesignError, check_stability, close_loop
-from rigd.identification.estimate import MotorEstimate, Quantity
+from rigd.identification.estimate import MotorEstimate, MotorQuantity
 from rigd.profile import Profile
 from rigd.units import unit_of
 
@@ -73,11 +73,11 @@ _HIGH_MISFIT = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ProposalRow:
     """A number of the profile beside what was measured."""
 
     key: str
-    measured: Quantity
+    measured: MotorQuantity
     profile_value: float
     source: str
     """Source of the profile's value."""
@@ -118,7 +118,7 @@ class Proposal:
 
     estimate: MotorEstimate
     """Estimate of the motor."""
-    rows: tuple[Row, ...]
+    rows: tuple[ProposalRow, ...]
     """Quantity by quantity, the estimate beside the profile."""
     notes: tuple[str, ...]
     """Sentences for the operator."""
@@ -200,7 +200,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     """
     rig = profile.rig
     motor = rig.motor
-    found: list[tuple[str, Quantity, float]] = [
+    found: list[tuple[str, MotorQuantity, float]] = [
         ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
@@ -228,7 +228,8 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     waits = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     least = {"actuation.delay_s": 1 / rig.rate_hz} if waits else {}
     rows = tuple(
-        Row(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0)) for row in found
+        ProposalRow(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0))
+        for row in found
     )
     notes = _notes(estimate, profile, unusable)
     if any(row.is_below_least for row in rows if row.key in least):
@@ -239,9 +240,9 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     return Proposal(estimate, rows, tuple(notes))
 
 
-def _times(factor: float, quantity: Quantity) -> Quantity:
+def _times(factor: float, quantity: MotorQuantity) -> MotorQuantity:
     std = None if quantity.std is None else factor * quantity.std
-    return Quantity(factor * quantity.value, std)
+    return MotorQuantity(factor * quantity.value, std)
 
 
 def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str]:

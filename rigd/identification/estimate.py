@@ -64,7 +64,7 @@ class _Stack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
+class _StackMoments:
     """Moments of a stack: ``y = x p``, a row a repeat and frequency."""
 
     y: Complex
@@ -73,7 +73,9 @@ class _Rows:
     """(r, m, p), of what belongs to each unknown."""
 
 
-def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int) -> _Rows:
+def _moments(
+    stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int
+) -> _StackMoments:
     """Integrate a stack with the test functions; times count from the window's first angle."""
     period_s = 1.0 / timing.rate_hz
     repeats, n = stack.angle_rad.shape
@@ -111,7 +113,7 @@ def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknow
     x[..., COULOMB] = -stack.direction * constant
     x[..., DELAY] = scale * slope
     x[..., ZERO + stack.session] = -constant
-    return _Rows(y, x)
+    return _StackMoments(y, x)
 
 
 def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
@@ -182,7 +184,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
     return None
 
 
-def _solve(rows: Sequence[_Rows], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
+def _solve(rows: Sequence[_StackMoments], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
     """_Fit the means of the repeats; the scale, where it is not free, is 1."""
     solution = np.zeros(free.size)
     solution[SCALE] = 1.0
@@ -222,7 +224,7 @@ def _weights(residuals: Sequence[Complex], stacks: Sequence[_Stack]) -> list[Rea
 
 
 def _judge(
-    rows: Sequence[_Rows],
+    rows: Sequence[_StackMoments],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
     free: NDArray[np.bool_],
@@ -292,12 +294,12 @@ _SCALES = (0.5, 2.0)
 torque constant."""
 
 
-class EstimateError(FailureError, ValueError):
+class MotorEstimateError(FailureError, ValueError):
     """The windows do not determine the motor's data; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class PassReadings:
     """Readings during one pass at constant nominal speed, each of shape (n,)."""
 
     angle_rad: Real
@@ -317,7 +319,7 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class MotorQuantity:
     """An estimate and its standard deviation; None: it was not estimated."""
 
     value: float
@@ -330,16 +332,16 @@ class Quantity:
 class MotorEstimate:
     """Estimate of the motor, at its output shaft."""
 
-    inertia_kg_m2: Quantity
+    inertia_kg_m2: MotorQuantity
     """Inertia of the motor without the tool."""
-    viscous_nm_s_per_rad: Quantity
+    viscous_nm_s_per_rad: MotorQuantity
     """Viscous friction."""
-    coulomb_nm: Quantity
+    coulomb_nm: MotorQuantity
     """Coulomb friction."""
-    torque_scale: Quantity
+    torque_scale: MotorQuantity
     """True torque over commanded torque; without a standard deviation it is held at 1, and the
     other quantities count in the drive's own torque."""
-    actuation_delay_s: Quantity
+    actuation_delay_s: MotorQuantity
     """From the command to the torque."""
     windows: int
     """Windows of the records that count."""
@@ -352,7 +354,7 @@ class MotorEstimate:
 
 
 def estimate_motor(
-    windows: Sequence[Window], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
+    windows: Sequence[PassReadings], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
 ) -> MotorEstimate:
     """_Fit the motor's equation to windows in which its speed keeps its sign.
 
@@ -389,7 +391,7 @@ def estimate_motor(
     if not scale_known:
         found = _fit(stacks, timing, hold_scale=True)
     if found is None:
-        raise EstimateError(
+        raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
@@ -397,18 +399,20 @@ def estimate_motor(
     values, stds = found.values, found.stds
     inertia = float(values[INERTIA])
     if inertia <= 0.0:
-        raise EstimateError(
+        raise MotorEstimateError(
             f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
     jump = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
     sampled_s = jump / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
-        inertia_kg_m2=Quantity(inertia, float(stds[INERTIA])),
-        viscous_nm_s_per_rad=Quantity(float(values[VISCOUS]), float(stds[VISCOUS])),
-        coulomb_nm=Quantity(float(values[COULOMB]), float(stds[COULOMB])),
-        torque_scale=Quantity(float(values[SCALE]), float(stds[SCALE]) if scale_known else None),
-        actuation_delay_s=Quantity(
+        inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA])),
+        viscous_nm_s_per_rad=MotorQuantity(float(values[VISCOUS]), float(stds[VISCOUS])),
+        coulomb_nm=MotorQuantity(float(values[COULOMB]), float(stds[COULOMB])),
+        torque_scale=MotorQuantity(
+            float(values[SCALE]), float(stds[SCALE]) if scale_known else None
+        ),
+        actuation_delay_s=MotorQuantity(
             float(values[DELAY]) - timing.angle_delay_s,
             sqrt(float(stds[DELAY]) ** 2 + sampled_s**2),
         ),
@@ -419,7 +423,7 @@ def estimate_motor(
     )
 
 
-def _keeps_moving(window: Window, rate_hz: float) -> bool:
+def _keeps_moving(window: PassReadings, rate_hz: float) -> bool:
     half = max(1, round(_SPEED_S * rate_hz))
     angle = window.angle_rad
     speed = (angle[2 * half :] - angle[: -2 * half]) * rate_hz / (2 * half)
@@ -427,13 +431,13 @@ def _keeps_moving(window: Window, rate_hz: float) -> bool:
     return bool(np.min(along) > _LEAST_SPEED_PART * abs(window.speed_rad_s))
 
 
-def _stack(windows: Sequence[Window], given: int) -> list[_Stack]:
-    groups: dict[Hashable, list[Window]] = {}
+def _stack(windows: Sequence[PassReadings], given: int) -> list[_Stack]:
+    groups: dict[Hashable, list[PassReadings]] = {}
     for window in windows:
         groups.setdefault(window.key, []).append(window)
     full = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
     if {np.sign(group[0].speed_rad_s) for group in full} != {1.0, -1.0}:
-        raise EstimateError(
+        raise MotorEstimateError(
             f"Of {given} passes {len(windows)} can be used, and that is too few: it takes at least "
             f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
             "standstill."

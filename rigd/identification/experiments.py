@@ -48,7 +48,7 @@ _GOLDEN = 0.618033988749895
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class PassSchedule:
     """When the shaft goes how: all of a session's passes follow from it.
 
     Each pass is a turn, a time to settle, and the window that is looked at.
@@ -73,7 +73,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True)
-class Pass:
+class SpeedPass:
     """A window of constant nominal speed."""
 
     first: int
@@ -86,7 +86,7 @@ class Pass:
     """Number of its cycle, from 0 on."""
 
 
-def lay_out_passes(layout: Layout, rate_hz: float) -> list[Pass]:
+def lay_out_passes(layout: PassSchedule, rate_hz: float) -> list[SpeedPass]:
     """Return the passes of a session in their order.
 
     Parameters
@@ -105,7 +105,7 @@ def lay_out_passes(layout: Layout, rate_hz: float) -> list[Pass]:
         for speed in layout.speeds_rad_s:
             for signed in (speed, -speed):
                 tick += turn + settle
-                passes.append(Pass(tick, tick + window, signed, cycle))
+                passes.append(SpeedPass(tick, tick + window, signed, cycle))
                 tick += window
     return passes
 
@@ -200,14 +200,14 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     return _excitation(SPEEDS, layout, profile, loop, reference, torque_percent, stroke_rad)
 
 
-def read_layout(metadata: Mapping[str, str]) -> Layout | None:
+def read_layout(metadata: Mapping[str, str]) -> PassSchedule | None:
     """Return the layout stated in the metadata of a session; None for any other session."""
     if metadata.get("excitation") not in TOP_HZ:
         return None
     try:
         speeds = tuple(float(text) for text in metadata["speeds_rad_s"].split())
         times = {name: float(metadata[name]) for name in _TIMES}
-        return Layout(speeds, int(metadata["cycles"]), **times)
+        return PassSchedule(speeds, int(metadata["cycles"]), **times)
     except (KeyError, ValueError):
         return None
 
@@ -228,7 +228,7 @@ def _percent(profile: Profile, torque_nm: float) -> int:
     return ceil(101 * torque_nm / profile.rig.motor.rated_torque_nm)
 
 
-def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: float) -> Layout:
+def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: float) -> PassSchedule:
     """Choose the speed so that the passes fit into the stroke, and the speed into its limit."""
     limits = profile.limits
     if not 0.0 < stroke_rad <= limits.angle_rad:
@@ -237,16 +237,16 @@ def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: floa
             f"{limits.angle_rad:g} rad."
         )
     cycles = _CYCLES[kind]
-    travel_s = float(np.ptp(_path(Layout(parts, 1), profile.rig.rate_hz)))
+    travel_s = float(np.ptp(_path(PassSchedule(parts, 1), profile.rig.rate_hz)))
     speed = min(
         _MAX_SPEED_RAD_S,
         _LIMIT_SHARE * limits.velocity_rad_s,
         2 * _STROKE_SHARE * stroke_rad / travel_s,
     )
-    return Layout(tuple(part * speed for part in parts), cycles)
+    return PassSchedule(tuple(part * speed for part in parts), cycles)
 
 
-def _path(layout: Layout, rate_hz: float) -> Real:
+def _path(layout: PassSchedule, rate_hz: float) -> Real:
     """Angle of the passes from the end of the approach on, beginning at 0."""
     turn, settle, window = (
         round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
@@ -264,7 +264,7 @@ def _path(layout: Layout, rate_hz: float) -> Real:
     return path
 
 
-def _carrier(layout: Layout, profile: Profile) -> Real:
+def _carrier(layout: PassSchedule, profile: Profile) -> Real:
     """Return the reference without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
     path = _path(layout, rate_hz)
@@ -278,7 +278,7 @@ def _carrier(layout: Layout, profile: Profile) -> Real:
     return reference
 
 
-def _add_offsets(reference: Real, layout: Layout, profile: Profile) -> None:
+def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> None:
     """Move each cycle by its own fraction of some encoder steps, in the turn before it."""
     rate_hz = profile.rig.rate_hz
     turn = round(layout.turn_s * rate_hz)
@@ -298,7 +298,7 @@ def _add_offsets(reference: Real, layout: Layout, profile: Profile) -> None:
         offset = following
 
 
-def _multisine(layout: Layout, loop: ClosedLoop, modulation: float) -> Real:
+def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
     """Return the reference whose answer moves the speed by a part of that of the passes."""
     rate_hz = loop.model.rate_hz
     window = round(layout.window_s * rate_hz)
@@ -339,7 +339,7 @@ def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
 
 def _excitation(
     kind: str,
-    layout: Layout,
+    layout: PassSchedule,
     profile: Profile,
     loop: ClosedLoop,
     reference: Real,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid, realise_force
 from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
-from rigd.devices.obstacles import Encounter, Knock, Obstacle
+from rigd.devices.obstacles import Encounter, ImpactSpecification, Obstacle
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -47,7 +47,7 @@ _SWEEPS = 3
 """Over several obstacles that the beam touches in one substep."""
 
 
-class Contact:
+class AttachedObstacles:
     """What the beam meets, attached to the plant.
 
     Parameters
@@ -105,7 +105,9 @@ class Contact:
             for index, body in enumerate(bodies)
             if isinstance(body, Obstacle)
         ]
-        self._knocks = [(i, body) for i, body in enumerate(bodies) if isinstance(body, Knock)]
+        self._knocks = [
+            (i, body) for i, body in enumerate(bodies) if isinstance(body, ImpactSpecification)
+        ]
         self._none: Real = np.zeros((self.substeps, len(bodies)))
         self.forces_n = self._none
         # Displacement at each body at the end of the last period, and at its start.
@@ -377,7 +379,7 @@ class Contact:
                 wall.start_m = wall.end_m
             j += 1
 
-    def take_over(self, state: Real, other: "Contact | None") -> Real:
+    def take_over(self, state: Real, other: "AttachedObstacles | None") -> Real:
         """Go on where another contact of the same beam is, whose bodies are the first of these.
 
         Parameters

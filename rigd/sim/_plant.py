@@ -15,7 +15,7 @@ from rigd.beam.realisation import Realisation
 from rigd.devices.obstacles import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
-from rigd.sim._obstacle import Contact, March
+from rigd.sim._obstacle import AttachedObstacles, March
 from rigd.sim._step import OUTPUTS, arrays_at, held_of, models_of, split_delay, steps_of
 from rigd.sim._stiffness_drift import StiffnessDrift
 
@@ -463,14 +463,16 @@ def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
     return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
 
 
-def _contact(parameters: RigParameters, beam: Realisation, period_s: float) -> Contact | None:
+def _contact(
+    parameters: RigParameters, beam: Realisation, period_s: float
+) -> AttachedObstacles | None:
     simulation = parameters.simulation
     if simulation is None or not simulation.obstacles:
         return None
     bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
     beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
     check_obstacles(bodies, parameters.beam, beside)
-    return Contact(parameters.beam, parameters.damping, beam, bodies, period_s)
+    return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
 
 
 def _vectors(states: int, points: int, *, felt: int) -> tuple[tuple[Real, Real, Real], ...]:

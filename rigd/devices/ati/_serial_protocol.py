@@ -48,7 +48,7 @@ class BadReply(ValueError):
     """A reply is missing, cut, disturbed or not the one to the request: asking again may help."""
 
 
-class Refused(ValueError):
+class ExceptionResponse(ValueError):
     """The sensor understood and declined: asking again will not help."""
 
 
@@ -133,14 +133,14 @@ def content_of(request: bytes, reply: bytes) -> bytes:
     content = reply[2:-2]
     if is_refusal(reply):
         code = content[0]
-        raise Refused(_EXCEPTIONS.get(code, f"it declined with code {code}"))
+        raise ExceptionResponse(_EXCEPTIONS.get(code, f"it declined with code {code}"))
     function = request[1]
     if function == _READ and content[0] != wanted - 5:
         raise BadReply(f"{content[0]} bytes of registers came instead of {wanted - 5}")
     if function == _WRITE and content != request[2:6]:
         raise BadReply("it confirmed other registers than were written")
     if function in (_LOCK, _START) and content[0] != _ACCEPTED:
-        raise Refused(f"it declined with code {content[0]}")
+        raise ExceptionResponse(f"it declined with code {content[0]}")
     return content[1:] if function == _READ else content
 
 

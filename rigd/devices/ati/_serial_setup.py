@@ -325,7 +325,7 @@ class SerialSetup:
                 self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
                 return modbus.content_of(request, reply)
-            except modbus.Refused as error:
+            except modbus.ExceptionResponse as error:
                 raise DeviceError(
                     f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
                     "Digital F/T sensor, and ati_serial.calibration."

@@ -17,7 +17,7 @@ from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
     WATCHDOG,
-    Access,
+    ObjectAccess,
     Requirement,
     Watchdog,
     requirement,
@@ -474,7 +474,7 @@ class _SetUp:
         found = self._sdo.read_if_there(row.index, row.sub)
         if not found:
             return
-        if Access.WRITE in row.access:
+        if ObjectAccess.WRITE in row.access:
             self.settle(row, 0)
             return
         raise DeviceError(

@@ -14,8 +14,8 @@ from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     REQUIREMENTS,
     WATCHDOG,
-    Access,
-    Fit,
+    AllowedValue,
+    ObjectAccess,
     Requirement,
     Watchdog,
     fixed_values,
@@ -245,15 +245,15 @@ class _Judge:
             grade = Grade.DOUBT if doubt else Grade.REFUSED
             return Finding(what, found, asked, grade, sentence)
 
-        if needed.access & (Access.SENT | Access.RECEIVED):
+        if needed.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
             trouble = self._unmappable(entry)
             if trouble and needed.accept:
                 return self._to_accept(needed, what, f"{found}, {trouble}", asked)
             if trouble:
                 return objection(f"{trouble}. {needed.sentence}")
-        if Access.WRITE in needed.access and not entry.writable:
+        if ObjectAccess.WRITE in needed.access and not entry.writable:
             return self._read_only(needed, entry, found, wanted)
-        if Access.READ in needed.access and entry.access == "wo":
+        if ObjectAccess.READ in needed.access and entry.access == "wo":
             return objection(
                 f"is write-only: what it holds cannot be checked. {needed.sentence}".rstrip(),
                 doubt=needed.index in MAY_BE_WRITE_ONLY,
@@ -270,7 +270,7 @@ class _Judge:
     ) -> Finding:
         """Judge an object that would be written and cannot be: what it holds may do."""
         what = f"{needed.place} {needed.name}"
-        if needed.fit is Fit.AT_LEAST:
+        if needed.fit is AllowedValue.AT_LEAST:
             asked = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
             asked = "" if wanted is None else _shown(needed, wanted)

@@ -2,7 +2,7 @@
 
 An object is *core* where no session is possible without it, and *optional* where something else
 stands in. An optional object that is read-only is fine as long as it holds what is needed
-(:class:`Fit`). Where nothing stands in by itself, the profile has to accept that by name
+(:class:`AllowedValue`). Where nothing stands in by itself, the profile has to accept that by name
 (``cia402.accept_without``), or the drive is refused.
 
 Imports nothing but the indices, so that a program which only reads an EDS file can use it.
@@ -28,7 +28,7 @@ ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
 """Names of what a profile may accept that its drive lacks."""
 
 
-class Access(Flag):
+class ObjectAccess(Flag):
     """Kind of access to an object."""
 
     READ = auto()
@@ -67,7 +67,7 @@ def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
     return Watchdog.OWN if own else Watchdog.NONE
 
 
-class Fit(Enum):
+class AllowedValue(Enum):
     """Which values an object may hold that cannot be written."""
 
     EQUAL = "exactly"
@@ -87,9 +87,9 @@ class Fit(Enum):
         found, wanted
             Value that the object holds, and the one that is needed.
         """
-        if self in (Fit.EQUAL, Fit.EQUAL_OR_UNUSED):
-            return found == wanted or (self is Fit.EQUAL_OR_UNUSED and found == 0)
-        return self is Fit.ANY or found >= wanted
+        if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
+            return found == wanted or (self is AllowedValue.EQUAL_OR_UNUSED and found == 0)
+        return self is AllowedValue.ANY or found >= wanted
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +123,10 @@ class Requirement:
     sub: int
     name: str
     core: bool
-    access: Access
+    access: ObjectAccess
     stand_in: str = ""
     sentence: str = ""
-    fit: Fit = Fit.EQUAL
+    fit: AllowedValue = AllowedValue.EQUAL
     accept: str = ""
     zero: bool = False
 
@@ -151,7 +151,7 @@ class Requirement:
         return f"it has no object {self.place} ({self.name}). {self.sentence}{remedy}"
 
 
-_R, _W = Access.READ, Access.WRITE
+_R, _W = ObjectAccess.READ, ObjectAccess.WRITE
 _NOT_USABLE: Final = "Without it the drive cannot be used: check whether its firmware offers it."
 _DYNAMIC: Final = (
     "Its PDOs must be mappable as rigd needs them, or be mapped so already: RPDO1 with "
@@ -161,9 +161,16 @@ _FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
 
 CORE: Final = (
     Requirement(
-        objects.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
+        objects.CONTROLWORD,
+        0,
+        "Controlword",
+        True,
+        _W | ObjectAccess.RECEIVED,
+        sentence=_NOT_USABLE,
     ),
-    Requirement(objects.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
+    Requirement(
+        objects.STATUSWORD, 0, "Statusword", True, _R | ObjectAccess.SENT, sentence=_NOT_USABLE
+    ),
     Requirement(
         objects.MODE,
         0,
@@ -180,7 +187,7 @@ CORE: Final = (
         0,
         "Position actual value",
         True,
-        _R | Access.SENT,
+        _R | ObjectAccess.SENT,
         sentence="The loop runs on it.",
     ),
     Requirement(
@@ -188,7 +195,7 @@ CORE: Final = (
         0,
         "Target torque",
         True,
-        Access.RECEIVED,
+        ObjectAccess.RECEIVED,
         sentence="Without it the drive has no torque mode that rigd could use.",
     ),
     Requirement(
@@ -225,7 +232,13 @@ CORE: Final = (
 OPTIONAL: Final = (
     # Identity and texts: told in reports, compared only where the profile names them.
     Requirement(
-        objects.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
+        objects.IDENTITY,
+        1,
+        "Vendor-ID",
+        False,
+        _R,
+        "nothing: cia402.vendor_id = 0",
+        fit=AllowedValue.ANY,
     ),
     Requirement(
         objects.IDENTITY,
@@ -234,11 +247,17 @@ OPTIONAL: Final = (
         False,
         _R,
         "nothing: cia402.product_code = 0",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
     ),
-    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
+    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=AllowedValue.ANY),
     Requirement(
-        objects.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
+        objects.ERROR_CODE,
+        0,
+        "Error code",
+        False,
+        _R,
+        "the emergency message",
+        fit=AllowedValue.ANY,
     ),
     # SYNC.
     Requirement(
@@ -257,7 +276,7 @@ OPTIONAL: Final = (
         _R | _W,
         "transmission type 1: the drive goes by the SYNCs that come",
         "It must be the period of rig.rate_hz in microseconds, or 0.",
-        Fit.EQUAL_OR_UNUSED,
+        AllowedValue.EQUAL_OR_UNUSED,
     ),
     Requirement(
         objects.SYNC_WINDOW_US,
@@ -379,7 +398,7 @@ OPTIONAL: Final = (
             "Max torque (6072)",
             "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
             "motor.peak_torque_nm.",
-            Fit.AT_LEAST,
+            AllowedValue.AT_LEAST,
         )
         for index, name in zip(
             objects.TORQUE_LIMITS,
@@ -406,7 +425,7 @@ OPTIONAL: Final = (
         "motor.rated_torque_nm alone: cia402.rated_torque_unit_nm = 0",
         "What 1000 thousandths of torque are cannot be compared with the profile: set "
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
     ),
     *(
         Requirement(
@@ -416,7 +435,7 @@ OPTIONAL: Final = (
             False,
             _R,
             "the probing move before the first session (docs/safety.md)",
-            fit=Fit.ANY,
+            fit=AllowedValue.ANY,
         )
         for index, sub, name in (
             (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
@@ -432,10 +451,10 @@ OPTIONAL: Final = (
         0,
         "Torque actual value",
         False,
-        _R | Access.SENT,
+        _R | ObjectAccess.SENT,
         "",
         "Torque commands that are lost, or cut by the drive, would not be noticed.",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
@@ -471,10 +490,16 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
+        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=AllowedValue.ANY
     ),
     Requirement(
-        objects.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
+        objects.FAULT_REACTION_OPTION,
+        0,
+        "Fault reaction option code",
+        False,
+        _R,
+        "–",
+        fit=AllowedValue.ANY,
     ),
 )
 """Objects that something else stands in for."""

@@ -23,7 +23,7 @@ from rigd.sim.wire._faults import (
     EventLog,
     Fault,
     FaultError,
-    Line,
+    FaultyLine,
     encounter_of,
 )
 
@@ -156,7 +156,7 @@ _TRAITS = {
 """Traits that a fault may give the drive, and the attribute of each."""
 
 
-class Node(Protocol):
+class SimulatedNode(Protocol):
     """A device on the simulated CAN bus."""
 
     frozen: bool
@@ -263,13 +263,13 @@ class BusSimulation:
         self._cut = cut
         self._mend = mend
         self._log = log
-        self._nodes: dict[str, Node] = {}
+        self._nodes: dict[str, SimulatedNode] = {}
         self._serial: SerialDevice | None = None
         self._owed = False
         self._lines = {
-            "host": Line("host", self._from_host, self._postpone, log),
-            "drive": Line("drive", partial(self._from_node, "drive"), self._postpone, log),
-            "sensor": Line("sensor", partial(self._from_node, "sensor"), self._postpone, log),
+            "host": FaultyLine("host", self._from_host, self._postpone, log),
+            "drive": FaultyLine("drive", partial(self._from_node, "drive"), self._postpone, log),
+            "sensor": FaultyLine("sensor", partial(self._from_node, "sensor"), self._postpone, log),
         }
         self._unheard: deque[tuple[str, int, bytes]] = deque()
         self._emitting = False
@@ -311,14 +311,14 @@ class BusSimulation:
         """Return what a sensor on a serial line writes with."""
         return self._write_serial
 
-    def join(self, name: str, node: Node) -> None:
+    def join(self, name: str, node: SimulatedNode) -> None:
         """Put a node on the bus."""
         self._nodes[name] = node
 
     def join_serial(self, device: SerialDevice) -> None:
         """Put the sensor on the serial line."""
         self._serial = device
-        self._lines["sensor"] = Line("sensor", self._to_serial, self._postpone, self._log)
+        self._lines["sensor"] = FaultyLine("sensor", self._to_serial, self._postpone, self._log)
 
     def step(self) -> None:
         """Move the rig on to the tick that a SYNC marks; the drive calls it when it hears one."""

@@ -27,8 +27,8 @@ from rigd.sim.wire._canopen_services import (
 from rigd.sim.wire._drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
     NO_MODE,
-    State,
-    StateMachine,
+    PdsState,
+    PdsStateMachine,
     add_drive_objects,
     follow_file,
     peak_per_mille,
@@ -222,7 +222,7 @@ class DriveNode:
             own.negative_limit,
         ):
             entry.wrote = self._refresh_torque
-        self._machine = StateMachine(
+        self._machine = PdsStateMachine(
             own.quick_stop_option,
             own.fault_option,
             entered=self._entered,
@@ -349,7 +349,7 @@ class DriveNode:
 
     def _end_connection(self) -> None:
         """Leave operation before the NMT state changes: no target can come any more."""
-        if self._machine.state is not State.OPERATION_ENABLED:
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         option = self._own.abort_option.value
         if option == 1:
@@ -398,7 +398,7 @@ class DriveNode:
             return
         if len(data) < pdo.size:
             vendor = bytes([len(data), pdo.size])
-            if self._machine.state is State.OPERATION_ENABLED:
+            if self._machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
             else:
                 self._report(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
@@ -465,7 +465,7 @@ class DriveNode:
             if not watch.check(now_s):
                 continue
             option, state = self._own.abort_option.value, self._machine.state
-            if option == 1 and state not in (State.READY, State.SWITCH_ON_DISABLED):
+            if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
                 self._machine.fail()
             elif option == 3:
                 self._machine.quick_stop()
@@ -487,12 +487,12 @@ class DriveNode:
         timeout_s = self._sync_timeout_s or SYNC_TIMEOUT_PERIODS * self._own.sync_period_s
         if now_s - self._last_sync_s > timeout_s + _TOLERANCE_S:
             self._sync_alive = False
-            if self._machine.state is State.OPERATION_ENABLED:
+            if self._machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_SYNC_LOST, _COMMUNICATION)
                 self._log("sync lost", timeout_s=timeout_s)
 
     def _watch_rpdos(self, now_s: float) -> None:
-        if self._machine.state is not State.OPERATION_ENABLED:
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         for number, pdo in enumerate(self._receive_pdos, 1):
             deadline_s = pdo.deadline_s
@@ -528,7 +528,7 @@ class DriveNode:
 
     def _clear(self, *codes: int) -> None:
         """Take errors back whose cause is gone; those of a fault stay until its reset."""
-        if self._machine.state not in (State.FAULT, State.FAULT_REACTION):
+        if self._machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
@@ -548,7 +548,7 @@ class DriveNode:
     def _on_controlword(self) -> None:
         word = self._own.controlword.value
         mask, operate = _OPERATE
-        if self._machine.state is not State.OPERATION_ENABLED or word & mask != operate:
+        if self._machine.state is not PdsState.OPERATION_ENABLED or word & mask != operate:
             self._machine.control(word)
         self._refresh_torque()
 
@@ -558,26 +558,26 @@ class DriveNode:
             self._log("mode", mode=self._mode)
             self._refresh_torque()
 
-    def _entered(self, left: State) -> None:
+    def _entered(self, left: PdsState) -> None:
         state = self._machine.state
-        if left is State.OPERATION_ENABLED:
+        if left is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
             self._limited = self._following = False
             self._log("torque", torque_nm=0.0, enabled=False)
         self._log("state", state=state.label)
-        if state is State.OPERATION_ENABLED:
+        if state is PdsState.OPERATION_ENABLED:
             self._plant.enable()
             self._log("torque", torque_nm=0.0, enabled=True)
             self._refresh_torque()
-        elif left is State.FAULT:
+        elif left is PdsState.FAULT:
             self._own.error_code.value = 0
             standing = {_HEARTBEAT_LOST} if any(watch.lost for watch in self._watches) else set()
             self._emergencies.clear(*(self._emergencies.active.keys() - standing))
 
     def _refresh_torque(self) -> None:
         """Hand the torque that follows from the dictionary to the plant, if it is another one."""
-        if self._machine.state is not State.OPERATION_ENABLED:
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         own = self._own
         self._following = (
@@ -603,16 +603,16 @@ class DriveNode:
     def _statusword(self) -> int:
         state = self._machine.state
         word = state.bits | (_REMOTE if self._sto_dropped else _VOLTAGE_AND_REMOTE)
-        if state is State.OPERATION_ENABLED:
+        if state is PdsState.OPERATION_ENABLED:
             if self._following:
                 word |= 0 if self.never_follows else _FOLLOWS
             elif self._own.controlword.value & _HALT and self._stands():
                 word |= _STANDING
             if self._limited:
                 word |= _INTERNAL_LIMIT
-        elif state is State.QUICK_STOP and self._stands():
+        elif state is PdsState.QUICK_STOP and self._stands():
             word |= _STANDING
-        if self._emergencies.active and state not in (State.FAULT, State.FAULT_REACTION):
+        if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             word |= _WARNING
         return word
 

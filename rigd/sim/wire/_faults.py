@@ -38,7 +38,7 @@ class FaultError(WrongUseError):
 
 
 @dataclass(frozen=True, slots=True)
-class _Key:
+class _FaultKey:
     """Values that a key may have, and its default."""
 
     read: Callable[[str], Value]
@@ -47,33 +47,33 @@ class _Key:
     needed: bool = False
 
 
-def _whole(low: int, high: int, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _whole(low: int, high: int, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> int:
         number = int(text, 0)
         if not low <= number <= high:
             raise ValueError(text)
         return number
 
-    return _Key(read, f"a whole number from {low} to {high}", **how)
+    return _FaultKey(read, f"a whole number from {low} to {high}", **how)
 
 
-def _positive(**how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _positive(**how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> float:
         number = float(text)
         if not 0 < number <= _LONGEST_S:
             raise ValueError(text)
         return number
 
-    return _Key(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
+    return _FaultKey(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
 
 
-def _one_of(*choices: str, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _one_of(*choices: str, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> str:
         if text not in choices:
             raise ValueError(text)
         return text
 
-    return _Key(read, " or ".join(choices), **how)
+    return _FaultKey(read, " or ".join(choices), **how)
 
 
 _LONGEST_S = 1e6
@@ -86,11 +86,11 @@ _SENDER = {
 _DEVICE = _one_of("drive", "sensor", needed=True)
 _FOR = _positive()
 
-_TEXT = _Key(str, "a value")
-_FOUND = _Key(str, "a value", needed=True)
+_TEXT = _FaultKey(str, "a value")
+_FOUND = _FaultKey(str, "a value", needed=True)
 
 LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
-KINDS: dict[str, dict[str, _Key]] = {
+KINDS: dict[str, dict[str, _FaultKey]] = {
     "drop": _SENDER | {"bytes": _whole(1, _MOST)},
     "delay": _SENDER | {"ms": _positive(needed=True)},
     "corrupt": _SENDER | {"byte": _whole(0, 255, default=0)},
@@ -258,7 +258,7 @@ class _Active:
         return self.kind != "corrupt" or self.byte < len(data)
 
 
-class Line:
+class FaultyLine:
     """The way of one sender's frames to everybody else, with the faults on it.
 
     Parameters

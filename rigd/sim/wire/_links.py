@@ -71,7 +71,7 @@ _LINK_HEADER = struct.Struct("=BxHiII")
 _VIRTUAL_KINDS = ("vcan", "vxcan")
 
 
-class _Client:
+class _LinkConnection:
     """One connection: what has come of an unfinished frame, and what has not gone of one."""
 
     def __init__(self, link: socket.socket, number: int) -> None:
@@ -111,7 +111,7 @@ class VirtualBus:
         self._handlers = handlers
         self._on_frames = on_frames
         self._on_clients = on_clients
-        self._clients: list[_Client] = []
+        self._clients: list[_LinkConnection] = []
         self._count = 0
         self.lost = 0
         self._path = path
@@ -148,12 +148,12 @@ class VirtualBus:
             link.setblocking(False)
             link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
             self._count += 1
-            client = _Client(link, self._count)
+            client = _LinkConnection(link, self._count)
             self._clients.append(client)
             self._handlers[link.fileno()] = lambda: self._receive(client)
             self._on_clients(f"client {client.number} connected", len(self._clients))
 
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: _LinkConnection) -> None:
         try:
             fresh = client.link.recv(_READ_BYTES)
         except BlockingIOError:
@@ -168,7 +168,7 @@ class VirtualBus:
         client.received = data[whole:]
         self._on_frames([data[i : i + FRAME_SIZE] for i in range(0, whole, FRAME_SIZE)], client)
 
-    def _send(self, client: _Client, frame: bytes) -> None:
+    def _send(self, client: _LinkConnection, frame: bytes) -> None:
         # The rest of a frame has to go before the next one, or all later ones are torn.
         if client.unsent:
             client.unsent = client.unsent[_offer(client.link, client.unsent) :]
@@ -181,7 +181,7 @@ class VirtualBus:
         elif sent < len(frame):
             client.unsent = frame[sent:]
 
-    def _drop(self, client: _Client) -> None:
+    def _drop(self, client: _LinkConnection) -> None:
         if client in self._clients:
             self._clients.remove(client)
             del self._handlers[client.link.fileno()]

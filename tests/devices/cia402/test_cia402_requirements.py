@@ -10,8 +10,8 @@ from rigd.devices.cia402.requirements import (
     CORE,
     OPTIONAL,
     REQUIREMENTS,
-    Access,
-    Fit,
+    AllowedValue,
+    ObjectAccess,
     requirement,
 )
 
@@ -50,10 +50,10 @@ def test_a_refusal_names_the_way_to_accept_it(name):
 
 
 def test_what_an_object_may_hold_that_cannot_be_written():
-    assert Fit.AT_LEAST.allows(50_000, 1800)
-    assert not Fit.AT_LEAST.allows(1799, 1800)
-    assert not Fit.EQUAL.allows(50_000, 1800)
-    assert Fit.ANY.allows(0, 1)
+    assert AllowedValue.AT_LEAST.allows(50_000, 1800)
+    assert not AllowedValue.AT_LEAST.allows(1799, 1800)
+    assert not AllowedValue.EQUAL.allows(50_000, 1800)
+    assert AllowedValue.ANY.allows(0, 1)
 
 
 def test_the_table_loads_no_library():
@@ -68,8 +68,8 @@ def test_the_table_loads_no_library():
 def test_what_is_mapped_is_what_the_pdos_carry():
     from rigd.devices.cia402 import objects
 
-    sent = {each.index for each in REQUIREMENTS if Access.SENT in each.access}
-    received = {each.index for each in REQUIREMENTS if Access.RECEIVED in each.access}
+    sent = {each.index for each in REQUIREMENTS if ObjectAccess.SENT in each.access}
+    received = {each.index for each in REQUIREMENTS if ObjectAccess.RECEIVED in each.access}
     assert sent == {entry >> 16 for entry in objects.TPDO_ENTRIES}
     assert received == {entry >> 16 for entry in objects.RPDO_ENTRIES}
     assert requirement(0x6072).accept == "torque_limit"
