@@ -15,7 +15,7 @@ import numpy as np
 
 from rigd.checks.rows import Row, Verdict, grade, name_of, value_of
 from rigd.devices import WhatMoves, open_devices, reality
-from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters
@@ -53,10 +53,10 @@ class InspectableDrive(Protocol):
 
 
 @runtime_checkable
-class OutfittedDrive(Protocol):
+class InspectedDrive(Protocol):
     """A drive whose objects were looked through when it was connected."""
 
-    def outfit(self) -> Outfit | None:
+    def capabilities(self) -> DriveCapabilities | None:
         """Return what it turned out to have."""
 
 
@@ -82,39 +82,39 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
             found = f"unknown: the drive does not state it (object {_SCALES[key]})"
             verdict = Verdict.SKIPPED
         yield Row("drive", name_of(key), found, wanted.get(key, ""), verdict)
-    outfit = drive.outfit() if isinstance(drive, OutfittedDrive) else None
-    if outfit is not None:
-        yield from _safeguard_rows(outfit)
+    capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
+    if capabilities is not None:
+        yield from _safeguard_rows(capabilities)
 
 
-def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
+def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[Row]:
     """Show the watchdog, the replacements of missing objects, and what was accepted."""
-    stands, after_s = outfit.watchdog, outfit.watchdog_s
-    unproven = stands in (Watchdog.OWN, Watchdog.NONE)
+    watchdog, after_s = capabilities.watchdog, capabilities.watchdog_s
+    unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield Row(
         "drive",
         "watchdog",
-        f"{stands.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
+        f"{watchdog.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
         Verdict.WARNING if unproven else Verdict.OK,
-        _WATCHDOG_DETAIL.get(stands, ""),
+        _WATCHDOG_DETAIL.get(watchdog, ""),
     )
-    accepted = outfit.accepted
-    for row in outfit.lacks:
+    accepted = capabilities.accepted
+    for row in capabilities.lacks:
         missing = row.accept in accepted
-        told = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+        substitute = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
         if row.accept == WATCHDOG:
-            told = f"stands in: {stands.value}" if stands is not Watchdog.NONE else ""
+            substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
         by_name = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
         yield Row(
             "drive",
-            f"object {row.place} ({row.name})",
-            "; ".join(("absent or not usable", *filter(None, (by_name, told)))),
+            f"object {row.address} ({row.name})",
+            "; ".join(("absent or not usable", *filter(None, (by_name, substitute)))),
             "",
             Verdict.WARNING if missing else Verdict.OK,
             f"{row.name}: {row.sentence}" if missing else "",
         )
-    for text in outfit.assigned:
+    for text in capabilities.assigned:
         yield Row("drive", "object set", text, "read back", Verdict.OK)
 
 
@@ -191,7 +191,7 @@ def _measured_rows(
 ) -> Iterator[Row]:
     """Judge rate and turn-round of the sensor; `cause` is what it says of gaps in its stream."""
     for key, value in measured.items():
-        wanted, verdict = _judge(key, value, rig)
+        wanted, verdict = _assess_diagnostic(key, value, rig)
         detail = cause if key == "longest_gap_s" and verdict is not Verdict.OK else ""
         yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
 
@@ -204,8 +204,8 @@ def _value(key: str, found: Mapping[str, object]) -> str:
 def _wanted(key: str, rig: RigParameters) -> str:
     if key != "serial_number":
         return ""
-    asked = rig.ati_can.serial_number if rig.ati_can else ""
-    return asked or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
+    expected = rig.ati_can.serial_number if rig.ati_can else ""
+    return expected or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
 
 
 def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
@@ -219,7 +219,7 @@ def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
     return Row("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
 
 
-def _judge(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
+def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
     """Return what a measured value should be, and whether it is."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition

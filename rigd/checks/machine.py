@@ -281,12 +281,12 @@ def _wall_clock_row() -> Row:
 def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
     runtime_us = _number(root / _THROTTLING, -1)
     period_us = _number(root / _THROTTLING_PERIOD, 1_000_000)
-    share = runtime_us / period_us if runtime_us >= 0 else 1.0
-    low = share < _LEAST_RUNTIME and settings.priority > 0
+    fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
+    low = fraction < _LEAST_RUNTIME and settings.priority > 0
     return Row(
         _GROUP,
         "real-time share",
-        "all of a core" if runtime_us < 0 else f"{100 * share:.0f} % of a core",
+        "all of a core" if runtime_us < 0 else f"{100 * fraction:.0f} % of a core",
         f"{100 * _LEAST_RUNTIME:.0f} %",
         grade(fail=False, warn=low),
         "Real-time share: the kernel stops real-time processes that take more; "

@@ -369,7 +369,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
 
     verdicts = {
         Grade.FITS: Verdict.OK,
-        Grade.STANDS_IN: Verdict.OK,
+        Grade.SUBSTITUTED: Verdict.OK,
         Grade.ASK: Verdict.SKIPPED,
         Grade.ACCEPTED: Verdict.WARNING,
         Grade.DOUBT: Verdict.WARNING,
@@ -468,8 +468,8 @@ def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
     """Return the relative change of mode 1's frequency by gravity along the beam, first order."""
     first_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
     along_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
-    share = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
-    return float(100.0 * share)
+    sag = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
+    return float(100.0 * sag)
 
 
 UNKNOWN_VALUES = "unknown_values"

@@ -55,7 +55,7 @@ class ImpactSpecification:
     """When it begins, from the first enabling of the drive."""
 
 
-Encounter = Obstacle | ImpactSpecification
+Disturbance = Obstacle | ImpactSpecification
 """What the beam may meet."""
 
 
@@ -75,7 +75,7 @@ def _time(value: float) -> bool:
     return 0 <= value <= _LONGEST_S
 
 
-_KEYS: dict[type[Encounter], dict[str, _ObstacleKey]] = {
+_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     Obstacle: {
         "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
         "angle": _ObstacleKey(
@@ -119,7 +119,7 @@ NOT_BESIDE_OBSTACLES = (
 """Keys of ``[simulation]`` with which no obstacle is simulated."""
 
 
-def parse_obstacle(text: str) -> Encounter:
+def parse_obstacle(text: str) -> Disturbance:
     """Read an obstacle or a knock.
 
     Parameters
@@ -176,7 +176,7 @@ def parse_obstacle(text: str) -> Encounter:
 
 
 def check_obstacles(
-    encounters: Iterable[Encounter], beam: Beam, simulated: Mapping[str, float | None]
+    disturbances: Iterable[Disturbance], beam: Beam, simulated: Mapping[str, float | None]
 ) -> None:
     """Refuse obstacles that cannot be simulated on a rig.
 
@@ -194,11 +194,11 @@ def check_obstacles(
     ObstacleError
         Saying why, and what to change.
     """
-    for encounter in encounters:
-        if encounter.x_m > beam.length_m:
+    for disturbance in disturbances:
+        if disturbance.x_m > beam.length_m:
             raise ObstacleError(
-                f"Obstacle '{describe_obstacle(encounter)}': x={encounter.x_m:g} m lies beyond the "
-                f"tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
+                f"Obstacle '{describe_obstacle(disturbance)}': x={disturbance.x_m:g} m lies beyond "
+                f"the tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
             )
         for name, value in simulated.items():
             if value:
@@ -235,7 +235,7 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
     return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
 
 
-def describe_obstacle(encounter: Encounter) -> str:
+def describe_obstacle(disturbance: Disturbance) -> str:
     """Write an obstacle or a knock so that `parse_obstacle` reads it back.
 
     Parameters
@@ -243,13 +243,13 @@ def describe_obstacle(encounter: Encounter) -> str:
     encounter
         What is written.
     """
-    default = {each.name: each.default for each in fields(encounter)}
-    if isinstance(encounter, Obstacle):
-        default["side"] = _side_of(encounter.angle_rad)
+    default = {each.name: each.default for each in fields(disturbance)}
+    if isinstance(disturbance, Obstacle):
+        default["side"] = _side_of(disturbance.angle_rad)
     return ",".join(
         f"{name}={value:g}" if float(f"{value:g}") == value else f"{name}={value!r}"
-        for name, key in _KEYS[type(encounter)].items()
-        if (value := getattr(encounter, key.field)) != default[key.field]
+        for name, key in _KEYS[type(disturbance)].items()
+        if (value := getattr(disturbance, key.field)) != default[key.field]
     )
 
 

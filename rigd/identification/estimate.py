@@ -174,7 +174,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
         change_s = float(solution[DELAY])
         if abs(change_s) < _CONVERGED_S:
             try:
-                return _judge(rows, weights, residuals, free, solution, delay_s)
+                return _with_uncertainty(rows, weights, residuals, free, solution, delay_s)
             except np.linalg.LinAlgError:  # something is not in the record at all
                 return None
         delay_s, scale = delay_s + change_s, float(solution[SCALE])
@@ -223,7 +223,7 @@ def _weights(residuals: Sequence[Complex], stacks: Sequence[_Stack]) -> list[Rea
     ]
 
 
-def _judge(
+def _with_uncertainty(
     rows: Sequence[_StackMoments],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
@@ -241,8 +241,8 @@ def _judge(
         mean = x.mean(axis=0)
         normal += np.einsum("mp,m,mq->pq", mean.conj(), weight, mean).real
         apart = x - mean
-        share = weight / (repeats * (repeats - 1))
-        bias += np.einsum("rmp,m,rm->p", apart.conj(), share, residual).real
+        part = weight / (repeats * (repeats - 1))
+        bias += np.einsum("rmp,m,rm->p", apart.conj(), part, residual).real
     inverse = np.linalg.inv(normal)
 
     # Each stack's part in the variance, from the scatter of what its repeats pull at the solution.
@@ -260,9 +260,9 @@ def _judge(
         terms += rest.size
         constant = abs(row.x[0, 0, COULOMB])
         departure_nm = max(departure_nm, abs(float(rest[0].real)) / float(constant))
-    shares = np.array(parts)
-    variance = shares.sum(axis=0)
-    freedom = variance**2 / np.sum(shares**2 / np.array(degrees)[:, None], axis=0)
+    parts_of_variance = np.array(parts)
+    variance = parts_of_variance.sum(axis=0)
+    freedom = variance**2 / np.sum(parts_of_variance**2 / np.array(degrees)[:, None], axis=0)
     misfit = left / max(1.0, terms - 0.5 * chosen.size)
     widening = _MARGIN * _coverage(freedom) * sqrt(max(1.0, misfit))
 
@@ -380,7 +380,7 @@ def estimate_motor(
     EstimateError
         If there are too few windows, or the fit does not settle.
     """
-    moving = [window for window in windows if _keeps_moving(window, timing.rate_hz)]
+    moving = [window for window in windows if _never_stops(window, timing.rate_hz)]
     stacks = _stack(moving, len(windows))
     found = _fit(stacks, timing, hold_scale=False)
     scale_known = (
@@ -423,7 +423,7 @@ def estimate_motor(
     )
 
 
-def _keeps_moving(window: PassReadings, rate_hz: float) -> bool:
+def _never_stops(window: PassReadings, rate_hz: float) -> bool:
     half = max(1, round(_SPEED_S * rate_hz))
     angle = window.angle_rad
     speed = (angle[2 * half :] - angle[: -2 * half]) * rate_hz / (2 * half)
@@ -442,7 +442,7 @@ def _stack(windows: Sequence[PassReadings], given: int) -> list[_Stack]:
             f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
             "standstill."
         )
-    sessions = {number: place for place, number in enumerate(sorted({g[0].session for g in full}))}
+    sessions = {number: index for index, number in enumerate(sorted({g[0].session for g in full}))}
     return [
         _Stack(
             np.array([window.angle_rad for window in group]),

@@ -29,9 +29,9 @@ TOP_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
 """Up to where the passes of each kind move the shaft, or the beam swings from a turn."""
 
 _MAX_SPEED_RAD_S = 1.0
-_LIMIT_SHARE = 0.5
+_LIMIT_FRACTION = 0.5
 """Share of the profile's speed limit: the rest is for multisine and a motor unlike its data."""
-_STROKE_SHARE = 0.93
+_STROKE_FRACTION = 0.93
 """Share of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
 _SPEED_PARTS = (0.1, 0.3, 0.6, 1.0)
 _MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
@@ -158,11 +158,11 @@ def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float)
     ride = _multisine(layout, loop, _MODULATION[kind])
     alone_nm = _peak_torque(loop, carrier)
     together_nm = _peak_torque(loop, carrier + ride)
-    share = 1.0
+    fraction = 1.0
     if together_nm > limit_nm:
         # The peak is convex in the share: on the straight line between the two it is lower yet.
-        share = (limit_nm - alone_nm) / (together_nm - alone_nm)
-    if share < _LEAST_MULTISINE:
+        fraction = (limit_nm - alone_nm) / (together_nm - alone_nm)
+    if fraction < _LEAST_MULTISINE:
         needed_nm = alone_nm + _LEAST_MULTISINE * (together_nm - alone_nm)
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: of {limit_nm:.3g} N·m the passes alone take "
@@ -170,7 +170,7 @@ def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float)
             f"{_percent(profile, needed_nm)} % or a shorter --stroke-rad."
         )
     return _excitation(
-        kind, layout, profile, loop, carrier + share * ride, torque_percent, stroke_rad
+        kind, layout, profile, loop, carrier + fraction * ride, torque_percent, stroke_rad
     )
 
 
@@ -240,8 +240,8 @@ def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: floa
     travel_s = float(np.ptp(_path(PassSchedule(parts, 1), profile.rig.rate_hz)))
     speed = min(
         _MAX_SPEED_RAD_S,
-        _LIMIT_SHARE * limits.velocity_rad_s,
-        2 * _STROKE_SHARE * stroke_rad / travel_s,
+        _LIMIT_FRACTION * limits.velocity_rad_s,
+        2 * _STROKE_FRACTION * stroke_rad / travel_s,
     )
     return PassSchedule(tuple(part * speed for part in parts), cycles)
 
@@ -252,14 +252,14 @@ def _path(layout: PassSchedule, rate_hz: float) -> Real:
         round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
     )
     change = _smooth(np.arange(turn) / turn)
-    pieces: list[Real] = []
+    segments: list[Real] = []
     before = 0.0
     for speed in [s for v in layout.speeds_rad_s for s in (v, -v)] * layout.cycles:
-        pieces.append(before + (speed - before) * change)
-        pieces.append(np.full(settle + window, speed))
+        segments.append(before + (speed - before) * change)
+        segments.append(np.full(settle + window, speed))
         before = speed
-    pieces.append(before * (1.0 - change))
-    speeds = np.concatenate(pieces)
+    segments.append(before * (1.0 - change))
+    speeds = np.concatenate(segments)
     path: Real = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]))]) / rate_hz
     return path
 

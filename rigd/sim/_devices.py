@@ -20,7 +20,7 @@ import numpy as np
 from rigd.beam import check_order
 from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
-from rigd.devices.obstacles import Encounter, ObstacleError, describe_obstacle, with_obstacles
+from rigd.devices.obstacles import Disturbance, ObstacleError, describe_obstacle, with_obstacles
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
@@ -112,8 +112,8 @@ class SimulatedRig:
         rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
         assert rig.simulation is not None
         self._parameters = rig
-        self._met: list[Encounter] = []
-        self._ended: list[Encounter] = []
+        self._met: list[Disturbance] = []
+        self._ended: list[Disturbance] = []
         self._preparing: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
@@ -137,7 +137,7 @@ class SimulatedRig:
     def advance(self, n_periods: int) -> None:
         """Move on by whole periods, the torque held."""
         if self._preparing is not None:
-            self._look()
+            self._poll_preparation()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
             self.sensor.elapse(n_periods)
@@ -147,7 +147,7 @@ class SimulatedRig:
             self.sensor.elapse(1)
             self.sensor.sample()
 
-    def check(self, encounter: Encounter) -> None:
+    def check(self, disturbance: Disturbance) -> None:
         """Refuse what the beam cannot meet beside what it meets already.
 
         Raises
@@ -155,7 +155,7 @@ class SimulatedRig:
         ObstacleError, RealisationError
             Saying why.
         """
-        with_obstacles(self._parameters, [describe_obstacle(encounter)])
+        with_obstacles(self._parameters, [describe_obstacle(disturbance)])
         check_order(self._parameters.damping)
         if len(self._met) == _MOST_MET:
             raise ObstacleError(
@@ -163,7 +163,7 @@ class SimulatedRig:
                 "more would take too long a tick; start it again."
             )
 
-    def meet(self, encounter: Encounter, *, wait: bool) -> None:
+    def meet(self, disturbance: Disturbance, *, wait: bool) -> None:
         """Put an obstacle or a knock in the beam's way.
 
         Parameters
@@ -174,20 +174,20 @@ class SimulatedRig:
             Let it take effect before the next period, for which the caller waits a tenth of a
             second. Otherwise another process makes ready for it, and the rig goes on meanwhile.
         """
-        self._met.append(encounter)
+        self._met.append(disturbance)
         if wait:
             self._take_over(self._prepared()[1])
         elif self._preparing is None:
             self._prepare()
 
-    def end(self, encounter: Encounter) -> None:
+    def end(self, disturbance: Disturbance) -> None:
         """Take an obstacle away that `meet` put there."""
-        self._ended.append(encounter)
-        self.plant.end_obstacle(encounter)
+        self._ended.append(disturbance)
+        self.plant.end_obstacle(disturbance)
 
     def _prepared(self) -> tuple[int, SimulatedPlant]:
         """Make a plant that meets all that was added so far, and their number."""
-        texts = [describe_obstacle(encounter) for encounter in self._met]
+        texts = [describe_obstacle(disturbance) for disturbance in self._met]
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _prepare(self) -> None:
@@ -207,7 +207,7 @@ class SimulatedRig:
             os._exit(failed)
         self._preparing = process, file
 
-    def _look(self) -> None:
+    def _poll_preparation(self) -> None:
         """Take over what was prepared, once it is; what came meanwhile is prepared next."""
         assert self._preparing is not None
         process, file = self._preparing
@@ -226,8 +226,8 @@ class SimulatedRig:
 
     def _take_over(self, plant: SimulatedPlant) -> None:
         self.plant.meet(plant)
-        for encounter in self._ended:
-            self.plant.end_obstacle(encounter)
+        for disturbance in self._ended:
+            self.plant.end_obstacle(disturbance)
 
     def read_angle(self) -> float:
         """Return the angle in whole encoder steps, in rad."""
@@ -470,7 +470,7 @@ def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[floa
     wrenches[:, known] = rows.T @ np.linalg.inv(rows @ rows.T)
     if crosstalk_percent:
         full = np.array(sensor.range)
-        shares = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
-        wrenches += shares * full[:, None] / full @ wrenches
+        crosstalk = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
+        wrenches += crosstalk * full[:, None] / full @ wrenches
     per_torque, per_shear = wrenches.T.tolist()
     return per_torque, per_shear

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid, realise_force
 from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
-from rigd.devices.obstacles import Encounter, ImpactSpecification, Obstacle
+from rigd.devices.obstacles import Disturbance, ImpactSpecification, Obstacle
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -74,7 +74,7 @@ class AttachedObstacles:
         beam: Beam,
         damping: Damping,
         realisation: Realisation,
-        bodies: tuple[Encounter, ...],
+        bodies: tuple[Disturbance, ...],
         period_s: float,
     ) -> None:
         self.bodies = bodies
@@ -111,12 +111,12 @@ class AttachedObstacles:
         self._none: Real = np.zeros((self.substeps, len(bodies)))
         self.forces_n = self._none
         # Displacement at each body at the end of the last period, and at its start.
-        self._place_m: Real = np.zeros(len(bodies))
-        self._start_m = self._place_m
+        self._displacement_m: Real = np.zeros(len(bodies))
+        self._start_m = self._displacement_m
         self._penetration_m = self._ends_m = dict.fromkeys(range(len(bodies)), -inf)
 
     @property
-    def place(self) -> Real:
+    def displacement_rows(self) -> Real:
         """Displacement of the beam at each body by the state of `attached`, (bodies, n)."""
         return np.column_stack([self._turned, self._own[:-2]])
 
@@ -181,11 +181,11 @@ class AttachedObstacles:
         steps, step_s, bodies = self.substeps, self._step_s, self._at_m.size
         n = model.b.size
         phi, whole = propagator(model, step_s)
-        place = self.place
+        displacement_rows = self.displacement_rows
 
         # Without a force: the states' share, row by row, and that of the torques column by column.
         rows = np.empty((steps, bodies, n))
-        row = place
+        row = displacement_rows
         for j in range(steps):
             rows[j] = row = row @ phi
         torques = np.empty((steps, bodies, 2))
@@ -195,7 +195,7 @@ class AttachedObstacles:
             after = propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else whole
             after = after * (before_s < step_s)
             state = phi @ state + np.column_stack([whole - after, after])
-            torques[j] = place @ state
+            torques[j] = displacement_rows @ state
         free = np.column_stack([rows.reshape(-1, n), torques.reshape(-1, 2)])
         free = np.column_stack([free, free[:, :n] @ friction])
 
@@ -204,16 +204,16 @@ class AttachedObstacles:
         left[0] = held_inputs(model, of_force, step_s)
         for j in range(1, steps):
             left[j] = phi @ left[j - 1]
-        kernel = place @ left
+        kernel = displacement_rows @ left
         kernel[0] += self._direct[:-2]
 
-        def told(row: Real, direct: Real, instant_s: float) -> Real:
+        def effect_on(row: Real, direct: Real, instant_s: float) -> Real:
             """Return what each substep's force adds to an output at an instant."""
             at = instant_s / step_s
             number = min(int(at), steps - 1)
-            share = at - number
+            fraction = at - number
             effect = np.zeros((steps, bodies))
-            for node, weight in ((number, 1 - share), (number + 1, share)):
+            for node, weight in ((number, 1 - fraction), (number + 1, fraction)):
                 effect[:node] += weight * (row @ left[:node])[::-1]
             effect[number] += direct
             return effect.ravel()
@@ -224,14 +224,14 @@ class AttachedObstacles:
         effect = np.vstack(
             [
                 left[::-1].transpose(1, 0, 2).reshape(n, -1),
-                told(model.angle, none, period_s),
-                told(model.velocity, none, period_s),
-                told(model.sensor_torque, at_sensor, period_s),
-                told(holding_torque, self._direct[-2], period_s),
-                told(model.shear, shear, period_s),
-                told(model.angle, none, angle_instant_s),
-                told(model.sensor_torque, at_sensor, torque_instant_s),
-                told(model.shear, shear, torque_instant_s),
+                effect_on(model.angle, none, period_s),
+                effect_on(model.velocity, none, period_s),
+                effect_on(model.sensor_torque, at_sensor, period_s),
+                effect_on(holding_torque, self._direct[-2], period_s),
+                effect_on(model.shear, shear, period_s),
+                effect_on(model.angle, none, angle_instant_s),
+                effect_on(model.sensor_torque, at_sensor, torque_instant_s),
+                effect_on(model.shear, shear, torque_instant_s),
             ]
         )
         return March(
@@ -243,7 +243,7 @@ class AttachedObstacles:
             velocity_row=n + 1,
         )
 
-    def nothing(self, place_m: Real, time_s: float) -> bool:
+    def nothing(self, displacement_m: Real, time_s: float) -> bool:
         """Tell whether the beam can have touched nothing over a period without a force.
 
         Parameters
@@ -254,8 +254,8 @@ class AttachedObstacles:
             Time at its start.
         """
         end_s = time_s + self._period_s
-        before_m = self._start_m = self._place_m
-        self._place_m = place_m.copy()
+        before_m = self._start_m = self._displacement_m
+        self._displacement_m = displacement_m.copy()
         for _, knock in self._knocks:
             if time_s < knock.at_s + knock.duration_s and knock.at_s < end_s:
                 return False
@@ -263,7 +263,7 @@ class AttachedObstacles:
             if body.from_s < end_s and time_s < body.until_s:
                 if self._penetration_m[index] > 0:
                     return False
-                old, new = before_m.item(index), place_m.item(index)
+                old, new = before_m.item(index), displacement_m.item(index)
                 moves = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
                 if body.side * (new - _surface(body, end_s)) > -(moves + _NEAR_M):
                     return False
@@ -411,10 +411,10 @@ class AttachedObstacles:
                     other._oscillating : other._oscillating + real
                 ]
             self._penetration_m.update(other._penetration_m)
-        self._place_m = self.place @ whole
+        self._displacement_m = self.displacement_rows @ whole
         return whole
 
-    def end(self, body: Encounter, time_s: float) -> None:
+    def end(self, body: Disturbance, time_s: float) -> None:
         """Take an obstacle away."""
         self._obstacles = [
             (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
@@ -425,7 +425,7 @@ class AttachedObstacles:
         """Go on from what `forces` found last."""
         self.forces_n = forces_n
         self._penetration_m = self._ends_m
-        self._place_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)
+        self._displacement_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)
 
 
 @dataclass(slots=True, eq=False)
@@ -513,7 +513,7 @@ def _surface(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or 
     return body.x_m * (body.angle_rad + body.rate_rad_s * (time_s - body.from_s))
 
 
-def _substeps(beam: Beam, bodies: tuple[Encounter, ...], period_s: float) -> int:
+def _substeps(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
     """Substeps of a period, fine enough for the stiffest obstacle."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     unit = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25

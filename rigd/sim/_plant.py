@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam.realisation import Realisation
-from rigd.devices.obstacles import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
+from rigd.devices.obstacles import (
+    NOT_BESIDE_OBSTACLES,
+    Disturbance,
+    check_obstacles,
+    parse_obstacle,
+)
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
 from rigd.sim._obstacle import AttachedObstacles, March
@@ -81,11 +86,12 @@ class SimulatedPlant:
         "_air",
         "_contact",
         "_coulomb_nm",
+        "_direct_fraction",
         "_direct_nm",
-        "_direct_share",
+        "_direct_shear_fraction",
         "_direct_shear_n",
-        "_direct_shear_share",
         "_drift",
+        "_fraction_before_switch",
         "_free",
         "_free_march",
         "_friction_effects",
@@ -106,11 +112,10 @@ class SimulatedPlant:
         "_sensed_shear_jump_gain",
         "_sensed_shears",
         "_sensed_torques",
-        "_share_before_switch",
         "_shear_jump_gain",
         "_states",
         "_stuck",
-        "_torque_instant_share",
+        "_torque_instant_fraction",
         "_torque_nm",
         "_torques",
         "_vectors",
@@ -163,11 +168,11 @@ class SimulatedPlant:
             )
             self._friction_speed = self._air.speed @ friction[:n]
             self._direct_nm = self._direct_shear_n = 0.0
-            self._direct_share = 1 - free.sensor_torque_per_torque
-            self._direct_shear_share = -free.shear_per_torque
-            self._torque_instant_share = 1 - torque_age / period
+            self._direct_fraction = 1 - free.sensor_torque_per_torque
+            self._direct_shear_fraction = -free.shear_per_torque
+            self._torque_instant_fraction = 1 - torque_age / period
         if self._contact is not None:
-            points = len(self._contact.place)
+            points = len(self._contact.displacement_rows)
             self._free_march, self._locked_march = (
                 self._contact.march(
                     model, of_force, locked.sensor_torque, *instants, friction=friction[:n]
@@ -175,7 +180,8 @@ class SimulatedPlant:
                 for model, of_force in ((free, on_free), (locked, on_locked))
             )
             step, locked_step = (
-                np.vstack([whole, self._contact.place @ whole[:n]]) for whole in (step, locked_step)
+                np.vstack([whole, self._contact.displacement_rows @ whole[:n]])
+                for whole in (step, locked_step)
             )
         self._drift: StiffnessDrift | None = None
         if simulation.stiffness_drift_per_s:
@@ -183,7 +189,9 @@ class SimulatedPlant:
                 simulation.stiffness_drift_per_s,
                 period,
                 np.abs(beam.poles_rad_s).max(initial=0.0, where=beam.poles_rad_s.imag > 0),
-                lambda share: arrays_at(share, parameters, simulation, beam, period, instants),
+                lambda fraction: arrays_at(
+                    fraction, parameters, simulation, beam, period, instants
+                ),
             )
             step, locked_step = self._drift.arrays[:2]
         # A bound method of a matrix in column order: the quickest product of this size in numpy.
@@ -201,7 +209,7 @@ class SimulatedPlant:
         self._friction_nm = 0.0
         self._stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
-        self._share_before_switch = switch / period
+        self._fraction_before_switch = switch / period
         self._next_is_known = switch == 0 and periods > 0
         self._jump_is_sensed = torque_age == 0 and not filtered
         self._set_jump_gains(free.sensor_torque_per_torque, free.shear_per_torque)
@@ -284,7 +292,7 @@ class SimulatedPlant:
         self._vectors = _vectors(state.size, len(contact.bodies), felt=0)
         self._vectors[0][0][: state.size] = state
 
-    def end_obstacle(self, obstacle: Encounter) -> None:
+    def end_obstacle(self, obstacle: Disturbance) -> None:
         """Take an obstacle away, if there is such a one."""
         if self._contact is not None:
             self._contact.end(obstacle, self.elapsed_s)
@@ -323,8 +331,8 @@ class SimulatedPlant:
             if self._air is not None:
                 self._air.hold(input_[n + 3 :])
 
-            share = self._share_before_switch
-            load = share * before + (1 - share) * after - self._holding_beam_nm
+            fraction = self._fraction_before_switch
+            load = fraction * before + (1 - fraction) * after - self._holding_beam_nm
             if self._stuck and abs(load) <= self._coulomb_nm:
                 self._locked(input_, output)
                 if self._contact is not None:
@@ -443,15 +451,17 @@ class SimulatedPlant:
             speed_m_s += self._friction_nm * self._friction_speed
         before_nm, before_n = self._direct_nm, self._direct_shear_n
         now_nm, now_n = self._air.feel(speed_m_s)
-        share, shear_share = (self._direct_share, self._direct_shear_share) if free else (1.0, 0.0)
-        now_n += shear_share * now_nm
+        fraction, shear_fraction = (
+            (self._direct_fraction, self._direct_shear_fraction) if free else (1.0, 0.0)
+        )
+        now_n += shear_fraction * now_nm
         self._direct_nm, self._direct_shear_n = now_nm, now_n
-        at = self._torque_instant_share
+        at = self._torque_instant_fraction
         return (
-            torque + share * now_nm,
+            torque + fraction * now_nm,
             holding + now_nm,
             shear + now_n,
-            sensed_torque + share * (before_nm + at * (now_nm - before_nm)),
+            sensed_torque + fraction * (before_nm + at * (now_nm - before_nm)),
             sensed_shear + before_n + at * (now_n - before_n),
         )
 
@@ -470,8 +480,8 @@ def _contact(
     if simulation is None or not simulation.obstacles:
         return None
     bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
-    beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
-    check_obstacles(bodies, parameters.beam, beside)
+    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    check_obstacles(bodies, parameters.beam, simulated)
     return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
 
 
@@ -515,9 +525,9 @@ class OtherClock:
         """Return the reading that is as old as the first has come to be (`index` 0)."""
         assert index == 0
         readings = self._readings
-        place = len(readings) - 1 - self._age
-        first = min(max(int(place) - 1, 0), len(readings) - _STENCIL)
-        x = place - first
+        position = len(readings) - 1 - self._age
+        first = min(max(int(position) - 1, 0), len(readings) - _STENCIL)
+        x = position - first
         a, b, c, d = readings[first : first + _STENCIL]
         return (
             -a * (x - 1) * (x - 2) * (x - 3) / 6

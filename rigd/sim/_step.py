@@ -111,7 +111,7 @@ def steps_of(
 
 
 def arrays_at(
-    share: float,
+    stiffness_ratio: float,
     parameters: RigParameters,
     simulation: Simulation,
     at_start: Realisation,
@@ -144,13 +144,14 @@ def arrays_at(
         If the beam cannot be realised at that stiffness.
     """
     own = parameters.beam
-    drifted = replace(own, bending_stiffness_n_m2=share * own.bending_stiffness_n_m2)
+    drifted = replace(own, bending_stiffness_n_m2=stiffness_ratio * own.bending_stiffness_n_m2)
     try:
         beam, *models = models_of(replace(parameters, beam=drifted), simulation, own)
     except RealisationError as error:
         raise RealisationError(
             "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
-            f"{share:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
+            f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
+            f"{error}"
         ) from error
     free, locked = (in_displacements(model, beam, at_start) for model in models)
     step, locked_step, friction = steps_of(free, locked, period_s, instants)
@@ -216,16 +217,16 @@ def _step(
         row: Real = of_state @ state_at(instant_s)
         apart_s = instant_s - switch_s
         if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
-            share_after = 0.5
+            fraction_after = 0.5
         else:
-            share_after = 1.0 if apart_s > 0 else 0.0
-        row[-2:] += per_torque * np.array([1 - share_after, share_after])
+            fraction_after = 1.0 if apart_s > 0 else 0.0
+        row[-2:] += per_torque * np.array([1 - fraction_after, fraction_after])
         return row
 
     end = state_at(period_s)
     return np.vstack(
         [
-            *_told(model, end, torque_at(period_s), holding_torque),
+            *_output_rows(model, end, torque_at(period_s), holding_torque),
             shear_at(period_s),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
@@ -238,7 +239,9 @@ def _step(
     )
 
 
-def _told(model: CoupledModel, end: Real, torque: Real, holding_torque: Real) -> tuple[Real, ...]:
+def _output_rows(
+    model: CoupledModel, end: Real, torque: Real, holding_torque: Real
+) -> tuple[Real, ...]:
     """Rows of the state at a period's end, and of what is told of it beside the sensors."""
     return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
 
@@ -273,7 +276,7 @@ def held_of(
     end = state_at(period_s)
     return np.vstack(
         [
-            *_told(model, end, model.sensor_torque @ end, holding_torque),
+            *_output_rows(model, end, model.sensor_torque @ end, holding_torque),
             model.shear @ end,
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),

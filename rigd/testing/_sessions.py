@@ -44,13 +44,13 @@ class Signals:
     rate_hz: float = 1000.0
     metadata: dict[str, str] = field(default_factory=dict)
 
-    def part(self, kept: slice | NDArray[np.generic]) -> "Signals":
+    def part(self, selected: slice | NDArray[np.generic]) -> "Signals":
         """Return some of the samples, by numpy's indexing; segments and rate stay as they are."""
         return replace(
             self,
-            reference_rad=self.reference_rad[kept],
-            angle_rad=self.angle_rad[kept],
-            torque_nm=self.torque_nm[kept],
+            reference_rad=self.reference_rad[selected],
+            angle_rad=self.angle_rad[selected],
+            torque_nm=self.torque_nm[selected],
         )
 
 

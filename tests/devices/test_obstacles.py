@@ -39,8 +39,8 @@ KNOCKS = st.builds(
 
 
 @given(st.one_of(OBSTACLES, KNOCKS))
-def test_what_is_written_is_read_back(encounter):
-    assert parse_obstacle(describe_obstacle(encounter)) == encounter
+def test_what_is_written_is_read_back(disturbance):
+    assert parse_obstacle(describe_obstacle(disturbance)) == disturbance
 
 
 def test_what_is_left_out():
@@ -82,10 +82,10 @@ NAMES = [
 def test_any_keys_are_an_obstacle_or_refused(words):
     text = ",".join(f"{name}={value}" for name, value in words)
     try:
-        encounter = parse_obstacle(text)
+        disturbance = parse_obstacle(text)
     except ObstacleError:
         return
-    assert parse_obstacle(describe_obstacle(encounter)) == encounter
+    assert parse_obstacle(describe_obstacle(disturbance)) == disturbance
 
 
 @pytest.mark.parametrize(

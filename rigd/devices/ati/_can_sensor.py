@@ -158,7 +158,7 @@ class AtiCanSensor:
             **self._calibration.as_dict(),
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
-            **({} if self._tells_scale else {"assumed": _ASSUMED}),
+            **({} if self._reports_scale else {"assumed": _ASSUMED}),
             "status": self._status,
             "base_id": self._settings.base_id,
         }
@@ -282,7 +282,7 @@ class AtiCanSensor:
         g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
         before, self._status_word = self._status_word, status
         if status:
-            self._judge(status, before)
+            self._check_status(status, before)
         limit = self._limit
         self.wrench_saturated = (
             max(g0, g2, g4, g1, g3, g5) >= limit or min(g0, g2, g4, g1, g3, g5) <= -limit
@@ -291,7 +291,7 @@ class AtiCanSensor:
         self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _judge(self, status: int, before: int) -> None:
+    def _check_status(self, status: int, before: int) -> None:
         if status & CAN_BUS_ERROR:
             self.bus_errors += 1
         if status & ~before & CAN_WATCHDOG_RESET:
@@ -399,7 +399,7 @@ class AtiCanSensor:
         return found
 
     @property
-    def _tells_scale(self) -> bool:
+    def _reports_scale(self) -> bool:
         return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
 
     def _select_calibration(self) -> None:
@@ -414,7 +414,7 @@ class AtiCanSensor:
         # Its status tells whether the selected one is any good.
         status = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
         if status & CAN_BAD_CALIBRATION:
-            self._judge(status, status)
+            self._check_status(status, status)
 
     def _read_matrix(self) -> Rows:
         return tuple(
@@ -432,7 +432,7 @@ class AtiCanSensor:
     def _read_scale(self, serial_number: str, matrix: Rows) -> Calibration:
         force = torque = netcanoem.COUNTS_BEFORE_SCALE
         force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
-        if self._tells_scale:
+        if self._reports_scale:
             force, torque = netcanoem.counts_per_unit(
                 self._ask("its counts per unit", netcanoem.COUNTS_PER_UNIT)
             )

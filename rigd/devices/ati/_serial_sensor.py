@@ -108,8 +108,8 @@ class AtiSerialSensor:
         self._steady_ticks = 0
         self._damages = 0
         self._missing_records = 0
-        self._asked_ns = 0
-        self._looked_ns = 0
+        self._requested_ns = 0
+        self._last_read_ns = 0
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
@@ -168,13 +168,13 @@ class AtiSerialSensor:
 
     def request(self, due_ns: int) -> None:
         """Begin the tick; the sensor streams, so nothing is sent."""
-        now_ns = self._asked_ns = time.monotonic_ns()
+        now_ns = self._requested_ns = time.monotonic_ns()
         periods = 1
         if self._tick_ns is not None and not self._lock_step:
             periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
         self._due += periods * self._bytes_per_tick
-        if now_ns - self._looked_ns > _IDLE_NS and not self._lock_step:
+        if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
             # What has piled up is old, and perhaps full of holes: only what comes now counts.
             self._take(self._open_line().read())
             self._history = b""
@@ -193,12 +193,12 @@ class AtiSerialSensor:
         while self._arrived < self._due:
             lacks_one = self._due - self._arrived <= RECORD_SIZE
             patience_ns = self._patience_ns if lacks_one else self._deadline_ns
-            left_ns = self._asked_ns + patience_ns - time.monotonic_ns()
+            left_ns = self._requested_ns + patience_ns - time.monotonic_ns()
             if left_ns <= 0:
                 break
             line.wait(left_ns * 1e-9)
             new += self._take(line.read())
-        self._looked_ns = time.monotonic_ns()
+        self._last_read_ns = time.monotonic_ns()
         self.wrench_stale = self._lags(len(new)) or not new
         if self.wrench_stale:
             return self._wrench
@@ -289,7 +289,7 @@ class AtiSerialSensor:
         line, stream = self._open_line(), self.stream
         self._take(line.read())
         records, errors, dropped = stream.records, stream.checksum_errors, stream.dropped_bytes
-        begin_ns = heard_ns = now_ns = time.monotonic_ns()
+        begin_ns = last_received_ns = now_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         longest_ns = 0
         while now_ns < end_ns:
@@ -297,10 +297,10 @@ class AtiSerialSensor:
             data = line.read()
             now_ns = time.monotonic_ns()
             if data or now_ns >= end_ns:
-                longest_ns = max(longest_ns, now_ns - heard_ns)
-                heard_ns = now_ns
+                longest_ns = max(longest_ns, now_ns - last_received_ns)
+                last_received_ns = now_ns
                 self._take(data)
-        self._looked_ns = now_ns
+        self._last_read_ns = now_ns
         return {
             "records_hz": (stream.records - records) / ((now_ns - begin_ns) * 1e-9),
             "checksum_errors": float(stream.checksum_errors - errors),
@@ -421,7 +421,7 @@ class AtiSerialSensor:
         if self._history:
             # What stands where the first tick finds no new records.
             self._filter()
-        self._looked_ns = time.monotonic_ns()
+        self._last_read_ns = time.monotonic_ns()
         self._due = self._arrived - self.stream.pending
         self._tick_ns = None
         self._steady_ticks = 0

@@ -110,14 +110,14 @@ class SerialLine:
         data = b""
         while True:  # a short piece need not be the last: the kernel moves bytes on as it is asked
             try:
-                piece = os.read(self._fd, _READ_SIZE)
+                chunk = os.read(self._fd, _READ_SIZE)
             except BlockingIOError:
                 return data
             except OSError as error:
                 raise self._gone(error.strerror) from None
-            if not piece:
+            if not chunk:
                 raise self._gone("hung up")
-            data = data + piece if data else piece
+            data = data + chunk if data else chunk
 
     def write(self, data: bytes) -> None:
         """Send some bytes; so few that they always fit into the kernel's buffer.
@@ -170,11 +170,11 @@ class SerialLine:
             Whether it fell silent within the limit.
         """
         now = time.monotonic()
-        heard, end = now, now + limit_s
+        last_received_s, end = now, now + limit_s
         while now < end:
             if self.read():
-                heard = now
-            elif now - heard >= quiet_s:
+                last_received_s = now
+            elif now - last_received_s >= quiet_s:
                 return True
             self.wait(quiet_s)
             now = time.monotonic()
@@ -340,7 +340,7 @@ class SerialSetup:
     def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
         registers: tuple[int, ...] = ()
         while len(registers) < count:
-            piece = min(modbus.MAX_REGISTERS, count - len(registers))
-            request = modbus.read_registers(first + len(registers), piece)
+            chunk = min(modbus.MAX_REGISTERS, count - len(registers))
+            request = modbus.read_registers(first + len(registers), chunk)
             registers += modbus.registers_of(self._ask(request, what))
         return registers

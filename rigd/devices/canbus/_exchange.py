@@ -66,10 +66,10 @@ class ReplyPairing:
 
     __slots__ = (
         "_alone",
-        "_asked",
-        "_heard",
         "_inbox",
         "_pauses",
+        "_received",
+        "_requested",
         "_steady",
         "lost",
         "owed",
@@ -86,8 +86,8 @@ class ReplyPairing:
     def start(self) -> None:
         """Start over, with nothing on its way."""
         self._inbox.replies = 0
-        self._asked = self._alone = True
-        self._heard = 0
+        self._requested = self._alone = True
+        self._received = 0
         self._steady = 0
         self.owed = 0
 
@@ -97,19 +97,19 @@ class ReplyPairing:
             return False
         self._take()
         # A pause in which a reply came goes on until they have all come, or none does.
-        return self.owed > 0 and (self._heard == 1 if self._asked else self._heard > 0)
+        return self.owed > 0 and (self._received == 1 if self._requested else self._received > 0)
 
     def ask(self) -> None:
         """Note a new request, right before it is made; all that has come has been delivered."""
         self._close()
-        self._asked = True
+        self._requested = True
         self._alone = not self.owed
         self.owed += 1
 
     def pause(self) -> None:
         """Note a tick without a request, right before its latch."""
         self._close()
-        self._asked = self._alone = False
+        self._requested = self._alone = False
 
     def has_caught_up(self) -> bool:
         """Whether the last reply is the one to the last request."""
@@ -127,23 +127,23 @@ class ReplyPairing:
         """End the period of the last tick."""
         self._take()
         if self.owed:
-            if not self._asked:
-                if not self._heard:
+            if not self._requested:
+                if not self._received:
                     self.lost += self.owed
                     self.owed = 0
             elif not self._pauses:
-                self._steady = self._steady + 1 if self._heard == 1 else 0
+                self._steady = self._steady + 1 if self._received == 1 else 0
                 if self._steady >= _STEADY_PERIODS:
                     self.lost += self.owed
                     self.unproven += self.owed
                     self.owed = self._steady = 0
         else:
             self._steady = 0
-        self._heard = 0
+        self._received = 0
 
     def _take(self) -> int:
         replies, self._inbox.replies = self._inbox.replies, 0
-        self._heard += replies
+        self._received += replies
         self.owed = max(0, self.owed - replies)
         return replies
 

@@ -44,7 +44,7 @@ class Assignment:
     value: int
 
     @property
-    def place(self) -> str:
+    def address(self) -> str:
         """Index and sub-index as messages show them."""
         return f"{self.index:04X}:{self.sub:X}"
 

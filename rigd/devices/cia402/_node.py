@@ -53,7 +53,7 @@ class ReceivedFrames:
         The last TPDO had the right length.
     nmt_state : int or None
         NMT state in the last heartbeat.
-    heard : bool
+    received : bool
         A heartbeat has come since somebody set this to False.
     watching : bool
         The drive is meant to stay operational.
@@ -75,12 +75,12 @@ class ReceivedFrames:
         "_value",
         "alarm",
         "emergency",
-        "heard",
         "legible",
         "malformed",
         "name",
         "nmt_state",
         "position",
+        "received",
         "replies",
         "reply",
         "statusword",
@@ -107,7 +107,7 @@ class ReceivedFrames:
         self.replies = 0
         self.legible = False
         self.nmt_state: int | None = None
-        self.heard = False
+        self.received = False
         self.watching = False
         self.alarm = ""
         self.emergency = False
@@ -161,7 +161,7 @@ class ReceivedFrames:
             return
         state = data[0] & ~_TOGGLE_BIT
         self.nmt_state = state
-        self.heard = True
+        self.received = True
         if self.watching and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
                 what = "it has restarted by itself; check its supply"
@@ -331,7 +331,7 @@ class Node:
     def resume(self) -> None:
         """Resume the ticks after a gap: both heartbeats restart."""
         self._next_heartbeat_ns = _LONG_AGO_NS
-        self.inbox.heard = True
+        self.inbox.received = True
 
     def await_reply(self, patience_ns: int = 0) -> bool:
         """Wait for a TPDO: one period or as given, in lock-step for as long as it takes."""

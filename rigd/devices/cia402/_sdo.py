@@ -89,7 +89,7 @@ class SdoRefusal(DeviceError):
         return self.code == _WRITE_ONLY
 
 
-class NotKept(DeviceError):
+class ValueNotStored(DeviceError):
     """The drive took a value and reads back another one, which this carries."""
 
     def __init__(self, message: str, got: int) -> None:
@@ -159,16 +159,16 @@ class SdoAccess:
         DeviceError
             If it does not.
         """
-        self.tell_pre_operational()
+        self.request_pre_operational()
         try:
             self.read(objects.IDENTITY, 1)
         except SdoRefusal:
             return
         except DeviceError as error:
             others = sorted(set(self._network.scanner.nodes) - {self._node.id})
-            heard = f"; heard of node {', '.join(map(str, others))}" if others else ""
+            received = f"; heard of node {', '.join(map(str, others))}" if others else ""
             raise DeviceError(
-                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{heard}."
+                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
             ) from None
 
     def use_eds(self, path: str) -> tuple[int, int]:
@@ -186,7 +186,7 @@ class SdoAccess:
         """
         return _take_types(self._node.object_dictionary, path, self._node_id)
 
-    def tell_pre_operational(self) -> None:
+    def request_pre_operational(self) -> None:
         """Tell the drive to leave operational, which it may ignore, without waiting for it.
 
         Raises
@@ -264,12 +264,12 @@ class SdoAccess:
         ------
         DeviceError
             If the drive does not answer, refuses (:class:`SdoRefusal`), or keeps another value in
-            the bits of `mask` (:class:`NotKept`).
+            the bits of `mask` (:class:`ValueNotStored`).
         """
         self.write(index, sub, value)
         got = self.read(index, sub)
         if (got ^ value) & mask:
-            raise NotKept(
+            raise ValueNotStored(
                 f"{self._name}: {self._title(index, sub)} was set to {show_value(value)} and reads "
                 f"{show_value(got)}; check with the drive's own tool why it does not keep it.",
                 got,
@@ -331,8 +331,8 @@ class SdoAccess:
 
     def _title(self, index: int, sub: int) -> str:
         name = self._variable(index, sub).name
-        place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
-        return f"object {place}" + (f" ({name})" if name else "")
+        address = f"{index:04X}:{sub}" if sub else f"{index:04X}"
+        return f"object {address}" + (f" ({name})" if name else "")
 
 
 def _ask(client: SdoClient, variable: SdoVariable, value: int | None) -> object:
@@ -367,8 +367,8 @@ def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int
         raise DeviceError(
             f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
-    for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        entry, mine = theirs.get(*place), own.get_variable(*place)
+    for address in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
+        entry, mine = theirs.get(*address), own.get_variable(*address)
         if (
             entry is not None
             and mine is not None

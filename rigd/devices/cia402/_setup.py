@@ -11,7 +11,7 @@ from math import tau
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
-from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
+from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
 from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
 from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
@@ -51,7 +51,7 @@ _DUPLICATE_WATCHES = 127
 
 
 @dataclass(frozen=True, slots=True)
-class Outfit:
+class DriveCapabilities:
     """Equipment of a drive, as found when it was set up.
 
     Attributes
@@ -92,7 +92,7 @@ class Outfit:
         return tuple(names)
 
 
-def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
+def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     """Verify and configure the drive; it stays pre-operational and disabled.
 
     Parameters
@@ -137,19 +137,19 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
         work.configure_torque()
         work.configure_speed()
         work.configure_sync()
-        stands = work.configure_guards()
-        work.configure_pdos(stands)
-        work.look_at_the_rest(identity)
+        active = work.configure_guards()
+        work.configure_pdos(active)
+        work.check_other_objects(identity)
         work.settle(requirement(objects.MODE))
         # Some drives show it only once they are enabled: it is looked at again then.
         wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
-    return Outfit(
+    return DriveCapabilities(
         identity,
-        stands,
+        active,
         {
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
-        }.get(stands, settings.heartbeat_timeout_s),
+        }.get(active, settings.heartbeat_timeout_s),
         tuple(work.lacks),
         settings.set_objects,
     )
@@ -244,9 +244,9 @@ class _SetUp:
             return True
         try:
             self._sdo.configure(row.index, row.sub, wanted)
-        except NotKept as kept:
-            found = kept.got
-            why: DeviceError = kept
+        except ValueNotStored as not_stored:
+            found = not_stored.got
+            why: DeviceError = not_stored
         except SdoRefusal as refusal:
             if found is None and refusal.is_absent:
                 self._do_without(row)
@@ -254,8 +254,8 @@ class _SetUp:
             if found is None:
                 raise
             why = DeviceError(
-                f"{self._name}: object {row.place} ({row.name}) is {show_value(found)}, needed is "
-                f"{show_value(wanted)}, and it refuses to change it (abort code "
+                f"{self._name}: object {row.address} ({row.name}) is {show_value(found)}, needed "
+                f"is {show_value(wanted)}, and it refuses to change it (abort code "
                 f"0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
             )
         else:
@@ -287,16 +287,16 @@ class _SetUp:
             return
         if counts is None:
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
-        told_nm = counts * settings.rated_torque_unit_nm * settings.gear_ratio
+        reported_nm = counts * settings.rated_torque_unit_nm * settings.gear_ratio
         wanted_nm = rig.motor.rated_torque_nm
-        identity["rated_torque_nm"] = told_nm
-        if abs(told_nm - wanted_nm) > _RATED_TORQUE_TOLERANCE * wanted_nm:
+        identity["rated_torque_nm"] = reported_nm
+        if abs(reported_nm - wanted_nm) > _RATED_TORQUE_TOLERANCE * wanted_nm:
             raise DeviceError(
-                f"{self._name}: its rated torque (object 6076 = {counts}) is {told_nm:.4g} N·m at "
-                f"the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every torque "
-                "would be wrong by that ratio. Correct the profile or the drive."
+                f"{self._name}: its rated torque (object 6076 = {counts}) is {reported_nm:.4g} N·m "
+                f"at the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every "
+                "torque would be wrong by that ratio. Correct the profile or the drive."
             )
 
     def check_scales(self, identity: dict[str, object], rig: RigParameters) -> None:
@@ -326,9 +326,9 @@ class _SetUp:
         step_rad = rig.encoder.resolution_rad
         if not turns or any(_is_near(tau / turn, step_rad) for turn in turns):
             return
-        objects_told = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
+        gear_objects = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
         raise DeviceError(
-            f"{self._name}: its encoder step (object {objects_told}) is {tau / turns[0]:.4g} rad "
+            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turns[0]:.4g} rad "
             f"at the output shaft ({turns[0]:.6g} steps a turn), encoder.resolution_rad says "
             f"{step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
             f"{tau / turns[0] / step_rad:.3g}. Correct the profile or the drive."
@@ -364,7 +364,7 @@ class _SetUp:
         row = requirement(objects.MAX_SPEED_RPM)
         if not self.settle(row):
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
 
     def configure_sync(self) -> None:
@@ -396,30 +396,30 @@ class _SetUp:
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
         has_deadline = sdo.read_if_there(deadline.index, deadline.sub) is not None
-        stands = watchdog(
+        active = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
         row = requirement(objects.HEARTBEAT_CONSUMER, 1)
         if not heartbeat:
             self.lacks.append(row)
-        if stands is Watchdog.NONE and not self._accepts(row):
+        if active is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.missing()}")
-        if stands in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
+        if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.settle(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
         if not self.settle(row) and settings.communication_error_option:
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}), so that it goes "
+                f"{self._name}: it has no object {row.address} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
         self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
         if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
             self.settle(row)
-        return stands
+        return active
 
-    def configure_pdos(self, stands: Watchdog) -> None:
+    def configure_pdos(self, active: Watchdog) -> None:
         """Map one PDO each way and switch all others off."""
         settings, sdo = self._settings, self._sdo
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
@@ -440,10 +440,10 @@ class _SetUp:
             objects.RPDO_COMMUNICATION,
             0,
             objects.RPDO_ENTRIES,
-            {objects.EVENT_TIMER: deadline_ms} if stands is Watchdog.RPDO_DEADLINE else {},
+            {objects.EVENT_TIMER: deadline_ms} if active is Watchdog.RPDO_DEADLINE else {},
         )
 
-    def look_at_the_rest(self, identity: dict[str, object]) -> None:
+    def check_other_objects(self, identity: dict[str, object]) -> None:
         """Report what is only read."""
         for key, index in (
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
@@ -478,7 +478,8 @@ class _SetUp:
             self.settle(row, 0)
             return
         raise DeviceError(
-            f"{self._name}: object {row.place} ({row.name}) is 0x{found:02X}, not 0. {row.sentence}"
+            f"{self._name}: object {row.address} ({row.name}) is 0x{found:02X}, not 0. "
+            f"{row.sentence}"
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
@@ -561,7 +562,7 @@ class _SetUp:
                 if refusal.is_absent:
                     raise DeviceError(f"{self._name}: {row.missing()}") from None
                 raise DeviceError(
-                    f"{self._name}: it does not take object {row.place} ({row.name}) into {what} "
+                    f"{self._name}: it does not take object {row.address} ({row.name}) into {what} "
                     f"(abort code 0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
                 ) from None
         sdo.configure(mapping, 0, len(entries))

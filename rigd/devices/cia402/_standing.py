@@ -152,7 +152,7 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
             if not told:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
-                    sdo.tell_pre_operational()
+                    sdo.request_pre_operational()
                     told = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
@@ -168,9 +168,9 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
-            said = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
             raise DeviceError(
-                f"{said} It has not shown that it is off: keep clear of the beam, and press the "
+                f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
                 "wired stop (STO) if anything moves."
             ) from None
         if state_of(statusword) in OFF:

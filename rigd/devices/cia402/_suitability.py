@@ -33,7 +33,7 @@ class Grade(Enum):
     """Grade of what a file tells of one object."""
 
     FITS = "as needed"
-    STANDS_IN = "something else does its work"
+    SUBSTITUTED = "something else does its work"
     ASK = "the drive will be asked"
     ACCEPTED = "the profile accepts that it is missing"
     DOUBT = "a session can be run; somebody should look"
@@ -85,7 +85,7 @@ _COB_IDS: Final = (
     (objects.RPDO_COMMUNICATION, 1),
 )
 _NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
-_TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
+_REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
 def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
@@ -99,10 +99,10 @@ def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
         Parameters of a profile with a section ``cia402``, whose values are compared too; None: the
         drive alone is judged, and what a profile may accept counts as accepted.
     """
-    return Judgement(tuple(_Judge(eds, rig).findings()))
+    return Judgement(tuple(_SuitabilityCheck(eds, rig).findings()))
 
 
-class _Judge:
+class _SuitabilityCheck:
     def __init__(self, eds: Eds, rig: "RigParameters | None") -> None:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
@@ -115,7 +115,7 @@ class _Judge:
         yield self._torque_mode()
         yield self._watchdog()
         for needed in REQUIREMENTS:
-            if needed.index in _TOLD_BEFORE or needed.accept == WATCHDOG:
+            if needed.index in _REPORTED_ELSEWHERE or needed.accept == WATCHDOG:
                 continue
             entry = self._eds.get(needed.index, needed.sub)
             yield self._absent(needed) if entry is None else self._present(needed, entry)
@@ -161,32 +161,32 @@ class _Judge:
             "bit 9 (cyclic torque)",
         )
         modes = self._eds.get(objects.SUPPORTED_MODES)
-        place = f"object {objects.SUPPORTED_MODES:04X}"
+        address = f"object {objects.SUPPORTED_MODES:04X}"
         if modes is None:
-            sentence = f"No cyclic synchronous torque mode: {place} is missing."
+            sentence = f"No cyclic synchronous torque mode: {address} is missing."
             return Finding(what, "absent", wanted, Grade.REFUSED, sentence)
         if modes.default:
             shown = f"0x{modes.default:X}"
             if modes.default & objects.SUPPORTS_CYCLIC_TORQUE:
                 return Finding(what, shown, wanted, Grade.FITS)
             sentence = (
-                f"No cyclic synchronous torque mode: {place} = {shown} lacks bit 9; this drive or "
-                "its firmware cannot be used."
+                f"No cyclic synchronous torque mode: {address} = {shown} lacks bit 9; this drive "
+                "or its firmware cannot be used."
             )
             return Finding(what, shown, wanted, Grade.REFUSED, sentence)
         return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
 
     def _watchdog(self) -> Finding:
         """Judge which watchdog takes the torque off when this computer falls silent."""
-        found = self._stands()
+        found = self._expected_watchdog()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:
             return Finding(what, found.value, wanted, Grade.FITS)
         if found is not Watchdog.NONE:
-            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.STANDS_IN)
+            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.SUBSTITUTED)
         return self._to_accept(requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
 
-    def _stands(self) -> Watchdog:
+    def _expected_watchdog(self) -> Watchdog:
         heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
         deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         return watchdog(
@@ -196,19 +196,19 @@ class _Judge:
         )
 
     def _absent(self, needed: Requirement) -> Finding:
-        what = f"{needed.place} {needed.name}"
+        what = f"{needed.address} {needed.name}"
         if needed.core:
             return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
-        if needed.index == objects.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
+        if needed.index == objects.ABORT_OPTION and self._expected_watchdog() in _NOT_SET_BY_RIGD:
             found = "absent; in its place: the manufacturer's own watchdog"
-            return Finding(what, found, "", Grade.STANDS_IN)
+            return Finding(what, found, "", Grade.SUBSTITUTED)
         if needed.accept:
             return self._to_accept(needed, what, "absent", "")
         if self._is_set_by_profile(needed):
-            sentence = f"it has no object {needed.place} ({needed.name}). {needed.sentence}"
+            sentence = f"it has no object {needed.address} ({needed.name}). {needed.sentence}"
             return Finding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
         stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
-        return Finding(what, f"absent{stand_in}", "", Grade.STANDS_IN)
+        return Finding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
     def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
         """Judge what is missing unless the profile accepts that by name."""
@@ -234,14 +234,14 @@ class _Judge:
         }.get((needed.index, needed.sub), False)
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
-        what = f"{needed.place} {needed.name}"
+        what = f"{needed.address} {needed.name}"
         wanted = self._wanted.get((needed.index, needed.sub))
         asked = "" if wanted is None else _shown(needed, wanted)
         told = "" if entry.default is None else f", {_shown(needed, entry.default)}"
         found = f"{entry.access}{told}"
 
         def objection(text: str, *, doubt: bool = False) -> Finding:
-            sentence = _sentence(f"its object {needed.place} ({needed.name}) {text}")
+            sentence = _sentence(f"its object {needed.address} ({needed.name}) {text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
             return Finding(what, found, asked, grade, sentence)
 
@@ -269,7 +269,7 @@ class _Judge:
         self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
     ) -> Finding:
         """Judge an object that would be written and cannot be: what it holds may do."""
-        what = f"{needed.place} {needed.name}"
+        what = f"{needed.address} {needed.name}"
         if needed.fit is AllowedValue.AT_LEAST:
             asked = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
@@ -285,7 +285,7 @@ class _Judge:
             mapping = needed.index + 0x200
             if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
                 sentence = (
-                    f"its object {needed.place} ({needed.name}) is read-only, so that the PDO "
+                    f"its object {needed.address} ({needed.name}) is read-only, so that the PDO "
                     f"cannot be switched off to be remapped. {needed.sentence}"
                 )
                 return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
@@ -296,7 +296,7 @@ class _Judge:
         if does is None and needed.index != objects.CONTROLWORD:
             return Finding(what, f"{found}: the drive will be asked", asked, Grade.ASK)
         sentence = (
-            f"its object {needed.place} ({needed.name}) is read-only and does not hold what is "
+            f"its object {needed.address} ({needed.name}) is read-only and does not hold what is "
             f"needed{f' ({asked})' if asked else ''}. {needed.sentence}"
         )
         return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))

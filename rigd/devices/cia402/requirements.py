@@ -131,7 +131,7 @@ class Requirement:
     zero: bool = False
 
     @property
-    def place(self) -> str:
+    def address(self) -> str:
         """Index and sub-index as messages show them: ``6072`` or ``1016:1``."""
         return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
 
@@ -148,7 +148,7 @@ class Requirement:
         remedy = (
             f' To run without it: cia402.accept_without = ["{self.accept}"].' if self.accept else ""
         )
-        return f"it has no object {self.place} ({self.name}). {self.sentence}{remedy}"
+        return f"it has no object {self.address} ({self.name}). {self.sentence}{remedy}"
 
 
 _R, _W = ObjectAccess.READ, ObjectAccess.WRITE
@@ -518,7 +518,7 @@ MAY_BE_WRITE_ONLY: Final = (
 """Objects that are set whatever they held before, so that one that cannot be read is written and
 taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
 
-_BY_PLACE: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
+_BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 
 
 def requirement(index: int, sub: int = 0) -> Requirement:
@@ -534,7 +534,7 @@ def requirement(index: int, sub: int = 0) -> Requirement:
     KeyError
         If rigd asks nothing of it.
     """
-    return _BY_PLACE[index, sub]
+    return _BY_ADDRESS[index, sub]
 
 
 _ROUNDING = 1e-9

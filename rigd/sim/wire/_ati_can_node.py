@@ -103,8 +103,8 @@ class AtiCanNode:
                 "The profile has no section [ati_can], which the simulated sensor on CAN needs; "
                 "copy it from a profile that has one."
             )
-        tells_counts = firmware[:2] >= _FIRST_WITH_COUNTS
-        self.gauges = AtiGauges(rig.sensor, counts_per_unit if tells_counts else COUNTS_PER_UNIT)
+        reports_counts = firmware[:2] >= _FIRST_WITH_COUNTS
+        self.gauges = AtiGauges(rig.sensor, counts_per_unit if reports_counts else COUNTS_PER_UNIT)
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
@@ -130,7 +130,7 @@ class AtiCanNode:
             0xE: (1, self._set_baud),
             0xF: (0, self._read_firmware),
         }
-        if tells_counts:
+        if reports_counts:
             self._requests[0x7] = (0, self._read_counts_per_unit)
             self._requests[0x8] = (0, self._read_units)
         if firmware[:2] >= _FIRST_WITH_DIAGNOSTICS:

@@ -131,7 +131,7 @@ class AtiSerialDevice:
         self._unset = list(range(6))
         """Gauges whose gain or offset is not the calibration's."""
         self._partial = b""
-        self._heard = False
+        self._received = False
         self._silent_since_s = math.inf
         self._jam = 0
 
@@ -139,7 +139,7 @@ class AtiSerialDevice:
         """Take bytes from the line, cut anywhere; answers go out at once."""
         if self.frozen:
             return
-        self._heard = True
+        self._received = True
         received = self._partial + data
         while received and not self.streaming:
             request, rest = _next_request(received)
@@ -171,8 +171,8 @@ class AtiSerialDevice:
 
     def tick(self, now_s: float) -> None:
         """Forget an incomplete request when the line has been silent for long."""
-        if self._heard:
-            self._heard = False
+        if self._received:
+            self._received = False
             self._silent_since_s = now_s
         elif now_s - self._silent_since_s > _SILENCE_S:
             self._partial = b""

@@ -17,14 +17,14 @@ from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig, Stuck
 from rigd.sim.wire._faults import (
-    ENCOUNTERS,
+    DISTURBANCES,
     LINE_KINDS,
     SERIAL,
     EventLog,
     Fault,
     FaultError,
     FaultyLine,
-    encounter_of,
+    disturbance_of,
 )
 
 _MEMORY_SYNCS = 256
@@ -116,27 +116,27 @@ class LockStep:
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
         self._period_ns = period_ns
-        self._stands_until_ns = float(now_ns)
+        self._halted_until_ns = float(now_ns)
 
     @property
     def due_ns(self) -> int:
         """When a period passes without a SYNC."""
-        return round(self._stands_until_ns + self._period_ns)
+        return round(self._halted_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
         """Return how many periods pass with a SYNC: always one."""
-        self._stands_until_ns = now_ns + _PATIENCE_NS
+        self._halted_until_ns = now_ns + _PATIENCE_NS
         return 1
 
     def elapse(self, now_ns: int) -> int:
         """Return how many periods pass by the wall clock."""
-        passed = max(0, int((now_ns - self._stands_until_ns) / self._period_ns))
-        self._stands_until_ns += passed * self._period_ns
+        passed = max(0, int((now_ns - self._halted_until_ns) / self._period_ns))
+        self._halted_until_ns += passed * self._period_ns
         return passed
 
     def left_alone(self, now_ns: int) -> None:
         """End the waiting: no client is connected any more."""
-        self._stands_until_ns = min(self._stands_until_ns, now_ns)
+        self._halted_until_ns = min(self._halted_until_ns, now_ns)
 
 
 # Nodes and frames
@@ -487,9 +487,9 @@ class BusSimulation:
                 f"the bytes 0 to {_CAN_BYTES - 1}."
             )
 
-        if fault.kind in ENCOUNTERS:
+        if fault.kind in DISTURBANCES:
             try:
-                self._simulated.check(encounter_of(fault, 0.0))
+                self._simulated.check(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
@@ -526,12 +526,12 @@ class BusSimulation:
             self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
         elif fault.kind in _TRAITS:
             self._stand(fault, drive, _TRAITS[fault.kind], True)
-        elif fault.kind in ENCOUNTERS:
+        elif fault.kind in DISTURBANCES:
             now_s = self._simulated.plant.elapsed_s + (0.0 if self._lock_step else _READY_IN_S)
-            encounter = encounter_of(fault, now_s)
-            self._simulated.meet(encounter, wait=self._lock_step)
-            if isinstance(encounter, Obstacle):
-                self._obstacles.append((fault, encounter))
+            disturbance = disturbance_of(fault, now_s)
+            self._simulated.meet(disturbance, wait=self._lock_step)
+            if isinstance(disturbance, Obstacle):
+                self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
             self._end(values.get("fault"))
         else:

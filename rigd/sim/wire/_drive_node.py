@@ -606,17 +606,17 @@ class DriveNode:
         if state is PdsState.OPERATION_ENABLED:
             if self._following:
                 word |= 0 if self.never_follows else _FOLLOWS
-            elif self._own.controlword.value & _HALT and self._stands():
+            elif self._own.controlword.value & _HALT and self._is_at_rest():
                 word |= _STANDING
             if self._limited:
                 word |= _INTERNAL_LIMIT
-        elif state is PdsState.QUICK_STOP and self._stands():
+        elif state is PdsState.QUICK_STOP and self._is_at_rest():
             word |= _STANDING
         if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             word |= _WARNING
         return word
 
-    def _stands(self) -> bool:
+    def _is_at_rest(self) -> bool:
         """Whether the shaft turns by less than a count a second."""
         return abs(self._plant.velocity_rad_s) < self._resolution_rad
 
@@ -627,8 +627,8 @@ class DriveNode:
 
     def _measure_torque(self) -> None:
         elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
-        share = -math.expm1(-elapsed_s / self.torque_lag_s)
-        self._measured_per_mille += share * (self._per_mille - self._measured_per_mille)
+        fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
+        self._measured_per_mille += fraction * (self._per_mille - self._measured_per_mille)
 
     def _actual_torque(self) -> int:
         return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille

@@ -197,7 +197,7 @@ _SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
 _IDENTITY = 0x1018
 _IN_SERVICE = (0x6076, 0x608F, 0x6091)
 """Set when a drive is commissioned for its motor: no file contains it."""
-_NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
+_ZERO_MEANS_UNKNOWN = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 
 _ENCODER_TURNS, _MOST_TURNS = 1000, 1000
@@ -366,8 +366,8 @@ def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
     own = set(_IN_SERVICE)
     own |= {
         index
-        for index in (*_NOT_TOLD_BY_ZERO, _SUPPORTED_INDEX)
-        if (said := file.entries.get((index, 0))) is not None and not said.default
+        for index in (*_ZERO_MEANS_UNKNOWN, _SUPPORTED_INDEX)
+        if (described := file.entries.get((index, 0))) is not None and not described.default
     }
     if not any(file.entries[key].default for key in file.entries if key[0] == _IDENTITY and key[1]):
         own.add(_IDENTITY)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rigd.devices.contracts import DeviceError
-from rigd.devices.obstacles import Encounter, ObstacleError, parse_obstacle
+from rigd.devices.obstacles import Disturbance, ObstacleError, parse_obstacle
 from rigd.errors import UserError
 
 
@@ -123,7 +123,7 @@ KINDS: dict[str, dict[str, _FaultKey]] = {
 _MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
-ENCOUNTERS = ("obstacle", "knock")
+DISTURBANCES = ("obstacle", "knock")
 """Kinds that the beam meets; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
@@ -139,7 +139,7 @@ class Fault:
     """Time after the drive was first enabled; None: at once."""
 
     @property
-    def stands(self) -> bool:
+    def is_persistent(self) -> bool:
         """Whether it lasts until it is ended, neither by a time nor by a number of frames."""
         return self.kind in LASTING and self.kind not in LINE_KINDS and "for" not in self.values
 
@@ -188,21 +188,21 @@ def parse_fault(spec: str) -> Fault:
         if key_of.default is not None and not (name == "frames" and "bytes" in values):
             values.setdefault(name, key_of.default)
     fault = Fault(kind, values, _time(spec, time) if at else None)
-    if kind in ENCOUNTERS:
+    if kind in DISTURBANCES:
         try:
-            encounter_of(fault, 0.0)
+            disturbance_of(fault, 0.0)
         except ObstacleError as error:
             raise FaultError(_complaint(spec, str(error).partition(": ")[2].rstrip("."))) from None
     return fault
 
 
-def encounter_of(fault: Fault, now_s: float) -> Encounter:
+def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     """Return the obstacle or knock that a fault puts in the beam's way from now on.
 
     Parameters
     ----------
     fault
-        One of the `ENCOUNTERS`.
+        One of the `DISTURBANCES`.
     now_s
         Time since the drive was first enabled.
     """
@@ -384,9 +384,9 @@ class EventLog:
             # States and faults must be in the file even if the process is killed.
             self._write_out()
             details = "  ".join(f"{key} {value}" for key, value in values.items())
-            self.tell(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
+            self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
 
-    def tell(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         """Tell the operator; a terminal that has gone is none of our business."""
         if not self._quiet:
             with suppress(OSError, ValueError):
@@ -423,7 +423,7 @@ class EventLog:
             action(self._file)
         except OSError as error:
             self.close()
-            self.tell(f"The log cannot be written any more ({error.strerror}).")
+            self.print_line(f"The log cannot be written any more ({error.strerror}).")
 
 
 def _new_file(path: Path) -> TextIO:

@@ -413,7 +413,7 @@ class PtyLine:
                 sent = os.write(self._ours, data)
             self.lost += len(data) - sent
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Find out whether the host has opened the port meanwhile."""
         if not self._open and self._ours >= 0:
             self._receive()

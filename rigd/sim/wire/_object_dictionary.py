@@ -131,7 +131,7 @@ class Entry:
         self.default_text = self.text
         self._set_range(self.low, self.high)
 
-    def become(self, said: Description, default: int | None) -> None:
+    def become(self, described: Description, default: int | None) -> None:
         """Take type, access, mapping and limits that a file states; the meaning stays.
 
         Parameters
@@ -141,12 +141,12 @@ class Entry:
         default
             Value at power-on from now on; None leaves it as it is.
         """
-        if self.live is not None and said.kind != self.kind:
-            self.live = partial(_within, self.live, *_range_of(said.kind))
-        self.kind, self.access, self.mapping = said.kind, said.access, said.mapping
+        if self.live is not None and described.kind != self.kind:
+            self.live = partial(_within, self.live, *_range_of(described.kind))
+        self.kind, self.access, self.mapping = described.kind, described.access, described.mapping
         # What the drive here can do bounds it as well.
-        low = max((x for x in (self.low, said.low) if x is not None), default=None)
-        high = min((x for x in (self.high, said.high) if x is not None), default=None)
+        low = max((x for x in (self.low, described.low) if x is not None), default=None)
+        high = min((x for x in (self.high, described.high) if x is not None), default=None)
         self._set_range(low, high)
         if default is not None:
             self.default = default
@@ -266,12 +266,12 @@ class ObjectDictionary:
         """
         before, self._entries = self._entries, {}
         self._indices.clear()
-        for (index, sub), said in file.items():
+        for (index, sub), described in file.items():
             entry = before.get((index, sub))
-            if entry is None or "s" in (entry.kind, said.kind):
-                entry = said.entry()
+            if entry is None or "s" in (entry.kind, described.kind):
+                entry = described.entry()
             else:
-                entry.become(said, None if index in own else said.default)
+                entry.become(described, None if index in own else described.default)
             self.add(index, entry, sub)
 
     def override(self, index: int, sub: int, value: int | None) -> None:
@@ -535,16 +535,16 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
         key: _described(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
     }
     for sub, number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
-        said = entries.get((_IDENTITY, sub))
-        if said is not None and not said.default:
-            entries[_IDENTITY, sub] = replace(said, default=number)
+        described = entries.get((_IDENTITY, sub))
+        if described is not None and not described.default:
+            entries[_IDENTITY, sub] = replace(described, default=number)
     highest: dict[int, int] = {}
     for index, sub in entries:
         highest[index] = max(sub, highest.get(index, 0))
     for index, last in highest.items():
-        said = entries.get((index, 0))
-        if last and said is not None and said.default is None and said.kind == "B":
-            entries[index, 0] = replace(said, default=last)
+        described = entries.get((index, 0))
+        if last and described is not None and described.default is None and described.kind == "B":
+            entries[index, 0] = replace(described, default=last)
     return DeviceFile(path.name, entries)
 
 

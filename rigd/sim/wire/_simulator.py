@@ -311,7 +311,7 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     for fault, spec in zip(faults, specs, strict=True):
         injected = str(ask_simulator(address, {"inject": spec})["injected"])
         end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
-        lines.append(f"{injected}; it lasts until: {end}" if fault.stands else injected)
+        lines.append(f"{injected}; it lasts until: {end}" if fault.is_persistent else injected)
     return lines
 
 
@@ -378,7 +378,7 @@ class _Process:
             **started,
         )
         for line in self._invitation():
-            self._log.tell(line)
+            self._log.print_line(line)
         announce(self._rig.name, self._address)
         self._stack.callback(forget, self._rig.name)
         # Set-up leaves objects that never go: no need to look through them again and again.
@@ -396,7 +396,7 @@ class _Process:
         """Serve until a stop is asked for."""
         handlers, world, line, log = self._handlers, self._world, self._line, self._log
         now_ns = time.monotonic_ns
-        look_ns = 0
+        poll_ns = 0
         while not stop():
             ready, _, _ = select.select(handlers, (), (), world.wait_s(now_ns(), _IDLE_S))
             for descriptor in ready:
@@ -405,11 +405,11 @@ class _Process:
                     handler()
             now = now_ns()
             world.elapse(now)
-            if now > look_ns:
-                look_ns = now + round(_IDLE_S * 1e9)
+            if now > poll_ns:
+                poll_ns = now + round(_IDLE_S * 1e9)
                 log.flush()
                 if line is not None:
-                    line.look()
+                    line.poll()
         self._log("simulator", "ended")
 
     def _make_world(self) -> BusSimulation:

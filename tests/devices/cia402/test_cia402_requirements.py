@@ -24,14 +24,14 @@ def test_each_object_stands_there_once():
 def test_what_is_core_is_refused_and_says_why():
     for each in CORE:
         assert each.core
-        assert each.place in each.missing(ACCEPTABLE)
+        assert each.address in each.missing(ACCEPTABLE)
         assert each.sentence.endswith(".")
 
 
 def test_what_is_optional_has_a_stand_in_or_has_to_be_accepted_by_name():
     for each in OPTIONAL:
         assert not each.core
-        assert each.stand_in or each.accept, each.place
+        assert each.stand_in or each.accept, each.address
         assert each.accept in ("", *ACCEPTABLE)
         assert each.missing(ACCEPTABLE) == ""
         assert bool(each.missing()) == bool(each.accept)
