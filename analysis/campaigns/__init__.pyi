@@ -6,9 +6,9 @@ from ._campaign import campaign as campaign
 from ._estimates import RecordEstimate as RecordEstimate
 from ._estimates import WelchFit as WelchFit
 from ._experiment import CampaignError as CampaignError
-from ._experiment import LoneSessionError as LoneSessionError
+from ._experiment import SingleSessionError as SingleSessionError
+from ._experiment import fact_text as fact_text
 from ._experiment import in_dispute as in_dispute
-from ._experiment import told as told
 from ._headlines import campaign_numbers as campaign_numbers
 from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity

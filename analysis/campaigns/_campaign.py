@@ -10,10 +10,10 @@ import numpy as np
 
 from analysis.campaigns._experiment import (
     CampaignError,
+    distinct_names,
     labelled,
     most_common,
     stated_specimens,
-    told_apart,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
@@ -244,7 +244,7 @@ def campaign_result(
     lost : sequence of LostTrial, optional
         Sessions that were to be predicted and were not.
     """
-    names = told_apart([*(each.path for each in sessions), *(each.path for each in failures)])
+    names = distinct_names([*(each.path for each in sessions), *(each.path for each in failures)])
     sessions = [replace(each, name=name) for each, name in zip(sessions, names, strict=False)]
     failures = [
         replace(each, name=name)

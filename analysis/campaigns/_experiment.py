@@ -23,7 +23,7 @@ class CampaignError(ValueError):
     """A campaign that cannot be analysed; the message says why and what to do."""
 
 
-class LoneSessionError(CampaignError):
+class SingleSessionError(CampaignError):
     """A campaign of whose files one alone can be used.
 
     Parameters
@@ -164,7 +164,7 @@ class Experiment:
         for key, mine in self.facts.items():
             theirs = mine if planned and key in _STATED else stated.get(key, mine)
             if not _same(theirs, mine):
-                return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
+                return f"{key} is {fact_text(key, theirs)}, but {fact_text(key, mine)}"
         return None
 
     @property
@@ -185,7 +185,7 @@ class Experiment:
         )
 
 
-def told_apart(paths: Sequence[Path]) -> list[str]:
+def distinct_names(paths: Sequence[Path]) -> list[str]:
     """Name files by as much of the end of each path as no other has.
 
     Parameters
@@ -275,9 +275,9 @@ def most_common(experiments: Sequence[Experiment]) -> int:
 
     A search agrees with any excitation, so it says of none that it is the common one.
     """
-    places = [i for i, each in enumerate(experiments) if not each.searched]
+    indices = [i for i, each in enumerate(experiments) if not each.searched]
     return max(
-        places or range(len(experiments)),
+        indices or range(len(experiments)),
         key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
     )
 
@@ -288,7 +288,7 @@ def _same(one: str | float, two: str | float) -> bool:
     return math.isclose(one, two, rel_tol=1e-9)
 
 
-def told(key: str, value: str | float) -> str:
+def fact_text(key: str, value: str | float) -> str:
     """Write a fact with its unit.
 
     Parameters

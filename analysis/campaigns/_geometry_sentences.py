@@ -38,21 +38,21 @@ def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
     if len(modal.stated) > 1:
         every = listed([f"{100 * each:g}" for each in modal.stated])
         given = f"{100 * stated:g} %, the largest of the {every} % that the files state"
-    said = (
+    sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
         f"{modal.sessions} sessions"
     )
     if estimate.basis != "geometry":
         return (
-            f"{said}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
+            f"{sentence}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
             f"beam to {given}, nor with a wider tolerance."
         )
     used = given
     if estimate.uniformity > stated:
         used = f"{100 * estimate.uniformity:g} % ({given} does not suffice)"
     return (
-        f"{said}; each mode lies where that of a uniform beam does, to {used}. An unevenness of "
-        "the specimen is common to all sessions and does not average out."
+        f"{sentence}; each mode lies where that of a uniform beam does, to {used}. An unevenness "
+        "of the specimen is common to all sessions and does not average out."
     )
 
 
@@ -75,10 +75,10 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
             f"{found.reason}. {alone}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
-    said = slope_of_loss(
+    sentence = slope_of_loss(
         found.order, found.value, found.interval, shown_hz, estimate, found.status, found.reason
     )
-    return f"{said} {alone}"
+    return f"{sentence} {alone}"
 
 
 def if_exact(
@@ -90,7 +90,7 @@ def if_exact(
     """
     if modal is None or modal.uniform_beam.status == "refused":
         return []
-    said = []
+    orders_shown = []
     for each in orders:
         exact = each.exact
         if exact is None or exact.reason or exact.value is None or exact.interval is None:
@@ -102,9 +102,11 @@ def if_exact(
             "fractional": "which would exclude 1",
             "open": "1 would be doubtful",
         }
-        said.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
+        orders_shown.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
     return (
-        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(said)}."] if said else []
+        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(orders_shown)}."]
+        if orders_shown
+        else []
     )
 
 

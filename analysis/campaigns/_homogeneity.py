@@ -186,12 +186,12 @@ def _of_modes(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple
     """Yield frequencies and damping ratios of the modes that all sessions have."""
     count = min((len(each.modes) for _, each in estimates), default=0)
     for quantity, std in _OF_MODES.items():
-        for place in range(count):
+        for index in range(count):
             values = (
-                (file, getattr(each.modes[place], quantity), getattr(each.modes[place], std))
+                (file, getattr(each.modes[index], quantity), getattr(each.modes[index], std))
                 for file, each in estimates
             )
-            yield f"{quantity}_{place + 1}", _known(values)
+            yield f"{quantity}_{index + 1}", _known(values)
 
 
 def _of_parameters(
@@ -231,7 +231,7 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
         cochran_q=q,
         chance=chance,
         mixed=significant and (bool(apart) or q * (1 - _LARGE) >= len(values) - 1),
-        groups=tuple(tuple(values[place][0] for place in sorted(part)) for part in apart),
+        groups=tuple(tuple(values[index][0] for index in sorted(part)) for part in apart),
     )
 
 

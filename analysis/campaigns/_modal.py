@@ -251,8 +251,8 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     phases = difference[_PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]  # a view
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
     found = []
-    for place, mode in enumerate(modes):
-        rows = slice(len(CONSTANTS) * place, len(CONSTANTS) * (place + 1))
+    for index, mode in enumerate(modes):
+        rows = slice(len(CONSTANTS) * index, len(CONSTANTS) * (index + 1))
         off, spread = difference[rows], covariance[rows, rows]
         chance = float(chi_square_p_value(off @ np.linalg.solve(spread, off), len(CONSTANTS)))
         std = np.sqrt(np.diag(spread))

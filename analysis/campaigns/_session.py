@@ -49,7 +49,7 @@ class SessionFailure:
     experiment: Experiment | None = None
     """Specimen and rig, None if nothing is known of them."""
     name: str = ""
-    """What tables call it: see `told_apart`; by itself the name of its file."""
+    """What tables call it: see `distinct_names`; by itself the name of its file."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
@@ -90,7 +90,7 @@ class SessionAnalysis:
     record_band_hz : tuple of float
         Band of the whole-record fits.
     name : str
-        What tables and sentences call it: see `told_apart`; by itself the name of its file.
+        What tables and sentences call it: see `distinct_names`; by itself the name of its file.
     digests : frozenset of bytes
         Digests of its samples: see `rigd.session.sample_digests`.
     validity : Validity
@@ -272,7 +272,7 @@ def _estimates(
     omega = 2 * np.pi * measured.frequency_hz
     grid = ResponseGrid(1j * omega)
 
-    def kept(candidate: Candidate) -> RecordEstimate:
+    def estimate_of(candidate: Candidate) -> RecordEstimate:
         # The measured response is free of the delay that the file states.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
@@ -282,9 +282,9 @@ def _estimates(
         return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
 
     order = list(STRUCTURES)
-    asked = [
-        kept(each)
+    requested = [
+        estimate_of(each)
         for each in whole.selection.candidates
         if each.fit.structure.name in structures or each.fit is whole.fit
     ]
-    return tuple(sorted(asked, key=lambda each: order.index(each.structure)))
+    return tuple(sorted(requested, key=lambda each: order.index(each.structure)))

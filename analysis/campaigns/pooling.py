@@ -385,8 +385,8 @@ def _coordinate(name: str, value: float) -> float:
 
 
 def _block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
-    places = [estimate.determined.index(name) for name in names]
-    return estimate.covariance[np.ix_(places, places)]
+    indices = [estimate.determined.index(name) for name in names]
+    return estimate.covariance[np.ix_(indices, indices)]
 
 
 def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import in_dispute, told
+from analysis.campaigns._experiment import fact_text, in_dispute
 from analysis.campaigns._statistics import BEST
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
 from analysis.identify import LOSSES
@@ -81,7 +81,7 @@ def probability(chance: float) -> str:
     return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
 
 
-def percent(share: float) -> str:
+def percent(fraction: float) -> str:
     """Write a share that may be next to 1, but is not 1.
 
     Examples
@@ -90,7 +90,7 @@ def percent(share: float) -> str:
     >>> percent(0.4321), percent(0.99999)
     ('43.2 %', '> 99.9 %')
     """
-    return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
+    return "> 99.9 %" if fraction > 0.999 else f"{100 * fraction:.3g} %"
 
 
 # One specimen or several
@@ -108,9 +108,9 @@ _SLIGHT: Final = 2e-3
 
 def specimens(found: Homogeneity) -> list[str]:
     """Say first that sessions are not of one specimen; nothing if they are."""
-    said = _stated(found.specimens) if len(found.specimens) > 1 else []
+    stated = _stated(found.specimens) if len(found.specimens) > 1 else []
     leading = found.leading
-    return said if leading is None else [*said, *_differing(found, leading)]
+    return stated if leading is None else [*stated, *_differing(found, leading)]
 
 
 def title(text: str, found: Homogeneity) -> str:
@@ -129,11 +129,11 @@ def title(text: str, found: Homogeneity) -> str:
 def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
     keys = in_dispute(found)
     each = "; ".join(
-        f"{', '.join(f'{key} {told(key, one.facts[key])}' for key in keys if key in one.facts)} "
-        f"in {_files(one.files)}"
+        ", ".join(f"{key} {fact_text(key, one.facts[key])}" for key in keys if key in one.facts)
+        + f" in {_files(one.files)}"
         for one in found
     )
-    first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)
+    first = ", ".join(f"{key} {fact_text(key, found[0].facts[key])}" for key in keys)
     return [
         f"The files state {len(found)} different specimens: {each}. Specimens are never "
         f"pooled: all results below are for {first}. Analyse the files of the others separately, "
@@ -172,11 +172,11 @@ def _scatter(each: Heterogeneity) -> str:
     """Say by how much one quantity scatters, of its own uncertainty and of its size."""
     percents = percent(each.i_squared)
     equals = "" if percents.startswith(">") else "= "
-    size = _told([each.between_std], each)
-    share = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
+    size = _rounded([each.between_std], each)
+    scatter = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
     return (
         f"{label(each.quantity)[0]} varies between sessions by {each.own_stds:.3g} of its own "
-        f"standard deviations ({share}Cochran's Q = {each.cochran_q:.3g} where "
+        f"standard deviations ({scatter}Cochran's Q = {each.cochran_q:.3g} where "
         f"{each.degrees_of_freedom} is expected, I² {equals}{percents})"
     )
 
@@ -187,14 +187,14 @@ def _where(each: Heterogeneity) -> str:
     values = {file: (value, std) for file, value, std in each.values}
     if each.groups:
         parts = "; ".join(
-            f"{_told([values[file][0] for file in part], each)} in {_files(part)}"
+            f"{_rounded([values[file][0] for file in part], each)} in {_files(part)}"
             for part in each.groups
         )
         return f"By the {name} they are {len(each.groups)} groups: {parts}."
     low, high = _ends(each.values)
     return (
-        f"There are no clear groups: the {name} goes from {_told([low[1]], each)} in {low[0]} to "
-        f"{_told([high[1]], each)} in {high[0]}."
+        f"There are no clear groups: the {name} goes from {_rounded([low[1]], each)} in {low[0]} "
+        f"to {_rounded([high[1]], each)} in {high[0]}."
     )
 
 
@@ -203,7 +203,7 @@ def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, f
     return ordered[0], ordered[-1]
 
 
-def _told(values: Sequence[float], each: Heterogeneity) -> str:
+def _rounded(values: Sequence[float], each: Heterogeneity) -> str:
     """Write a mean with the digits that tell it from the others."""
     _, factor, unit = label(each.quantity)
     digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
@@ -248,19 +248,19 @@ def answer(
     """
     joint = " and " if alpha.exact is None else "; "
     dampings = f"{_answered(alpha)}{joint}{_answered(lambda_)}"
-    said = f"{dampings[0].upper()}{dampings[1:]}."
+    sentence = f"{dampings[0].upper()}{dampings[1:]}."
     errors: dict[str, list[str]] = {}
     for name in dict.fromkeys((_CLASSICAL, freest.name)):
         its = [e.error for e in validation if e.method == "record" and e.name == name]
         if its:
             errors.setdefault(f"{100 * float(np.mean(its)):.2g} %", []).append(name)
     if not errors:
-        return said
+        return sentence
     each = ", ".join(
         f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error}"
         for error, names in errors.items()
     )
-    return f"{said} Error of the torque predicted for an unseen session: {each}."
+    return f"{sentence} Error of the torque predicted for an unseen session: {each}."
 
 
 def _answered(found: PooledOrder) -> str:
@@ -293,12 +293,12 @@ def _effective(found: PooledOrder) -> str:
         return f"{loss} with a slope that is not established"
     half = (found.interval[1] - found.interval[0]) / 2
     number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
-    said = {
+    conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss} growing as f^({number}), {said[found.status]}"
+    return f"{loss} growing as f^({number}), {conclusion[found.status]}"
 
 
 def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
@@ -317,31 +317,31 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
         if given
         else ", so its intervals hold for any simpler one, too."
     )
-    said = (
+    sentence = (
         f"The numbers are those of type {freest.name}: {_damping(freest.structure)}. "
         f"It is the freest structure that the sessions determine{so}"
     )
     if best.name != freest.name:
-        said += (
+        sentence += (
             f" Type {best.name} has the lowest BIC ({_damping(best.structure)}); "
             "its intervals are narrower, and valid only if it is true."
         )
-    return said
+    return sentence
 
 
 def sizes(found: Sequence[Size]) -> list[str]:
     """Say how large each damping is where it depends least on its order."""
-    said = []
+    factors = []
     for each in found:
         if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
             continue
         value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
         flag = f", {each.size.flag}" if each.size.flag else ""
-        said.append(
+        factors.append(
             f"{each.damping} {value} (95 %: {low} to {high}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{flag}"
         )
-    return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
+    return [f"Loss factors at the pivot frequencies: {'; '.join(factors)}."] if factors else []
 
 
 def selected(
@@ -364,18 +364,18 @@ def selected(
         Number of sessions.
     """
     best = ranked[0]
-    said = f"Lowest BIC: type {best.name}."
+    sentence = f"Lowest BIC: type {best.name}."
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
-        said += (
+        sentence += (
             f" All sessions together do not distinguish it from {names} (ΔBIC "
             f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
-        said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
+        sentence += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
     selections = {f"type {name}": count for name, count in alone.items()}
-    return f"{said} {in_single_sessions(selections, sessions)}"
+    return f"{sentence} {in_single_sessions(selections, sessions)}"
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
@@ -431,9 +431,9 @@ def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[st
     if not found:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    said = "; ".join(_mode(each, t) for each in found)
+    modes = "; ".join(_mode(each, t) for each in found)
     of = "the sessions, a mixture" if mixed else "the sessions"
-    return [f"Modes: {said} (± 95 % of the mean over {of})."]
+    return [f"Modes: {modes} (± 95 % of the mean over {of})."]
 
 
 def order(found: PooledOrder) -> str:
@@ -456,12 +456,12 @@ def order(found: PooledOrder) -> str:
     if found.reason is not None:
         would = is_.replace(" is ", " would be ", 1)
         return f"{would}, but {found.reason}; do not interpret it.{alone}"
-    said = {
+    conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{is_}: {said[found.status]}.{alone}"
+    return f"{is_}: {conclusion[found.status]}.{alone}"
 
 
 def welch_bias(
@@ -488,23 +488,23 @@ def welch_bias(
     of_type = [each for each in biases if each.structure == freest.name]
     best = [each for each in of_type if (each.structure, each.weighting) in BEST]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
-    said = []
+    sentences = []
     for each in best or of_type[:1]:
         found = [one for one in each.significant if one.parameter not in left_out]
         if not found:
             continue
-        said.append(
+        sentences.append(
             f"Welch's {'; '.join(map(_biased, found))} (type {each.structure}, weights "
             f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
         if each.wmse < each.record_wmse:
-            said.append(
+            sentences.append(
                 f"The lower WMSE of the Welch fits ({each.wmse:.3g} against "
                 f"{each.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
                 "from Welch's response, which has the same bias."
             )
-    return said
+    return sentences
 
 
 def _biased(each: ParameterBias) -> str:
@@ -593,7 +593,7 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
     ]
 
 
-def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
+def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
     """Account for the sessions that were to be predicted and were not.
 
     Parameters
@@ -608,8 +608,8 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
     each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
     more = f"; and {len(lost) - _MANY} more" if len(lost) > _MANY else ""
     return [
-        f"Of {asked} sessions to be predicted from the others, {asked - len(lost)} "
-        f"{'was' if asked - len(lost) == 1 else 'were'} and {len(lost)} "
+        f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
+        f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
         f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Prediction errors are averaged "
         "over those predicted."
     ]

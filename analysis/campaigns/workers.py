@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-_LOOK_S: Final = 2.0
+_POLL_S: Final = 2.0
 """How often is looked whether there are workers at all."""
 
 _HOPELESS: Final = 2
@@ -128,7 +128,7 @@ class Workers:
 
         waiting = deque(range(len(arguments)))
         while waiting:
-            with self._telling():
+            with self._explaining():
                 suspects = self._try(waiting, submit, done)
                 for number in suspects:
                     self._renew(alone=True)
@@ -160,7 +160,7 @@ class Workers:
                         self._renew()
                     break
                 waiting.popleft()
-            for future in wait(under_way, _LOOK_S, FIRST_COMPLETED).done:
+            for future in wait(under_way, _POLL_S, FIRST_COMPLETED).done:
                 number = under_way.pop(future)
                 try:
                     result = future.result()
@@ -174,7 +174,7 @@ class Workers:
     def _renew(self, *, alone: bool = False) -> None:
         """Start processes in the place of those that ended, or one for one task."""
 
-    def _telling(self) -> AbstractContextManager[None]:
+    def _explaining(self) -> AbstractContextManager[None]:
         """Tell as a `CampaignError` what else says that there are no workers any more."""
         return nullcontext()
 
@@ -335,7 +335,7 @@ class _DaskWorkers(Workers):
         self._died = _distributed().KilledWorker
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _explaining(self) -> Iterator[None]:
         try:
             yield
         except CampaignError:

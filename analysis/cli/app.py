@@ -36,7 +36,7 @@ from rigd.runtime import raise_on, use_one_thread
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns import LoneSessionError
+    from analysis.campaigns import SingleSessionError
     from analysis.identify import Setting
     from analysis.results import FigureFormat
 
@@ -72,7 +72,7 @@ class DefaultCommandGroup(TyperGroup):
             return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
-class CommandBesideOthers(TyperCommand):
+class CommandWithOthers(TyperCommand):
     """The default command: its help names the others, which the group itself never shows."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -82,15 +82,17 @@ class CommandBesideOthers(TyperCommand):
             formatter.write_dl([*_COMMANDS.items()])
 
 
-def _tell(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"analyze {rigd.__version__}")
         raise typer.Exit
 
 
 Version = Annotated[
     bool,
-    typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
+    typer.Option(
+        "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+    ),
 ]
 
 
@@ -166,7 +168,7 @@ def _quieten_libraries() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT, epilog=_EPILOG, cls=CommandBesideOthers)
+@app.command(DEFAULT, epilog=_EPILOG, cls=CommandWithOthers)
 def analyze(
     context: typer.Context,
     files: Annotated[
@@ -320,7 +322,7 @@ def analyze(
         if not is_campaign:
             code = session_command(files, routes, outputs, rerun)
         else:
-            from analysis.campaigns import CampaignError, LoneSessionError
+            from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
 
@@ -331,8 +333,8 @@ def analyze(
                     fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
                     uniformity=routes.uniformity, with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
-            except LoneSessionError as lone:
-                code = _lone_session(lone, routes, outputs)
+            except SingleSessionError as single:
+                code = _report_single_session(single, routes, outputs)
             except CampaignError as error:
                 complain(str(error))
                 code = 1
@@ -378,13 +380,13 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
         )
 
 
-def _lone_session(lone: LoneSessionError, routes: Routes, outputs: Outputs) -> int:
+def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
     """Tell what is wrong with the other files of a campaign, and report the one that is left."""
-    for failure in lone.failures:
+    for failure in single.failures:
         complain(failure.message)
-    typer.echo(f"A campaign needs two sessions: {lone.path} is reported alone.", err=True)
-    others = {str(failure.path): failure.message for failure in lone.failures}
-    return max(1, session_command([lone.path], routes, outputs, others=others))
+    typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)
+    others = {str(failure.path): failure.message for failure in single.failures}
+    return max(1, session_command([single.path], routes, outputs, others=others))
 
 
 def _fixed(text: str) -> tuple[Setting, ...]:

@@ -116,7 +116,7 @@ def _analysed(
     formats: Sequence[FigureFormat],
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
-    from analysis.campaigns import LoneSessionError
+    from analysis.campaigns import SingleSessionError
     from analysis.report.campaign_report import write_campaign
     from analysis.report.folder import new_folder
     from rigd.printable import progress_bar
@@ -130,14 +130,14 @@ def _analysed(
         with new_folder(folder, overwrite=outputs.overwrite) as part:
             found = run(on_progress=on_progress)
             if len(found.sessions) == 1:
-                raise LoneSessionError(found.sessions[0].path, found.failures)
+                raise SingleSessionError(found.sessions[0].path, found.failures)
             write_campaign(
                 found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
-    tell = partial(print_readable, progress.console)
+    report_error = partial(print_readable, progress.console)
     for failure in found.failures:
-        tell(f"Error: {failure.message}")
+        report_error(f"Error: {failure.message}")
     for lost in found.lost_trials:
-        tell(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
+        report_error(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
     return found

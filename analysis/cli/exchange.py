@@ -247,10 +247,10 @@ def export_frf_command(
     from analysis.exchange import export_frf
 
     settings = welch_settings("I", "const", frf, segment, overlap, nfft)
-    asked_hz = band_hz(band)
+    requested_hz = band_hz(band)
 
     def run() -> None:
-        table = export_frf(session, target, settings, asked_hz, binary=binary)
+        table = export_frf(session, target, settings, requested_hz, binary=binary)
         typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
 
     raise typer.Exit(_explained(run))

@@ -186,7 +186,7 @@ def _analyse_all(
     errors: dict[str, str] = {}
     code = 0
     with progress_bar() as progress:
-        tell = partial(print_readable, progress.console)
+        print_message = partial(print_readable, progress.console)
         steps = _steps(routes, rerun)
         task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
@@ -198,7 +198,13 @@ def _analyse_all(
             try:
                 found.append(
                     _analyse_file(
-                        file, folder, routes, rerun, on_step, tell, overwrite=outputs.overwrite
+                        file,
+                        folder,
+                        routes,
+                        rerun,
+                        on_step,
+                        print_message,
+                        overwrite=outputs.overwrite,
                     )
                 )
             except (
@@ -206,13 +212,13 @@ def _analyse_all(
                 MemoryError, LinAlgError,
             ) as error:  # fmt: skip
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
-                errors[str(file)] = message = _told(file, error)
+                errors[str(file)] = message = _error_message(file, error)
                 progress.update(task, completed=number * steps)
-                tell(f"Error: {message}")
+                print_message(f"Error: {message}")
     return found, errors, code
 
 
-def _told(file: Path, error: Exception) -> str:
+def _error_message(file: Path, error: Exception) -> str:
     from numpy.linalg import LinAlgError
 
     if isinstance(error, MemoryError):
@@ -238,7 +244,7 @@ def _analyse_file(
     routes: Routes,
     rerun: Path | None,
     on_step: Callable[[str], None],
-    tell: Callable[[str], None],
+    print_message: Callable[[str], None],
     *,
     overwrite: bool,
 ) -> RecordResult:
@@ -248,7 +254,7 @@ def _analyse_file(
 
     result = record_result(
         file, routes, on_step=on_step,
-        warn=lambda text: tell(f"Warning: {text}"),
+        warn=lambda text: print_message(f"Warning: {text}"),
     )  # fmt: skip
     with new_folder(folder, overwrite=overwrite) as part:
         write_report(result, part, on_step, formats=routes.figures)

@@ -51,7 +51,7 @@ _JITTER_SHOWN: Final = 0.01
 """Shift between channels, in periods, below which it is not worth a warning."""
 
 
-def place_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
+def time_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
     """Place the samples in time, by the channel of times or by the rate stated."""
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
@@ -99,20 +99,20 @@ class FileStatements:
         """
         for choice in self.plan.choices:
             label = channels[choice.channel].unit_label.strip()
-            said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
-            if said is not None and said != choice.unit:
+            stated_unit = canonical_unit(label) if label else unit_in_brackets(choice.channel)
+            if stated_unit is not None and stated_unit != choice.unit:
                 self.contradict(
-                    f"the file says that '{choice.channel}' is in {said}, and {choice.unit} was "
-                    "stated",
-                    f"state '{choice.channel}:{said}', or correct the file",
+                    f"the file says that '{choice.channel}' is in {stated_unit}, and {choice.unit} "
+                    "was stated",
+                    f"state '{choice.channel}:{stated_unit}', or correct the file",
                 )
-            if said is None and label not in _NO_UNIT:
+            if stated_unit is None and label not in _NO_UNIT:
                 self.warnings.append(
                     f"The file states '{printable(label, 20)}' for '{choice.channel}'; "
                     f"{choice.unit} was used as stated."
                 )
             suffix = unit_in_suffix(choice.channel)
-            if said is None and suffix not in (None, choice.unit):
+            if stated_unit is None and suffix not in (None, choice.unit):
                 self.warnings.append(
                     f"The name '{choice.channel}' suggests {suffix}; {choice.unit} was used as "
                     "stated."
@@ -137,7 +137,7 @@ class FileStatements:
             If the times are not a time base, or the file has another rate than was stated.
         """
         time = self.plan.time
-        found = place_samples(self.path, self.plan, channels)
+        found = time_samples(self.path, self.plan, channels)
         for name, channel in channels.items():
             own_hz = channel.rate_hz
             if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
@@ -182,10 +182,10 @@ class FileStatements:
         if len(values) < 2:
             return
         if len(values) < len(times.values):
-            place = int(np.argmin(np.isfinite(times.values))) + 1
+            row_number = int(np.argmin(np.isfinite(times.values))) + 1
             self.contradict(
-                f"the times '{printable(times.name, 60)}' are missing from sample {place} on, in "
-                f"{len(times.values) - len(values)} samples, so that these may be none",
+                f"the times '{printable(times.name, 60)}' are missing from sample {row_number} on, "
+                f"in {len(times.values) - len(values)} samples, so that these may be none",
                 "repair or remove their lines",
             )
             return
@@ -193,11 +193,12 @@ class FileStatements:
         steps = np.diff(values)
         name = f"'{printable(times.name, 60)}'"
         if (steps < 0.0).any():
-            place = int(np.argmax(steps < 0.0)) + 2
+            row_number = int(np.argmax(steps < 0.0)) + 2
             if (steps < 0.0).all():
                 return  # it runs backwards, as an index or a countdown may
             self.contradict(
-                f"the times {name} go back at sample {place}, so that another record begins there",
+                f"the times {name} go back at sample {row_number}, so that another record begins "
+                "there",
                 "cut one record out of the file",
             )
             return

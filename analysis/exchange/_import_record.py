@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.exchange._file_statements import FileStatements, place_samples
+from analysis.exchange._file_statements import FileStatements, time_samples
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
@@ -114,7 +114,7 @@ class ImportedRecord:
     warnings: tuple[str, ...]
 
 
-_JITTER_TOLD: Final = 0.01
+_JITTER_REPORTED: Final = 0.01
 """Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
 
 
@@ -147,7 +147,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     statements.check_units(channels)
     base = statements.timebase(channels)
     channels, delays_s = statements.align(channels, base)
-    base = place_samples(source, plan, channels)
+    base = time_samples(source, plan, channels)
     warnings = statements.warnings
     warnings += _check_rate(source, plan, base)
     segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
@@ -157,11 +157,11 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     columns, status, first = hold(source, titles, columns)
     ticks = base.ticks[first:]
     after_gap = np.diff(ticks, prepend=-1) > 1
-    if base.jitter > _JITTER_TOLD:
+    if base.jitter > _JITTER_REPORTED:
         warnings.append(
             f"The time stamps lie up to {base.jitter:.2g} periods from equidistant ones."
         )
-    warnings += _told(titles, status, first, ticks)
+    warnings += _missing_sentences(titles, status, first, ticks)
     odd = unlikely_torque(
         _on_grid(ticks, columns["angle_rad"]),
         _on_grid(ticks, columns["coupling_torque_nm"]),
@@ -260,7 +260,7 @@ def _segments(
     return found
 
 
-def _told(
+def _missing_sentences(
     titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
 ) -> list[str]:
     """Sentences on what of the record is missing."""
@@ -449,8 +449,8 @@ def unlikely_torque(
     for low, high in _BANDS:
         band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
     s = 2j * np.pi * frequency_hz[band]
-    place = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
-    window = np.sin(np.pi / 2 * np.minimum((1 - place) / (2 * _TAPER), 1)) ** 2
+    from_middle = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
+    window = np.sin(np.pi / 2 * np.minimum((1 - from_middle) / (2 * _TAPER), 1)) ** 2
     with np.errstate(over="ignore", invalid="ignore"):
         angle, torque = (
             np.fft.rfft(window * (values - values.mean()))[band]

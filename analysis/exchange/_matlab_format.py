@@ -78,8 +78,10 @@ def _vectors(
         if variable not in shapes:
             raise no_such_channel(path, name, shapes)
         check_samples(path, f"The variable '{variable}'", max(shapes[variable], default=0))
-    beside = {n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES}
-    contents = load(path, variable_names=sorted(beside | set(variables.values())))
+    time_variables = {
+        n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES
+    }
+    contents = load(path, variable_names=sorted(time_variables | set(variables.values())))
     known = {name: contents[name] for name in shapes if name in contents}
 
     def fields(parent: str) -> Sequence[str]:
@@ -148,7 +150,7 @@ def _value_of(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noq
     value: Any = None
     shown = ""
     for depth, part in enumerate((first, *fields)):
-        key, place = _element(part)
+        key, element = _element(part)
         if depth:
             found = getattr(value, "dtype", None)
             if found is None or found.names is None:
@@ -170,13 +172,13 @@ def _value_of(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noq
         else:
             value = contents[key]
         shown = f"{shown}.{part}" if depth else part
-        if place is not None:
+        if element is not None:
             count = getattr(value, "size", 0)
-            if not 0 <= place < count:
+            if not 0 <= element < count:
                 raise ExchangeError(
                     f"{path}: '{shown}' is not there; '{key}' has {count} elements."
                 )
-            value = value.reshape(-1, order="F")[place : place + 1]
+            value = value.reshape(-1, order="F")[element : element + 1]
     return value
 
 

@@ -246,7 +246,7 @@ def no_such_channel(path: Path, name: str, available: Iterable[str]) -> Exchange
     )
 
 
-def place_of(
+def channel_index(
     path: Path, name: str, titles: Sequence[str], several: str, *, numbered: bool = False
 ) -> int:
     """Find a channel by its title, or by its number as in ``#3``; return its place from 0 on.
@@ -280,7 +280,7 @@ def place_of(
     number = name.removeprefix("#")
     if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
         return int(number) - 1
-    listed = [f"#{place} {each}" for place, each in enumerate(titles, 1)] if numbered else titles
+    listed = [f"#{number} {each}" for number, each in enumerate(titles, 1)] if numbered else titles
     raise no_such_channel(path, name, listed)
 
 

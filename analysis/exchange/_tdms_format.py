@@ -80,9 +80,9 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 def _check_entries(path: Path, stream: BinaryIO) -> None:
     """Refuse a file whose table of contents alone would take minutes or gigabytes to read."""
     size = path.stat().st_size
-    place = channels = entries = 0
-    while place + _LEAD_IN <= size and entries <= _MOST_ENTRIES:
-        stream.seek(place)
+    offset = channels = entries = 0
+    while offset + _LEAD_IN <= size and entries <= _MOST_ENTRIES:
+        stream.seek(offset)
         head = stream.read(_LEAD_IN + 4)
         contents = int.from_bytes(head[4:8], "little")
         order = ">" if contents & _BIG_ENDIAN else "<"
@@ -92,7 +92,7 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
             channels = listed if contents & _NEW_LIST else channels + listed
             entries += channels
         entries += 1
-        place += _LEAD_IN + length
+        offset += _LEAD_IN + length
     stream.seek(0)
     if entries > _MOST_ENTRIES:
         raise ExchangeError(

@@ -18,10 +18,10 @@ from analysis.exchange._source import (
     SourceChannel,
     as_column,
     bounded_memory,
+    channel_index,
     check_samples,
     missing_library,
     not_in_time,
-    place_of,
 )
 from rigd.printable import printable
 from rigd.text_table.titles import stated_unit_of, time_unit_s
@@ -75,10 +75,10 @@ def _functions(
 ) -> dict[str, SourceChannel]:
     _check_marks(path)
     file = open_file(str(path))
-    places = [place for place, kind in enumerate(file.get_set_types()) if kind == 58]
-    titles = [file.read_sets(place, header_only=True)["id1"] for place in places]
+    set_numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
+    titles = [file.read_sets(number, header_only=True)["id1"] for number in set_numbers]
     numbers = {
-        name: place_of(path, name, titles, "data sets have the title", numbered=True)
+        name: channel_index(path, name, titles, "data sets have the title", numbered=True)
         for name in names
         if name != ABSCISSA
     }
@@ -86,7 +86,7 @@ def _functions(
         raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was asked for.")
     channels, times, units = {}, [], []
     for name, number in numbers.items():
-        function = file.read_sets(places[number])
+        function = file.read_sets(set_numbers[number])
         stamps = np.asarray(function["x"], dtype=np.float64)
         channels[name] = _channel(path, name, function, stamps, timed=ABSCISSA in names)
         times.append(stamps)

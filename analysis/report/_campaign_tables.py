@@ -86,7 +86,7 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
 def session_list_table(campaign: CampaignResult) -> Table:
     """All files, those that were left out behind the others."""
 
-    def said(text: str) -> Cell:
+    def text_cell(text: str) -> Cell:
         return Cell(text, text or ABSENT)
 
     headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
@@ -107,10 +107,10 @@ def session_list_table(campaign: CampaignResult) -> Table:
         (
             (
                 Cell(str(each.path), each.name),
-                said(its.start_utc if its else ""),
-                said(its.label if its else ""),
-                said(its.operator if its else ""),
-                said(its.note if its else ""),
+                text_cell(its.start_utc if its else ""),
+                text_cell(its.label if its else ""),
+                text_cell(its.operator if its else ""),
+                text_cell(its.note if its else ""),
                 *(_added_cell(its.added.get(name) if its else None) for name in added),
                 used,
             )
@@ -144,9 +144,9 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
             **fit.parameters,
             "cost": fit.cost,
             "at_bounds": " ".join(fit.at_bounds),
-            **{f"nominal_{name}": value for name, value in asdict(model.indices[place]).items()},
+            **{f"nominal_{name}": value for name, value in asdict(model.indices[index]).items()},
         }
-        for place, session in enumerate(campaign.sessions)
+        for index, session in enumerate(campaign.sessions)
         for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
     return _for_programs("sessions_welch", rows)
@@ -245,7 +245,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
     """Every session with its own verdict, then those left out."""
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()
-    group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
+    group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
     tried = {
         each.path: each

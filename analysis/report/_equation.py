@@ -216,7 +216,7 @@ def types_table(whole: WholeRecord) -> Table:
 
     def rows() -> Iterator[tuple[str, str, str, str]]:
         for structure in STRUCTURES.values():
-            told, terms = [], []
+            described, terms = [], []
             for present, what, coefficient, order, symbol in (
                 (structure.internal, "internal", "ζ", "alpha", "α"),
                 (structure.external, "external", "γ", "lambda", "λ"),
@@ -226,8 +226,8 @@ def types_table(whole: WholeRecord) -> Table:
                     f"{coefficient} s{'' if integer else '^' + symbol}" if present else ABSENT
                 )
                 if present:
-                    told.append(f"{what} of {words[integer]} order")
-            yield structure.name, terms[0], terms[1], ", ".join(told)
+                    described.append(f"{what} of {words[integer]} order")
+            yield structure.name, terms[0], terms[1], ", ".join(described)
 
     return Table.of(
         "types",

@@ -162,14 +162,14 @@ def _magnitude(
 def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
     """Choose what is shown of a mode: so much that a bin of a short record lies inside, too."""
     spacing_hz = float(np.diff(frequency_hz).max())
-    share = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
-    half_hz = max(share * mode.frequency_hz, spacing_hz)
+    relative_width = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
 
 
 _LOSS_POINTS: Final = 400
-_LOOKS: Final = {
+_CURVE_STYLES: Final = {
     "internal (material)": (style.VERMILION, (0, (4, 2))),
     "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
     "total": (style.BLUE, "-"),
@@ -251,14 +251,16 @@ def _curves(
     if first_hz >= last_hz:
         return []
     factors = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
-    curves = dict(zip(_LOOKS, (factors.internal, factors.external, factors.total), strict=True))
+    curves = dict(
+        zip(_CURVE_STYLES, (factors.internal, factors.external, factors.total), strict=True)
+    )
     both = None not in curves.values()
     drawn = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
         # Parts of which one is not known are not told apart; alone, a part is the total.
         if factor is None or (order is not None and (not both or withheld)):
             continue
-        color, dash = _LOOKS[label]
+        color, dash = _CURVE_STYLES[label]
         axes.fill_between(
             factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
         )
@@ -343,12 +345,12 @@ def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     counted = analysis.compared
     power = np.abs(model.residual[counted]) ** 2
-    share = np.cumsum(power) / power.sum()
+    cumulative = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[counted]
     half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
     axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
-    difference = 100 * (share - uniform)
+    difference = 100 * (cumulative - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
@@ -420,8 +422,8 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     """Draw the figures one after the other; within `style.styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    highest_hz, told = whole.band_hz[1], whole.headline
-    model = ShownModel.of(told, whole.record)
+    highest_hz, headline = whole.band_hz[1], whole.headline
+    model = ShownModel.of(headline, whole.record)
     analysis = model.compared(whole.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss, residual, signals = FIGURES
@@ -435,11 +437,11 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
         f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
         "the line where it is not seen.",
     )
-    test = told.uniform_beam
+    test = headline.uniform_beam
     if test is not None and test.p_value is not None:
         yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
     beam = loss_estimate(whole)
-    doubtful = [mode.number for mode in told.modes if mode.damping_ratio.flag is not None]
+    doubtful = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss,
         loss_figure(
@@ -504,10 +506,10 @@ def _curve(whole: WholeRecord) -> str:
     return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
 
 
-def _reasons(told: Headline) -> str:
+def _reasons(headline: Headline) -> str:
     """Say why points are hollow."""
     reasons = dict.fromkeys(
-        mode.damping_ratio.flag for mode in told.modes if mode.shown and mode.damping_ratio.flag
+        mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
     return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
 

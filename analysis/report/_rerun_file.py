@@ -140,19 +140,23 @@ class ChartPage:
 def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     """Return the measured response with its coherence, and each model type with its residuals."""
     magnitude = _magnitude_axis(analysis)
-    looks = line_keys(analysis.settings.weightings)
+    keys_by_weighting = line_keys(analysis.settings.weightings)
     return (
         _measured_page(analysis, magnitude),
-        *(_type_page(analysis, name, magnitude, looks) for name in analysis.settings.types),
+        *(
+            _type_page(analysis, name, magnitude, keys_by_weighting)
+            for name in analysis.settings.types
+        ),
     )
 
 
 def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
     """Return how the models of each weighting are drawn."""
     others = cycle(_MORE_LINES)
-    looks = {name: _LINES.get(name) or next(others) for name in weightings}
+    keys_by_weighting = {name: _LINES.get(name) or next(others) for name in weightings}
     return {
-        name: Key(f"model, weights {name}", color, width) for name, (color, width) in looks.items()
+        name: Key(f"model, weights {name}", color, width)
+        for name, (color, width) in keys_by_weighting.items()
     }
 
 
@@ -240,10 +244,10 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
 
 
 def _type_page(
-    analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[str, Key]
+    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, Key]
 ) -> ChartPage:
     models = [model for model in analysis.models if model.fit.structure.name == name]
-    keys = [looks[model.fit.weighting] for model in models]
+    keys = [keys_by_weighting[model.fit.weighting] for model in models]
     # Shorter on the narrow charts: in full they would run into the title of the axis.
     form = "weights {}" if len(models) <= _MOST_IN_WORDS else "{}"
     short = [
@@ -435,12 +439,12 @@ def draw_record(
     stream
         Takes the drawings.
     """
-    said = [
+    sentences = [
         *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
         *whole.verdict.sentences,
         *(f"* {advice}" for advice in whole.verdict.experiments),
     ]
-    _draw_text(VERDICT, "\n\n".join((*said, f"```\n{tables}\n```")), stream)
+    _draw_text(VERDICT, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
     _draw_page(record_page(whole), stream)
     t_ns = np.round(1e9 * whole.record.time_s).astype(np.int64)
     for lines in _OVER_TIME:
@@ -473,7 +477,7 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
 
     start = rrb.TimeRangeBoundary.absolute(seconds=0.0)
     end = rrb.TimeRangeBoundary.absolute(seconds=end_s)
-    look = rr.SeriesLines(
+    series_style = rr.SeriesLines(
         names=lines.names,
         colors=lines.colors,
         widths=lines.widths,
@@ -483,7 +487,7 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
     return rrb.TimeSeriesView(
         name=lines.title,
         origin=lines.entity,
-        overrides={lines.entity: look},
+        overrides={lines.entity: series_style},
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=rrb.ScalarAxis(range=_span(largest)),

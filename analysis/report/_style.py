@@ -127,8 +127,10 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
             left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common
         ),
     ):
-        share = text.get_window_extent().width / (DPI * width_in)
-        text.set_fontsize(float(text.get_fontsize()) * (1 - 2 * left) / max(share, 1 - 2 * left))
+        width_fraction = text.get_window_extent().width / (DPI * width_in)
+        text.set_fontsize(
+            float(text.get_fontsize()) * (1 - 2 * left) / max(width_fraction, 1 - 2 * left)
+        )
     return figure
 
 

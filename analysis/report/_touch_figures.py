@@ -172,8 +172,8 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
 
 
 def _map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool) -> None:
-    for place, session in enumerate(sessions):
-        color = _COLORS[place % len(_COLORS)]
+    for number, session in enumerate(sessions):
+        color = _COLORS[number % len(_COLORS)]
         name: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:

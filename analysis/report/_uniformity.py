@@ -117,18 +117,18 @@ def uniformity_table(test: UniformBeamTest) -> Table:
     """Measured and predicted modal constants with their deviations."""
     rows: list[tuple[Entry, ...]] = []
     away = _deviations(test).ravel()
-    for place, (measured, std, predicted, off) in enumerate(
+    for index, (measured, std, predicted, off) in enumerate(
         zip(
             test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), away.tolist(),
             strict=True,
         )
     ):  # fmt: skip
-        name = CONSTANTS[place % len(CONSTANTS)]
+        name = CONSTANTS[index % len(CONSTANTS)]
         words = Cell(name, name.removesuffix("_rad").replace("_", " "))
         shown = estimate((measured, std, predicted), std)
         rows.append(
             (
-                test.modes[place // len(CONSTANTS)], words, *shown,
+                test.modes[index // len(CONSTANTS)], words, *shown,
                 number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
             )
         )  # fmt: skip

@@ -133,10 +133,12 @@ class NearlyUniformBeam:
 
 def loss_estimate(whole: WholeRecord) -> Estimate | None:
     """Choose the beam whose loss factors are drawn over frequency; None if none explains them."""
-    told = whole.headline
-    if told.tolerant is not None:
-        return None if told.tolerant.basis == "none" else NearlyUniformBeam.of(told.tolerant)
-    refused = told.uniform_beam is not None and told.uniform_beam.status == "refused"
+    headline = whole.headline
+    if headline.tolerant is not None:
+        return (
+            None if headline.tolerant.basis == "none" else NearlyUniformBeam.of(headline.tolerant)
+        )
+    refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
     return None if refused else whole.fit
 
 

@@ -45,17 +45,17 @@ def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
 
     The second sentence, or the only one, is on the validity of the numbers.
     """
-    said = _verdict_sentences(campaign)
-    return (*said[:1], campaign.validity.sentence, *said[1:])
+    sentences = _verdict_sentences(campaign)
+    return (*sentences[:1], campaign.validity.sentence, *sentences[1:])
 
 
 def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     if campaign.verdict is not None:
         return campaign.verdict.sentences
-    asked = any(each.record_estimates for each in campaign.sessions)
+    has_estimates = any(each.record_estimates for each in campaign.sessions)
     return (
         *specimens(campaign.homogeneity),
-        *([_NO_VERDICT] if asked else []),
+        *([_NO_VERDICT] if has_estimates else []),
         *lost_trials(campaign.lost_trials, campaign.trials),
     )
 
@@ -75,9 +75,9 @@ def campaign_tables(
         are, and the tables of the paper if its numbers are to stand beside them.
     """
     parts: list[RenderableType] = []
-    said = campaign_sentences(campaign)
-    if said:
-        first, *others = said
+    sentences = campaign_sentences(campaign)
+    if sentences:
+        first, *others = sentences
         parts += [Text(first, style="bold"), *map(Text, others)]
         if campaign.verdict is not None and campaign.verdict.experiments:
             parts.append(Text("Further experiments:"))

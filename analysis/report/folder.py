@@ -61,9 +61,9 @@ def report_folders(
     """
     if report is None:
         # A folder given for a file may have no name of its own ("." or "/").
-        asked = [file.parent / f"{file.stem}.report" for file in files]
+        requested = [file.parent / f"{file.stem}.report" for file in files]
     elif overwrite or _is_free(report):
-        asked = [report] if len(files) == 1 else [report / file.stem for file in files]
+        requested = [report] if len(files) == 1 else [report / file.stem for file in files]
     else:
         raise OutputExistsError(
             f"--report {report} exists and is not an empty folder; choose another name, or replace "
@@ -71,8 +71,8 @@ def report_folders(
         )
     taken: set[Path] = set()
     if not overwrite:
-        return asked if asked == [report] else [_free(each, taken) for each in asked]
-    folders = [_free(each, taken, overwrite=True) for each in asked]
+        return requested if requested == [report] else [_free(each, taken) for each in requested]
+    folders = [_free(each, taken, overwrite=True) for each in requested]
     for folder in folders:
         _check_earlier(folder)
     return folders

@@ -98,8 +98,8 @@ def record_page(
 def _session(record: Record) -> list[str]:
     """Say whose session it is, as far as the file does."""
     metadata = record.metadata
-    told = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
-    return [*_start(metadata), f"outcome {record.outcome}", *told]
+    lines = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
+    return [*_start(metadata), f"outcome {record.outcome}", *lines]
 
 
 def _start(metadata: Mapping[str, str]) -> list[str]:
@@ -294,7 +294,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
 
 
 _FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
-_FIGURES_BESIDE_RECORD: Final = ("welch_frf",)
+_FIGURES_WITH_RECORD: Final = ("welch_frf",)
 """Figures of the Welch fits where the whole-record fit has its own of signals and torque."""
 
 
@@ -347,7 +347,7 @@ def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
     """
     if not paper:
         return ()
-    return _FIGURES_BESIDE_RECORD if whole_record else _FIGURES
+    return _FIGURES_WITH_RECORD if whole_record else _FIGURES
 
 
 def _draw(

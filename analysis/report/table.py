@@ -255,7 +255,7 @@ def terminal_table(table: Table) -> rich.table.Table:
         if not column.spread:
             shown.add_column(Text(column.heading), justify="right" if column.numeric else "left")
     rows = table.shown_rows
-    for place, row in enumerate(rows):
+    for index, row in enumerate(rows):
         cells: list[Text] = []
         for cell, spread in zip(row, spreads, strict=True):
             if not spread:
@@ -263,8 +263,8 @@ def terminal_table(table: Table) -> rich.table.Table:
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
                 cells[-1].append(f" ±{cell.text}")
-        ends = table.grouped and row[0].text != rows[min(place + 1, len(rows) - 1)][0].text
-        shown.add_row(*cells, end_section=ends, style="bold" if place == table.selected else "")
+        ends = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
+        shown.add_row(*cells, end_section=ends, style="bold" if index == table.selected else "")
     return shown
 
 
@@ -280,7 +280,7 @@ _ESCAPED: Final = {
     "–": "--",
 }  # fmt: skip
 _RAISED: Final = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_PIECES: Final = re.compile(
+_LATEX_TOKENS: Final = re.compile(
     r"(?P<digits>\d+(?:\.\d+)?)e(?P<power>[+-]?\d+)|\^(?P<up>[^\W⁰¹²³⁴⁵⁶⁷⁸⁹]+)"
     rf"|(?P<raised>[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)|(?P<letter>[{''.join(_LETTERS)}])(?P<index>\d*)"
     r"|(?P<minus>−)|(?P<stiffness>\bEI\b)|(?P<other>.)",
@@ -297,12 +297,12 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
-    found = "".join(map(_latex_piece, _PIECES.finditer(text)))
+    found = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
     return found.replace("$$", "")
 
 
-def _latex_piece(piece: re.Match[str]) -> str:
-    part = piece.groupdict()
+def _latex_token(token: re.Match[str]) -> str:
+    part = token.groupdict()
     if part["power"]:
         digits = "" if part["digits"] == "1" else rf"{part['digits']} \cdot "
         return f"${digits}10^{{{int(part['power'])}}}$"

@@ -68,16 +68,16 @@ def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
         "angle_rad": touch.angle_rad,
         "kind": "not estimated" if estimate is None else _KINDS.get(estimate.kind, estimate.kind),
     }
-    told: dict[str, tuple[Estimated | None, float]] = {}
+    estimates: dict[str, tuple[Estimated | None, float]] = {}
     if estimate is not None:
-        told = {
+        estimates = {
             "time_s": (estimate.time_s, touch.start_s),
             "x_m": (estimate.x_m, 0.0),
             "force_n": (estimate.force_n, 0.0),
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        found, start = told.get(key, (None, 0.0))
+        found, start = estimates.get(key, (None, 0.0))
         row[key] = _cell(found, start)
         row[f"{key}_std"] = None if found is None else found.std
     return row

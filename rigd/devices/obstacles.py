@@ -230,8 +230,8 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
             "obstacle; copy it from that of rigd profiles show sim."
         )
     texts = tuple(texts)
-    beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
-    check_obstacles(map(parse_obstacle, texts), rig.beam, beside)
+    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    check_obstacles(map(parse_obstacle, texts), rig.beam, simulated)
     return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
 
 

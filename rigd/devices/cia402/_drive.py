@@ -178,7 +178,7 @@ class Cia402Drive:
         if capabilities is None:
             return {}
         numbers = ("vendor_id", "product_code", "revision", "serial_number")
-        told = {
+        facts = {
             "drive_identity": " ".join(
                 f"0x{number:X}"
                 if isinstance(number := capabilities.identity.get(key), int)
@@ -195,8 +195,8 @@ class Cia402Drive:
             ("drive_objects_set", capabilities.assigned),
         ):
             if texts:
-                told[key] = "; ".join(texts)
-        return told
+                facts[key] = "; ".join(texts)
+        return facts
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Bring the drive to operation enabled, at zero torque.

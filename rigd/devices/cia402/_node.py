@@ -267,13 +267,13 @@ class Node:
             patience_ns = _START_PATIENCE_NS + round(3e9 * period_s)
             self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
         if not self._is_operational():
-            told = (
+            reported = (
                 "no heartbeat came"
                 if inbox.nmt_state is None
                 else f"its heartbeat says {inbox.nmt_state}"
             )
             raise DeviceError(
-                f"{self.name}: it does not become operational ({told}, {OPERATIONAL} was "
+                f"{self.name}: it does not become operational ({reported}, {OPERATIONAL} was "
                 "expected); check its own diagnosis."
             )
         inbox.watching = True

@@ -177,9 +177,9 @@ def _check_identity(
     ):
         got = identity[key]
         if wanted and got != wanted:
-            told = "nothing" if got is None else f"0x{got:08X}"
+            got_text = "nothing" if got is None else f"0x{got:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {told}. "
+                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {got_text}. "
                 "Check cia402.node_id, or write into the profile what is really there."
             )
     modes = identity["supported_modes"]

@@ -145,15 +145,15 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
     """
     began = time.monotonic()
     statusword: int | None = None
-    told = False
+    requested = False
     with sdo.hurried():
         while True:
             command_off(sdo)
-            if not told:
+            if not requested:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
                     sdo.request_pre_operational()
-                    told = True
+                    requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
                 if state_of(statusword) in OFF:

@@ -121,15 +121,15 @@ class _SuitabilityCheck:
             yield self._absent(needed) if entry is None else self._present(needed, entry)
 
     def _identity(self) -> Iterator[Finding]:
-        for key, told, name in (
+        for key, stated, name in (
             ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
             ("product_code", self._eds.product_code, self._eds.product_name),
         ):
             what = key.replace("_", " ")
             wanted = getattr(self._settings, key) if self._settings else 0
-            shown = f"0x{told:08X}" if told else "not told"
+            shown = f"0x{stated:08X}" if stated else "not told"
             found = f"{shown} ({name})" if name else shown
-            if not (told and wanted and told != wanted):
+            if not (stated and wanted and stated != wanted):
                 yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
                 continue
             sentence = (
@@ -236,19 +236,19 @@ class _SuitabilityCheck:
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
         what = f"{needed.address} {needed.name}"
         wanted = self._wanted.get((needed.index, needed.sub))
-        asked = "" if wanted is None else _shown(needed, wanted)
-        told = "" if entry.default is None else f", {_shown(needed, entry.default)}"
-        found = f"{entry.access}{told}"
+        wanted_text = "" if wanted is None else _shown(needed, wanted)
+        default = "" if entry.default is None else f", {_shown(needed, entry.default)}"
+        found = f"{entry.access}{default}"
 
         def objection(text: str, *, doubt: bool = False) -> Finding:
             sentence = _sentence(f"its object {needed.address} ({needed.name}) {text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
-            return Finding(what, found, asked, grade, sentence)
+            return Finding(what, found, wanted_text, grade, sentence)
 
         if needed.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
             trouble = self._unmappable(entry)
             if trouble and needed.accept:
-                return self._to_accept(needed, what, f"{found}, {trouble}", asked)
+                return self._to_accept(needed, what, f"{found}, {trouble}", wanted_text)
             if trouble:
                 return objection(f"{trouble}. {needed.sentence}")
         if ObjectAccess.WRITE in needed.access and not entry.writable:
@@ -261,9 +261,9 @@ class _SuitabilityCheck:
         if wanted is not None and not _takes(entry, wanted):
             limits = f"{_limit(needed, entry.low)} to {_limit(needed, entry.high)}"
             return objection(
-                f"takes {limits}, not {asked}. {needed.sentence}", doubt=not needed.core
+                f"takes {limits}, not {wanted_text}. {needed.sentence}", doubt=not needed.core
             )
-        return Finding(what, found, asked, Grade.FITS)
+        return Finding(what, found, wanted_text, Grade.FITS)
 
     def _read_only(
         self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
@@ -271,9 +271,9 @@ class _SuitabilityCheck:
         """Judge an object that would be written and cannot be: what it holds may do."""
         what = f"{needed.address} {needed.name}"
         if needed.fit is AllowedValue.AT_LEAST:
-            asked = f"at least {wanted or 'motor.peak_torque_nm'}"
+            wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
-            asked = "" if wanted is None else _shown(needed, wanted)
+            wanted_text = "" if wanted is None else _shown(needed, wanted)
         if needed.index in _PDO_ENTRIES:
             held = self._mapped(needed.index)
             does = None if None in held else held == _PDO_ENTRIES[needed.index]
@@ -288,18 +288,18 @@ class _SuitabilityCheck:
                     f"its object {needed.address} ({needed.name}) is read-only, so that the PDO "
                     f"cannot be switched off to be remapped. {needed.sentence}"
                 )
-                return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+                return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
         else:
             does = needed.fit.allows(entry.default, wanted)
         if does:
-            return Finding(what, f"{found}: it does", asked, Grade.FITS)
+            return Finding(what, f"{found}: it does", wanted_text, Grade.FITS)
         if does is None and needed.index != objects.CONTROLWORD:
-            return Finding(what, f"{found}: the drive will be asked", asked, Grade.ASK)
+            return Finding(what, f"{found}: the drive will be asked", wanted_text, Grade.ASK)
         sentence = (
             f"its object {needed.address} ({needed.name}) is read-only and does not hold what is "
-            f"needed{f' ({asked})' if asked else ''}. {needed.sentence}"
+            f"needed{f' ({wanted_text})' if wanted_text else ''}. {needed.sentence}"
         )
-        return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+        return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
 
     def _unmappable(self, entry: EdsEntry) -> str:
         """Say why an object cannot be in its PDO; empty if it can."""

@@ -237,10 +237,10 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
 
     def in_cyclic_torque() -> bool:
         nonlocal mode
-        told = read_mode(inbox.reply)
-        if told is None:
+        mode_read = read_mode(inbox.reply)
+        if mode_read is None:
             return False
-        mode, inbox.reply = told, b""
+        mode, inbox.reply = mode_read, b""
         if mode != CYCLIC_TORQUE:
             send(frames.ask_mode)
         return mode == CYCLIC_TORQUE
