@@ -69,7 +69,7 @@ def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
 
 
 def describe_unknown_values(rig: "RigParameters") -> str:
-    """Name the unknown values, a line for each with the place to find it; empty: none.
+    """List the unknown values, one a line, with where to find each; empty if there are none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a simulated beam meets, as it is written in a profile or on the command line.
+"""Obstacles and impacts on a simulated beam, as written in a profile or on the command line.
 
 ``x=0.62,angle=0.6,stiffness=3000`` is an obstacle, ``x=0.5,force=2,duration=0.02,at=3`` a knock.
 """
@@ -13,12 +13,12 @@ from rigd.errors import UserError
 
 
 class ObstacleError(UserError, ValueError):
-    """An obstacle is not written as it should be; the message says what may stand there."""
+    """An obstacle has a syntax error; the message states what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Something that stands in the way of the beam: it pushes, and never pulls.
+    """Obstacle in the path of the beam: it pushes, and never pulls.
 
     Its force is ``stiffness · penetration + damping · its rate``, while that pushes.
     """
@@ -56,7 +56,7 @@ class ImpactSpecification:
 
 
 Disturbance = Obstacle | ImpactSpecification
-"""What the beam may meet."""
+"""Obstacle or impact on the simulated beam."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def parse_obstacle(text: str) -> Disturbance:
     Raises
     ------
     ObstacleError
-        Naming the key that is wrong and what may stand there.
+        If a key or value is wrong; the message states what is allowed.
 
     Examples
     --------
@@ -182,12 +182,11 @@ def check_obstacles(
 
     Parameters
     ----------
-    encounters
-        Obstacles and knocks.
-    beam
+    disturbances
+        Obstacles and knocks. beam
         The beam, on which they have to be.
     simulated
-        What else is simulated, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: it is not.
+        Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: not simulated.
 
     Raises
     ------
@@ -209,7 +208,7 @@ def check_obstacles(
 
 
 def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
-    """Put obstacles in the way of a rig's simulated beam, beside those of its profile.
+    """Add obstacles to those of a rig's simulated beam.
 
     Parameters
     ----------
@@ -221,7 +220,7 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
     Raises
     ------
     ObstacleError
-        If one is not written as it should be, or cannot be simulated on this rig.
+        If one has a syntax error, or cannot be simulated on this rig.
     """
     simulation = rig.simulation
     if simulation is None:
@@ -240,8 +239,8 @@ def describe_obstacle(disturbance: Disturbance) -> str:
 
     Parameters
     ----------
-    encounter
-        What is written.
+    disturbance
+        Obstacle or impact.
     """
     default = {each.name: each.default for each in fields(disturbance)}
     if isinstance(disturbance, Obstacle):

@@ -1,4 +1,4 @@
-"""An ATI sensor behind a NETCANOEM box on CAN: set up once, then polled once a tick."""
+"""ATI sensor with a NETCANOEM box on CAN: set up once, then polled once a tick."""
 
 import time
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
 _TRIES = 3
-# What was asked for again may be answered twice, and no reply says which row of the matrix it is.
+# A repeated request may be answered twice, and no reply states which row of the matrix it holds.
 _LATE_REPLY_S = 0.5
 _LOST_POLL_S = 0.02
 # A box that was silent for this long may have restarted; no box starts faster.
@@ -39,7 +39,7 @@ _ASSUMED = (
 
 
 class AtiCanSensor:
-    """The sensor of a profile with a section ``ati_can``.
+    """Sensor of a profile with a section ``ati_can``.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class AtiCanSensor:
         Raises
         ------
         DeviceError
-            If the sensor is absent, not the profile's or not sound.
+            If the sensor is absent, is not the one of the profile, or reports a fault.
         """
         self.close()
         exchange = self._link.open()
@@ -164,7 +164,7 @@ class AtiCanSensor:
         }
 
     def request(self, due_ns: int) -> None:  # noqa: ARG002
-        """Poll the sensor, unless it is in doubt which reply is whose, or what it measures with.
+        """Poll the sensor, unless the pairing of replies or the sensor's calibration is uncertain.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class AtiCanSensor:
         """
         polls = self.polls
         if self._lock_step and not self._waits:
-            # No time passes between two ticks: the reply to the last poll is still being made.
+            # No time passes between two ticks: the reply to the last poll is still in preparation.
             polls.wait(time.monotonic_ns() + self._deadline_ns)
         polls.drain()
         if not self._waits:
@@ -204,7 +204,7 @@ class AtiCanSensor:
             self._unanswered += 1
             return self._wrench
         if self._unanswered >= self._restart_ticks:
-            # It answers again: before a reading counts, it has to show its calibration.
+            # It answers again: its calibration is verified before a reading counts.
             self._in_doubt = True
             self._shown = b""
             self._inbox.clear()
@@ -257,7 +257,7 @@ class AtiCanSensor:
         }
 
     def close(self) -> None:
-        """Give the bus up. Never raises."""
+        """Release the bus. Never raises."""
         if self._connected:
             self._connected = False
             self.polls.close()
@@ -316,9 +316,9 @@ class AtiCanSensor:
         )
 
     def _is_the_same(self) -> bool:
-        """Whether a box that was silent has shown the calibration that was read from it.
+        """Whether a box that was silent still has the calibration that was read from it.
 
-        One that was without power for a moment does not say so: bit 0 of its status is for the
+        A box that was without power for a moment does not report it: bit 0 of its status is for the
         watchdog only.
         """
         inbox, calibration = self._inbox, self._calibration
@@ -332,7 +332,7 @@ class AtiCanSensor:
                 raise self._restarted(
                     "it was silent for a moment and answers with another calibration matrix since"
                 )
-            # Once may be a reply that was damaged, as at connecting.
+            # A single mismatch may be a damaged reply, as at connecting.
             self._shown = shown
             inbox.clear()
         base = self._settings.base_id
@@ -340,7 +340,7 @@ class AtiCanSensor:
         return False
 
     def _poll(self, timeout_s: float) -> Answer | None:
-        """Poll outside the cycle."""
+        """Poll the sensor outside the cycle."""
         polls = self.polls
         polls.drain()
         polls.forget()
@@ -356,7 +356,7 @@ class AtiCanSensor:
         raise self._no_reply("a reading")
 
     def _ask(self, what: str, opcode: int, *arguments: int, replies: Sequence[int] = ()) -> bytes:
-        """Return the reply to a request, several frames end to end."""
+        """Return the reply to a request, its frames concatenated."""
         exchange, inbox = self.polls.exchange, self._inbox
         wanted = replies or (opcode,)
         frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
@@ -411,7 +411,7 @@ class AtiCanSensor:
                 f"{self._name}: asked for calibration {wanted}, it selected {selected}. Choose "
                 "one that it has (ati_can.calibration)."
             )
-        # Its status tells whether the selected one is any good.
+        # The status shows whether the selected calibration is valid.
         status = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
         if status & CAN_BAD_CALIBRATION:
             self._check_status(status, status)

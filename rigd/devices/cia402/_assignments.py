@@ -50,7 +50,7 @@ class Assignment:
 
 
 def parse_assignment(text: str) -> Assignment:
-    """Return what a text of ``cia402.set_objects`` says.
+    """Parse a text of ``cia402.set_objects``.
 
     Parameters
     ----------

@@ -112,7 +112,7 @@ class Cia402Drive:
         Raises
         ------
         DeviceError
-            If the drive is absent, in fault, not what the profile says, or does not take the
+            If the drive is absent, in fault, differs from the profile, or rejects the
             configuration.
         """
         if self._rig.encoder.resolution_rad == 0:
@@ -129,7 +129,7 @@ class Cia402Drive:
         has_torque = capabilities.has(ACTUAL_TORQUE)
         self._inbox.with_torque = has_torque
         self._following.compares = has_torque
-        # Without its own heartbeat the drive is heard by its TPDOs alone.
+        # Without a heartbeat of its own the drive is monitored by its TPDOs alone.
         self._listens = capabilities.has(HEARTBEAT_PRODUCER_MS)
         self._has_rpdo_deadline = capabilities.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
@@ -146,7 +146,7 @@ class Cia402Drive:
         node.resume()
 
     def identity(self) -> dict[str, object]:
-        """Return what the drive said of itself at :meth:`connect`, for reports.
+        """Return the identity that the drive reported at :meth:`connect`.
 
         Returns
         -------
@@ -160,7 +160,7 @@ class Cia402Drive:
         return {} if self._capabilities is None else dict(self._capabilities.identity)
 
     def capabilities(self) -> DriveCapabilities | None:
-        """Return what the drive turned out to have at :meth:`connect`, or None before."""
+        """Return the capabilities found at :meth:`connect`, or None before."""
         return self._capabilities
 
     def statement(self) -> dict[str, str]:
@@ -170,9 +170,8 @@ class Cia402Drive:
         -------
         dict
             ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks
-            something that the profile accepts by name, ``drive_without``; where something stands
-            in for an object, ``drive_stand_ins``; objects that the profile has set,
-            ``drive_objects_set``.
+            something that the profile accepts by name, ``drive_without``; where something replaces
+            an object, ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
         """
         capabilities = self._capabilities
         if capabilities is None:
@@ -206,12 +205,12 @@ class Cia402Drive:
         Parameters
         ----------
         stop
-            Asked once a period: the drive is then disabled instead.
+            Called once a period; if it returns True, the drive is disabled instead.
 
         Raises
         ------
         DeviceError
-            If the drive does not get there; it is then disabled again.
+            If the drive does not reach that state; it is then disabled again.
         """
         node = self._connected()
         if self._enabled:
@@ -373,8 +372,8 @@ class Cia402Drive:
         Raises
         ------
         DeviceError
-            If the drive does not answer, does not show itself off within 0.2 s, the fault stands,
-            or it does not get ready.
+            If the drive does not answer, does not report that it is off within 0.2 s, the fault
+            persists, or it does not become ready.
         """
         self.disable()
         exchange = self._open_link()
@@ -398,7 +397,7 @@ class Cia402Drive:
             self._link.close()
 
     def _own_end(self) -> str:
-        """Say what takes the torque off a drive that cannot be switched off."""
+        """Describe what removes the torque of a drive that cannot be switched off."""
         capabilities = self._capabilities
         if capabilities is None or capabilities.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."
@@ -428,7 +427,7 @@ class Cia402Drive:
         exchange.subscribe(self._frames.reply_id, self._inbox.take_reply)
 
     def _settle_previous(self, node: Node) -> None:
-        """Take the reply to the SYNC of the tick before, which should have come by now."""
+        """Process the reply to the previous tick's SYNC, which should have arrived."""
         if node.lock_step and node.pairing.owed:
             node.exchange.wait_until(node.pairing.has_caught_up, node.sync_ns + node.deadline_ns)
         else:
@@ -436,21 +435,21 @@ class Cia402Drive:
         self._settle(node)
 
     def _settle(self, node: Node) -> None:
-        """Take the position if it is the reply to the last SYNC."""
+        """Store the position if it is the reply to the last SYNC."""
         fresh = node.pairing.settle() and self._inbox.legible
         self.angle_stale = not fresh
         if self._enabled and fresh:
             self._following.compare(self._inbox.torque)
         if fresh:
             position = self._inbox.position
-            # The counter of 32 bits wraps around.
+            # The 32-bit counter wraps around.
             self._counts += (position - self._position + _HALF_TURN & _ALL_COUNTS) - _HALF_TURN
             self._position = position
             self.angle_rad = self._counts * self._rad_per_count
             self.angle_time_ns = node.sync_ns
 
     def _complain(self, node: Node) -> None:
-        """Say what is wrong with the drive."""
+        """Raise the error of the drive, if there is one."""
         node.refuse_alarm()
         statusword = self._inbox.strayed
         if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:

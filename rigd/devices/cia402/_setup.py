@@ -1,8 +1,8 @@
 """Set-up of the drive, in pre-operational, before the cycle starts.
 
-What is asked of it stands in :mod:`rigd.devices.cia402.requirements`. An object that holds what is
-needed is left alone, for it may be read-only; one that is absent or cannot be changed is judged by
-its row there.
+The requirements are in :mod:`rigd.devices.cia402.requirements`. An object that holds the required
+value is not written, because it may be read-only; its row there decides what follows if it is
+absent or cannot be changed.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ _DUPLICATE_WATCHES = 127
 
 @dataclass(frozen=True, slots=True)
 class DriveCapabilities:
-    """Equipment of a drive, as found when it was set up.
+    """Capabilities of a drive, as found during set-up.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class DriveCapabilities:
         What takes the torque off when this computer falls silent, and after how long; infinite
         where nothing does.
     lacks
-        Rows of the objects that it has not, or that do not do what they are for.
+        Rows of the objects that are absent or not usable.
     assigned
         Manufacturer-specific objects that the profile has set.
     """
@@ -106,20 +106,20 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
 
     Returns
     -------
-    Outfit
-        Identity that the drive reports, and what it has.
+    DriveCapabilities
+        Identity and capabilities of the drive.
 
     Raises
     ------
     DeviceError
-        If it does not answer, is not the drive of the profile, is in fault, lacks what is needed,
-        or does not take the configuration.
+        If it does not answer, is not the drive of the profile, is in fault, lacks a required
+        object, or rejects the configuration.
     """
     settings = rig.cia402
     assert settings is not None
     wanted = wanted_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
-        # Before anything else, whoever it is: a session that was killed may have left it turning.
+        # First of all, before its identity is known: a killed session may have left it turning.
         command_off(sdo)
         sdo.to_pre_operational()
         command_off(sdo)
@@ -141,7 +141,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
         work.configure_pdos(active)
         work.check_other_objects(identity)
         work.settle(requirement(objects.MODE))
-        # Some drives show it only once they are enabled: it is looked at again then.
+        # Some drives show the mode only when enabled: it is checked again then.
         wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
     return DriveCapabilities(
         identity,
@@ -191,7 +191,7 @@ def _check_identity(
 
 
 class _SetUp:
-    """The work on one drive that is disabled; collects what it has not.
+    """Set-up of one drive that is disabled; collects the objects that it lacks.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class _SetUp:
         self.lacks: list[Requirement] = []
 
     def settle(self, row: Requirement, wanted: int | None = None) -> bool:
-        """Have an object hold a value, and return whether the drive has it.
+        """Set an object to a value, and return whether the drive has the object.
 
         A write-only one is written and not read back, where that may be.
 
@@ -229,7 +229,7 @@ class _SetUp:
         Raises
         ------
         DeviceError
-            If the drive cannot do without, or keeps another value that does not do.
+            If the object is indispensable, or the drive stores a value that is not acceptable.
         """
         if wanted is None:
             wanted = self._wanted[row.index, row.sub]
@@ -276,7 +276,7 @@ class _SetUp:
                 raise DeviceError(f'{error} (cia402.set_objects: "{text}")') from None
 
     def check_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare the torque that 1000 per mille stand for with the profile's."""
+        """Compare the rated torque of the drive with that of the profile."""
         settings = self._settings
         counts = self._sdo.read_if_there(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
@@ -349,7 +349,7 @@ class _SetUp:
         return above / below
 
     def configure_torque(self) -> None:
-        """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
+        """Configure the torque limit, and clear offsets that add to the target torque."""
         self.settle(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
             if self._sdo.read_if_there(index) is not None:
@@ -358,7 +358,7 @@ class _SetUp:
         self._clear(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Limit the speed that a torque which is never withdrawn can lead to."""
+        """Configure the speed limit, which bounds the effect of a constant torque."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
@@ -368,7 +368,7 @@ class _SetUp:
             )
 
     def configure_sync(self) -> None:
-        """Have the drive go by a SYNC of this period, of no window and without a counter."""
+        """Configure SYNC: its period, no window, no counter."""
         sdo = self._sdo
         cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
@@ -390,7 +390,7 @@ class _SetUp:
         Returns
         -------
         Watchdog
-            Which one stands.
+            Watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
@@ -444,7 +444,7 @@ class _SetUp:
         )
 
     def check_other_objects(self, identity: dict[str, object]) -> None:
-        """Report what is only read."""
+        """Check the objects that are only read."""
         for key, index in (
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
@@ -457,12 +457,12 @@ class _SetUp:
         return row.accept in self._settings.accept_without
 
     def _do_without(self, row: Requirement) -> None:
-        """Note an object that is not there, if that may be.
+        """Record a missing object if it is dispensable.
 
         Raises
         ------
         DeviceError
-            If it may not.
+            If it is indispensable.
         """
         reason = row.missing(self._settings.accept_without)
         if reason:
@@ -470,7 +470,7 @@ class _SetUp:
         self.lacks.append(row)
 
     def _clear(self, row: Requirement) -> None:
-        """Have an object read 0 where the drive has it; one that rigd does not set, refuse."""
+        """Set an object to 0 if the drive has it; raise if rigd does not set it."""
         found = self._sdo.read_if_there(row.index, row.sub)
         if not found:
             return
@@ -483,7 +483,7 @@ class _SetUp:
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
-        """Have the drive watch over this computer's heartbeat; return whether it can."""
+        """Configure the monitoring of this computer's heartbeat; return whether there is one."""
         settings, sdo = self._settings, self._sdo
         index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
         wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
@@ -509,7 +509,7 @@ class _SetUp:
         entries: tuple[int, ...],
         parameters: dict[int, int],
     ) -> None:
-        """Have a PDO carry these entries; one that does so already is left alone.
+        """Map entries into a PDO; one that has them already is not written.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
-"""Suitability of a drive for torque control, judged by its EDS file before it is connected.
+"""Suitability of a drive for torque control, checked by its EDS file before it is connected.
 
 The file is compared with the table of :mod:`rigd.devices.cia402.requirements`, which the set-up
-goes by. What it does not state the drive is asked when it is connected.
+goes by. What it does not state is read from the drive when it is connected.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Grade(Enum):
-    """Grade of what a file tells of one object."""
+    """Grade of an object by the file."""
 
     FITS = "as needed"
     SUBSTITUTED = "something else does its work"
@@ -89,7 +89,7 @@ _REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
 def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
-    """Hold a drive's EDS against what rigd asks of a drive.
+    """Check a drive's EDS file against the requirements.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ class _SuitabilityCheck:
         return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
 
     def _watchdog(self) -> Finding:
-        """Judge which watchdog takes the torque off when this computer falls silent."""
+        """Check which watchdog removes the torque when this computer falls silent."""
         found = self._expected_watchdog()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:
@@ -211,7 +211,7 @@ class _SuitabilityCheck:
         return Finding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
     def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
-        """Judge what is missing unless the profile accepts that by name."""
+        """Return the finding on a missing object that the profile may accept by name."""
         stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
         if self._settings is not None and needed.accept in self._settings.accept_without:
             found = f"{found}, accepted by the profile"
@@ -268,7 +268,7 @@ class _SuitabilityCheck:
     def _read_only(
         self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
     ) -> Finding:
-        """Judge an object that would be written and cannot be: what it holds may do."""
+        """Return the finding on a read-only object: its value may be acceptable."""
         what = f"{needed.address} {needed.name}"
         if needed.fit is AllowedValue.AT_LEAST:
             wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
@@ -302,7 +302,7 @@ class _SuitabilityCheck:
         return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
 
     def _unmappable(self, entry: EdsEntry) -> str:
-        """Say why an object cannot be in its PDO; empty if it can."""
+        """Describe why an object cannot be mapped into its PDO; empty if it can."""
         bits = _LENGTHS[entry.index]
         if entry.bits not in (None, bits):
             return f"has {entry.bits} bits, not {bits}"

@@ -82,14 +82,14 @@ class TorqueFollowing:
     tolerance_percent
         Tolerance in percent of the rated torque; 0 disables the comparison.
     response_s
-        Time constant of that lag; 0 for a drive that tells what it was told.
+        Time constant of that lag; 0 for a drive that reports the commanded torque.
     period_s
         Time between two commands.
 
     Attributes
     ----------
     compares : bool
-        The drive tells its torque at all.
+        Whether the drive reports its torque.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class TorqueFollowing:
     ) -> None:
         self._name = name
         self._tolerance = 10.0 * tolerance_percent
-        # Share of a step that a command reaches after one period.
+        # Fraction of a step that a command reaches after one period.
         self._step_fraction = 1.0 - exp(-period_s / response_s) if response_s else 1.0
         self.compares = True
         self.start()
 
     def start(self) -> None:
-        """Begin with a drive that has been told to exert nothing."""
+        """Start with a drive whose commanded torque is zero."""
         self._commanded = 0
         self._last = 0.0
         self._before = 0.0
@@ -157,7 +157,7 @@ _SWITCH_OFF_NS = 50_000_000
 
 
 class StopRequestedError(Exception):
-    """The operator wants no enabled drive any more."""
+    """The operator requested a stop while the drive was being enabled."""
 
 
 def step_up(node: Node, stop: Callable[[], bool]) -> None:
@@ -168,13 +168,12 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
     node
         The drive's node.
     stop
-        Asked once a period whether to give up.
+        Called once a period; True aborts the transition.
 
     Raises
     ------
-    StopAskedError
-        If it said so. The drive may be enabled then.
-    DeviceError
+    StopRequestedError
+        If `stop` returned True. The drive may be enabled then. DeviceError
         If a step takes longer than ``cia402.enable_timeout_s``, the drive then ignores the torque,
         or is in another mode. It may be enabled then.
     """

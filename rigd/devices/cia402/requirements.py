@@ -1,8 +1,8 @@
 """Requirements on a drive's object dictionary: one table for set-up, EDS files and docs.
 
-An object is *core* where no session is possible without it, and *optional* where something else
-stands in. An optional object that is read-only is fine as long as it holds what is needed
-(:class:`AllowedValue`). Where nothing stands in by itself, the profile has to accept that by name
+An object is *core* if no session is possible without it, and *optional* if something else replaces
+it. An optional object may be read-only if it holds an allowed value (:class:`AllowedValue`). If
+nothing replaces it by itself, the profile has to accept its absence by name
 (``cia402.accept_without``), or the drive is refused.
 
 Imports nothing but the indices, so that a program which only reads an EDS file can use it.
@@ -51,7 +51,7 @@ class Watchdog(Enum):
 
 
 def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
-    """Return which watchdog stands, the best first.
+    """Return the watchdog that is active, the best one first.
 
     Parameters
     ----------
@@ -68,24 +68,24 @@ def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
 
 
 class AllowedValue(Enum):
-    """Which values an object may hold that cannot be written."""
+    """Rule for the value of an object that cannot be written."""
 
     EQUAL = "exactly"
-    """The one that is needed."""
+    """The required value."""
     AT_LEAST = "at least"
-    """A limit that does not cut what is needed."""
+    """A limit of at least the required value."""
     EQUAL_OR_UNUSED = "exactly, or 0"
-    """0 says that it is not used."""
+    """The required value, or 0: not used."""
     ANY = "any"
     """It is only read."""
 
     def allows(self, found: int, wanted: int) -> bool:
-        """Whether a value does where another one is wanted.
+        """Return whether a value is allowed where another one is required.
 
         Parameters
         ----------
         found, wanted
-            Value that the object holds, and the one that is needed.
+            Value that the object holds, and the required one.
         """
         if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
             return found == wanted or (self is AllowedValue.EQUAL_OR_UNUSED and found == 0)
@@ -114,7 +114,7 @@ class Requirement:
         Values that it may hold where it cannot be written.
     accept
         Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
-        not have to. (For 1016:1 only where no other :class:`Watchdog` stands.)
+        not have to. (For 1016:1 only if no other :class:`Watchdog` is active.)
     zero
         Has to read 0 where it is there: something that a drive may hold from before.
     """
@@ -230,7 +230,7 @@ CORE: Final = (
 """No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
 
 OPTIONAL: Final = (
-    # Identity and texts: told in reports, compared only where the profile names them.
+    # Identity and texts: reported, and compared only if the profile states them.
     Requirement(
         objects.IDENTITY,
         1,
@@ -502,7 +502,7 @@ OPTIONAL: Final = (
         fit=AllowedValue.ANY,
     ),
 )
-"""Objects that something else stands in for."""
+"""Objects that something else can replace."""
 
 REQUIREMENTS: Final = CORE + OPTIONAL
 
@@ -516,7 +516,7 @@ MAY_BE_WRITE_ONLY: Final = (
     objects.MAX_SPEED_RPM,
 )
 """Objects that are set whatever they held before, so that one that cannot be read is written and
-taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
+not verified. (6060 is write-only in the first editions of CiA 402; 6061 shows the mode.)"""
 
 _BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 
@@ -573,7 +573,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     Raises
     ------
     DeviceError
-        If the period cannot be told to a drive.
+        If a drive cannot represent the period.
     """
     settings = rig.cia402
     assert settings is not None
