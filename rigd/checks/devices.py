@@ -1,8 +1,8 @@
 """Checks of the connected devices: drive, sensor and their exchange, without a torque.
 
-The devices are connected, asked and polled, but the drive is never enabled. The exchange of a tick
+The devices are connected, read and polled, but the drive is never enabled. The exchange of a tick
 is as in a session before the drive is enabled: SYNC, poll, replies. It runs in an ordinary process,
-which oversleeps now and then; what a device cannot do shows in most ticks.
+which wakes up late now and then; a fault of a device shows in most ticks.
 """
 
 import time
@@ -49,15 +49,15 @@ class InspectableDrive(Protocol):
     """A drive with an identity; simulated ones in this process have none."""
 
     def identity(self) -> Mapping[str, object]:
-        """Return what it said of itself when it was connected; the keys end in their units."""
+        """Return the identity reported at connecting; the keys end in their units."""
 
 
 @runtime_checkable
 class InspectedDrive(Protocol):
-    """A drive whose objects were looked through when it was connected."""
+    """A drive whose objects were checked when it was connected."""
 
     def capabilities(self) -> DriveCapabilities | None:
-        """Return what it turned out to have."""
+        """Return the capabilities found at connecting."""
 
 
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
@@ -138,7 +138,7 @@ class MeasurableSensor(Protocol):
     """A sensor whose rate can be measured; simulated ones in this process have none."""
 
     def measure(self, duration_s: float) -> Mapping[str, float]:
-        """Poll it, or watch its stream, for a while; the keys of the result end in their units."""
+        """Measure polls or stream for a while; the keys of the result end in their units."""
 
 
 def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[Row]:
@@ -189,7 +189,7 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
 def _measured_rows(
     measured: Mapping[str, float], rig: RigParameters, cause: str = ""
 ) -> Iterator[Row]:
-    """Judge rate and turn-round of the sensor; `cause` is what it says of gaps in its stream."""
+    """Return the rows on rate and turn-round; `cause` is the sensor's reason for gaps."""
     for key, value in measured.items():
         wanted, verdict = _assess_diagnostic(key, value, rig)
         detail = cause if key == "longest_gap_s" and verdict is not Verdict.OK else ""
@@ -220,7 +220,7 @@ def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
 
 
 def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
-    """Return what a measured value should be, and whether it is."""
+    """Return the expected value of a diagnostic, and the verdict."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
     same_tick = acquisition is not None and acquisition.mode == "same_tick"
@@ -251,14 +251,14 @@ _GROUP = "exchange"
 
 
 def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
-    """Run some ticks without a torque, and judge how quickly and how surely the replies come.
+    """Run some ticks without a torque, and check latency and losses of the replies.
 
     Parameters
     ----------
     profile
         Profile whose limits count.
     devices
-        Connected, not enabled.
+        Devices that are connected, not enabled.
     moves
         What moves. In lock-step the simulated rig waits for this computer: times mean nothing.
 
@@ -334,7 +334,7 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row
 
 
 def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
-    """Say whether scales and signs are known, or verified before the first session."""
+    """Return the row on scales and signs: known, or verified before the first session."""
     if moves is WhatMoves.SIMULATED:
         return
     missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
@@ -357,7 +357,7 @@ def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
 
 
 def inspect_devices(profile: Profile) -> list[Row]:
-    """Connect to the devices of a profile, ask them, run some ticks, and let go of them.
+    """Connect to the devices of a profile, read them, run some ticks, and release them.
 
     No torque: the drive is never enabled. Whatever happens, both devices are closed.
     """
@@ -410,7 +410,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
 
 
 def _try(group: str, found: Iterable[Row], rows: list[Row]) -> bool:
-    """Take in rows up to the first error, which becomes one too; say whether there was none."""
+    """Collect rows up to the first error, which becomes a row; return whether there was none."""
     try:
         rows.extend(found)
     except (DeviceError, OSError) as error:

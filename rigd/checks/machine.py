@@ -46,9 +46,9 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return what the control process is granted, tried in its own process.
+    """Return the settings granted to the control process, tried in a process of its own.
 
-    Under ``supervision`` stands what supervisor and recorder are.
+    The key ``supervision`` holds the settings of supervisor and recorder.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
-    """Show which of the profile's real-time settings a session would be granted."""
+    """Return the rows on the real-time settings that a session would be granted."""
     try:
         obtained = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
@@ -96,7 +96,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
 
 
 def _remedy(name: str, settings: RealtimeSettings) -> str:
-    """Return what is too long for the table."""
+    """Return the remedy, which is too long for the table."""
     if name == "idle_states":
         return _IDLE_STATES_REMEDY
     lines = {
@@ -132,13 +132,13 @@ _TIMEX_SIZE = 512
 """More than the kernel's structure has on any architecture."""
 _NOT_SYNCHRONISED = 5
 _LEAST_RUNTIME = 0.95
-"""Share of each period that the kernel leaves to real-time processes by default."""
+"""Fraction of each period that the kernel leaves to real-time processes by default."""
 
 
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[Row]:
-    """Show what on this computer makes ticks late, and the remedies.
+    """Return the rows on settings of this computer that delay ticks, with remedies.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
 
 
 def _synchronised() -> bool:
-    """Whether the kernel knows of somebody who keeps its wall clock right."""
+    """Return whether the kernel reports a synchronised wall clock."""
     try:
         state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
     except (OSError, AttributeError):

@@ -74,7 +74,7 @@ _HIGH_MISFIT = 1.5
 
 @dataclass(frozen=True, slots=True)
 class ProposalRow:
-    """A number of the profile beside what was measured."""
+    """A number of the profile and its measured value."""
 
     key: str
     measured: MotorQuantity
@@ -91,7 +91,7 @@ class ProposalRow:
 
     @property
     def is_below_least(self) -> bool:
-        """Whether the measured value is smaller than can be, by more than its scatter."""
+        """Whether the measured value is below its lower bound by more than its scatter."""
         lowest = self.least - _DIFFERS * (self.measured.std or 0.0)
         return self.least > 0.0 and self.measured.value < lowest
 
@@ -103,7 +103,7 @@ class ProposalRow:
         return abs(self.measured.value - self.profile_value) > _DIFFERS * self.measured.std
 
     def toml(self) -> str:
-        """Return the line to paste: within its scatter no value is smaller than it can be."""
+        """Return the line to paste; a value below its bound by less than its scatter is raised."""
         std = self.measured.std or 0.0
         value, deviation = _rounded(self.measured.value, std)
         if not self.is_below_least and float(value) < self.least:
@@ -114,12 +114,12 @@ class ProposalRow:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """An estimate beside the profile it is to improve."""
+    """Comparison of an estimate with the profile that it is to improve."""
 
     estimate: MotorEstimate
     """Estimate of the motor."""
     rows: tuple[ProposalRow, ...]
-    """Quantity by quantity, the estimate beside the profile."""
+    """Comparison of estimate and profile, one row a quantity."""
     notes: tuple[str, ...]
     """Sentences for the operator."""
 
@@ -286,7 +286,7 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
 
 
 def _rounded(value: float, std: float) -> tuple[str, str]:
-    """Write a value and its deviation to two figures of the deviation."""
+    """Format a value and its deviation to two digits of the deviation."""
     if std <= 0.0:
         return f"{value:.6g}", "0"
     exponent = floor(log10(max(abs(value), std)))

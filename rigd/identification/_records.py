@@ -1,4 +1,4 @@
-"""Windows of motion from recorded sessions, as the estimate takes them."""
+"""Windows of motion from recorded sessions, as input of the estimate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from rigd.session.layout import Status
 _USELESS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
 )
-"""A held or clipped reading does not belong to the torque of its tick."""
+"""Status bits of held or clipped readings, which do not belong to the torque of their tick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,9 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     ------
     SessionError
         If a file cannot be read.
-    EstimateError
-        If a file is of another excitation, its rate or delays are not those of the first, or two
+    MotorEstimateError
+        If a file is of another excitation, its rate or delays are not those of the
+    first, or two
         files have samples in common.
     """
     windows: list[PassReadings] = []

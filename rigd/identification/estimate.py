@@ -6,13 +6,13 @@ between commands,
     ``s u(t - D) = J θ'' + B θ' + C sign(θ') + z + τ_c``,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
-reading is differentiated; frequency by frequency this gives linear rows, _moments of the readings
+reading is differentiated; frequency by frequency this gives linear rows, moments of the readings
 (`_moments`). All integrals are exact for a command that changes at any moment of a period. The
-measured coupling torque τ_c stands alone on its side because it carries the noise.
+measured coupling torque τ_c is alone on its side because it carries the noise.
 
 The rows are fitted by weighted least squares (`_fit`). The mean of repeats is fitted, because the
 loop feeds the noise of a reading back into the command and so biases a fit of single ones; their
-scatter gives the weights, what is left of that bias, and the standard deviations.
+scatter gives the weights, the remainder of that bias, and the standard deviations.
 """
 
 from collections.abc import Hashable, Sequence
@@ -34,7 +34,7 @@ SCALE, INERTIA, VISCOUS, COULOMB, DELAY, ZERO = range(6)
 """Indices of the unknowns; from the last on, one zero of the torque for each session."""
 
 _FLANK = 0.15
-"""Part of a window in which the test functions rise, and fall."""
+"""Part of a window over which the test functions rise, and fall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def _moments(
     age_s = timing.angle_delay_s - timing.torque_delay_s
     y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
 
-    # A command stands for a period: its middle, and the integral over the period around it.
+    # A command lasts a period: its middle, and the integral over the period around it.
     middle_s = delay_s + 0.5 * period_s
     w, w1, _ = _test_window(tick_s + middle_s, length_s)
     held = np.sinc(omega * period_s / (2.0 * pi))
@@ -132,7 +132,7 @@ def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
 
 _MARGIN = 1.25
 """On all deviations: they are themselves known to some 15 %, and the filter of the readings and the
-beam's share in a jump of torque are not in the model."""
+beam's part in a jump of torque are not in the model."""
 _MAX_ITERATIONS = 30
 _CONVERGED_S = 1e-9
 _LONGEST_DELAY_S = 0.05
@@ -141,7 +141,7 @@ _SMOOTHED_BINS = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """The unknowns in the order of `_moments`, and the fit's own diagnostics."""
+    """Solution in the order of `_moments`, with diagnostics."""
 
     values: Real
     """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""
@@ -151,7 +151,7 @@ class _Fit:
 
 
 def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit | None:
-    """_Fit by least squares, iterated for delay and weights; None if it does not settle.
+    """Fit by least squares, iterated for delay and weights; None if it does not converge.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
     timing
         Timing of the readings; the search for the delay starts at its value.
     hold_scale
-        Take the commanded torque for the true one.
+        Whether the commanded torque counts as the true one.
     """
     unknowns = ZERO + 1 + max(stack.session for stack in stacks)
     free = np.arange(unknowns) != SCALE if hold_scale else np.full(unknowns, fill_value=True)
@@ -175,7 +175,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
         if abs(change_s) < _CONVERGED_S:
             try:
                 return _with_uncertainty(rows, weights, residuals, free, solution, delay_s)
-            except np.linalg.LinAlgError:  # something is not in the record at all
+            except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
         delay_s, scale = delay_s + change_s, float(solution[SCALE])
         if not (abs(delay_s) < _LONGEST_DELAY_S and scale > 0.0):
@@ -185,7 +185,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
 
 
 def _solve(rows: Sequence[_StackMoments], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
-    """_Fit the means of the repeats; the scale, where it is not free, is 1."""
+    """Fit the means of the repeats; the scale, if it is not free, is 1."""
     solution = np.zeros(free.size)
     solution[SCALE] = 1.0
     matrix, side = [], []
@@ -274,17 +274,17 @@ def _with_uncertainty(
 
 
 def _coverage(freedom: Real) -> Real:
-    """Three quantiles' worth: Student's t over the normal's at 3, to second order in 1/freedom."""
+    """Return Student's t over the normal quantile at 3 deviations, to second order in 1/freedom."""
     return 1.0 + (7.5 / freedom + 17.25 / freedom**2) / 3.0
 
 
 # Estimate of a motor
 
 LEAST_REPEATS = 4
-"""Fewer tell too little of the scatter."""
+"""Fewer repeats do not determine the scatter."""
 
 _LEAST_SPEED_PART = 0.1
-"""Share of the nominal speed below which a window may contain a standstill."""
+"""Fraction of the nominal speed below which a window may contain a standstill."""
 _SPEED_S = 0.01
 """Half the time over which that speed is taken."""
 _MAX_SCALE_STD = 0.05
@@ -311,7 +311,7 @@ class PassReadings:
     speed_rad_s: float
     """Nominal, signed."""
     top_hz: float
-    """Up to where there is something to see."""
+    """Highest frequency of the motion."""
     session: int
     """Each session has its own zero of the torque."""
     key: Hashable
@@ -348,7 +348,7 @@ class MotorEstimate:
     dropped: int
     """Windows in which the shaft may have stood still."""
     misfit: float
-    """Mean square of what the equation leaves, over what scatter explains: 1 if it holds."""
+    """Mean square of the residual over that expected from scatter: 1 if the equation holds."""
     friction_departure_nm: float
     """Largest departure of a pass's mean torque from viscous and Coulomb friction."""
 
@@ -356,7 +356,7 @@ class MotorEstimate:
 def estimate_motor(
     windows: Sequence[PassReadings], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
 ) -> MotorEstimate:
-    """_Fit the motor's equation to windows in which its speed keeps its sign.
+    """Fit the motor's equation to windows in which its speed does not change sign.
 
     Parameters
     ----------
@@ -377,8 +377,8 @@ def estimate_motor(
 
     Raises
     ------
-    EstimateError
-        If there are too few windows, or the fit does not settle.
+    MotorEstimateError
+        If there are too few windows, or the fit does not converge.
     """
     moving = [window for window in windows if _never_stops(window, timing.rate_hz)]
     stacks = _stack(moving, len(windows))

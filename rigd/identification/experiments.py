@@ -1,10 +1,10 @@
 """The sessions that identify a motor: a multisine on passes at constant speed, and slow passes.
 
 Friction jumps where a motor turns round, and nobody knows how: sticking, wind-up, backlash. So the
-shaft sweeps to and fro at constant speed, with smooth turns, and what is looked at is the inside of
-each pass, where the speed keeps its sign and Coulomb friction is a constant. The multisine rides on
-fast passes and moves the speed by at most half of it. Every cycle of passes is the same, but for an
-offset of some encoder steps, so that cycles can be averaged and tell how much they scatter.
+shaft sweeps to and fro at constant speed, with smooth turns, and the estimate uses the inside of
+each pass, where the speed does not change sign and Coulomb friction is a constant. The multisine
+rides on fast passes and moves the speed by at most half of it. Every cycle of passes is the same,
+but for an offset of some encoder steps, so that cycles can be averaged and their scatter estimated.
 """
 
 from collections.abc import Mapping
@@ -26,13 +26,14 @@ SPEEDS = "motor-speeds"
 """Kinds of the sessions."""
 
 TOP_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
-"""Up to where the passes of each kind move the shaft, or the beam swings from a turn."""
+"""Highest frequency in Hz of the shaft's motion, or of the beam's swing after a turn, by kind."""
 
 _MAX_SPEED_RAD_S = 1.0
 _LIMIT_FRACTION = 0.5
-"""Share of the profile's speed limit: the rest is for multisine and a motor unlike its data."""
+"""Fraction of the profile's speed limit: the rest is for multisine and errors of the motor's
+data."""
 _STROKE_FRACTION = 0.93
-"""Share of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
+"""Fraction of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
 _SPEED_PARTS = (0.1, 0.3, 0.6, 1.0)
 _MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
 """Part of the speed that the multisine modulates. The trial knows little of the motor: a quarter of
@@ -49,9 +50,9 @@ _GOLDEN = 0.618033988749895
 
 @dataclass(frozen=True, slots=True)
 class PassSchedule:
-    """When the shaft goes how: all of a session's passes follow from it.
+    """Schedule of the shaft's motion, which defines all passes of a session.
 
-    Each pass is a turn, a time to settle, and the window that is looked at.
+    Each pass is a turn, a time to settle, and the window that is evaluated.
     """
 
     speeds_rad_s: tuple[float, ...]
@@ -160,7 +161,7 @@ def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float)
     together_nm = _peak_torque(loop, carrier + ride)
     fraction = 1.0
     if together_nm > limit_nm:
-        # The peak is convex in the share: on the straight line between the two it is lower yet.
+        # The peak is convex in the fraction: below the straight line between the two.
         fraction = (limit_nm - alone_nm) / (together_nm - alone_nm)
     if fraction < _LEAST_MULTISINE:
         needed_nm = alone_nm + _LEAST_MULTISINE * (together_nm - alone_nm)
@@ -299,7 +300,7 @@ def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> Non
 
 
 def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
-    """Return the reference whose answer moves the speed by a part of that of the passes."""
+    """Return the reference whose response modulates the speed of the passes by a fraction."""
     rate_hz = loop.model.rate_hz
     window = round(layout.window_s * rate_hz)
     step_hz = rate_hz / window

@@ -1,4 +1,4 @@
-"""Drive and sensor of the simulated rig: what the plant does, as the devices would show it.
+"""Drive and sensor of the simulated rig: the plant as the devices measure it.
 
 The drive's latch, which comes first in a tick, moves the rig on to it; periods that the loop
 missed pass with the last torque held, as they do on a real rig.
@@ -50,7 +50,7 @@ class Stuck:
         self._value: object = None
 
     def __call__(self, value: T) -> T:
-        """Return what is shown in place of a reading."""
+        """Return the reading that replaces a given one."""
         if self._count == 0 or (self._every and self._count % self._every == 0):
             self._value = value
         self._count += 1
@@ -92,7 +92,7 @@ class SimulatedRig:
     records_per_period : int
         Readings of the sensor in one period.
     stuck_encoder : Stuck or None
-        What an encoder shows that has failed; None: it works.
+        Readings of a failed encoder; None: it works.
     """
 
     def __init__(self, rig: RigParameters) -> None:
@@ -121,7 +121,7 @@ class SimulatedRig:
         self.stuck_encoder: Stuck | None = None
 
     def begin_session(self, seed: int) -> None:
-        """Begin the noise anew, and take the beam of this session where it differs between them.
+        """Restart the noise, and use the beam of this session if beams differ between sessions.
 
         The drive is off. A beam takes a tenth of a second to make.
 
@@ -148,7 +148,7 @@ class SimulatedRig:
             self.sensor.sample()
 
     def check(self, disturbance: Disturbance) -> None:
-        """Refuse what the beam cannot meet beside what it meets already.
+        """Raise if a disturbance cannot be simulated in addition to the present ones.
 
         Raises
         ------
@@ -164,15 +164,14 @@ class SimulatedRig:
             )
 
     def meet(self, disturbance: Disturbance, *, wait: bool) -> None:
-        """Put an obstacle or a knock in the beam's way.
+        """Add an obstacle or a knock.
 
         Parameters
         ----------
-        encounter
-            Its times count from the first enabling of the drive.
-        wait
-            Let it take effect before the next period, for which the caller waits a tenth of a
-            second. Otherwise another process makes ready for it, and the rig goes on meanwhile.
+        disturbance
+            Its times count from the first enabling of the drive. wait
+            Whether it takes effect before the next period; the caller then waits a tenth of a
+            second. Otherwise another process prepares it, and the rig continues meanwhile.
         """
         self._met.append(disturbance)
         if wait:
@@ -181,17 +180,17 @@ class SimulatedRig:
             self._prepare()
 
     def end(self, disturbance: Disturbance) -> None:
-        """Take an obstacle away that `meet` put there."""
+        """Remove an obstacle that `meet` added."""
         self._ended.append(disturbance)
         self.plant.end_obstacle(disturbance)
 
     def _prepared(self) -> tuple[int, SimulatedPlant]:
-        """Make a plant that meets all that was added so far, and their number."""
+        """Return a plant with all disturbances added so far, and their number."""
         texts = [describe_obstacle(disturbance) for disturbance in self._met]
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _prepare(self) -> None:
-        """Make it in a process of its own: a thread would hold the interpreter's lock."""
+        """Start the preparation in a process: a thread would hold the interpreter's lock."""
         import tempfile  # late: no session needs it
 
         file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
@@ -208,7 +207,7 @@ class SimulatedRig:
         self._preparing = process, file
 
     def _poll_preparation(self) -> None:
-        """Take over what was prepared, once it is; what came meanwhile is prepared next."""
+        """Use the prepared plant if it is ready; then prepare disturbances added meanwhile."""
         assert self._preparing is not None
         process, file = self._preparing
         ended, status = os.waitpid(process, os.WNOHANG)
@@ -254,7 +253,7 @@ class SimulatedDrive:
 
     @property
     def stuck_encoder(self) -> Stuck | None:
-        """What an encoder shows that has failed; it may be set."""
+        """Readings of a failed encoder; None: it works. Can be set."""
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
@@ -265,7 +264,7 @@ class SimulatedDrive:
         """Nothing to connect to."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
-        """Let commands through."""
+        """Enable the drive."""
         if self._sto_dropped:
             raise wired_stop_dropped(_NAME)
         self._plant.enable()
@@ -285,7 +284,7 @@ class SimulatedDrive:
         return LineHealth()
 
     def disable(self) -> None:
-        """Zero the torque, and let no command through."""
+        """Zero the torque, and ignore further commands."""
         self._plant.disable()
         self.read_angle = self._rig.read_angle
 
@@ -323,13 +322,13 @@ class SimulatedSensor:
     rate_hz
         Rate of the readings, by which the hum goes on.
     weights
-        Weights of the last readings in the value, oldest first; one weight: a reading is taken when
-        it is asked for.
+        Weights of the last readings in the value, oldest first; one weight: a reading is taken on
+        request.
 
     Attributes
     ----------
     stuck : Stuck or None
-        What a sensor shows that has failed; None: it works.
+        Readings of a failed sensor; None: it works.
     """
 
     def __init__(
@@ -396,7 +395,7 @@ class SimulatedSensor:
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
-        """Begin the noise anew from a seed."""
+        """Restart the noise from a seed."""
         self._rows = chain.from_iterable(self._noise(seed))
         self.records.clear()
 
@@ -406,7 +405,7 @@ class SimulatedSensor:
         self._saturated |= self.wrench_saturated
 
     def elapse(self, readings: int) -> None:
-        """Let the time of some readings pass, taken or not."""
+        """Advance the time by some readings."""
         if self._hum_nm:
             # Whole turns are left out, for the phase to stay exact.
             self._hum_turns = (self._hum_turns + readings * self._hum_turn) % 1.0
@@ -458,7 +457,8 @@ _CROSSTALK = (
     (-0.88, -0.33, 0.46, 0.54, 0.0, 0.79),
     (0.41, -0.97, 0.68, -0.75, 0.29, 0.0),
 )
-"""Share of its range that each axis (row) shows of the full range of another, over the largest."""
+"""Crosstalk of each axis (row) at the full range of another, over its range and the largest
+entry."""
 
 
 def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[float], list[float]]:

@@ -1,10 +1,10 @@
 """Obstacles in the way of the simulated beam, and knocks on it, tick by tick.
 
-A force on the beam drives states of its own beside those of the plant (`realise_force`): they tell
-what it does to the beam, and by their torque it acts on the shaft. Where the beam touches nothing,
-plant and these states go on by whole periods. Near an obstacle a period is divided into substeps,
-over each of which the force is constant; all that the rest of the plant does meanwhile is linear
-and known exactly, so the force of each substep is the root of one scalar equation.
+A force on the beam drives additional states (`realise_force`): they describe its effect on the
+beam, and their torque acts on the shaft. Where the beam touches nothing, plant and these states go
+on by whole periods. Near an obstacle a period is divided into substeps, over each of which the
+force is constant; all that the rest of the plant does meanwhile is linear and known exactly, so the
+force of each substep is the root of one scalar equation.
 
 Within a substep the penetration goes from a to q. The mean of the obstacle's elastic force over it
 is taken so that the work done on the obstacle is the energy it then holds, or has given back: no
@@ -29,7 +29,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _RIGID_N_PER_M = 1e9
-"""What stands for an obstacle that does not yield: it yields a nanometre for a newton."""
+"""Stiffness of a rigid obstacle: it yields a nanometre for a newton."""
 _STIFFEST_N_PER_M = 1e5
 """Stiffest obstacle whose touch the substeps resolve."""
 _PER_CONTACT_TIME = 6
@@ -39,16 +39,16 @@ _FEWEST_SUBSTEPS = 8
 _FREE_END = 4.0
 """By how much a beam gives way more readily at its tip than far from it."""
 _NEAR_M = 1e-3
-"""Distance within which the beam may touch between the ends of a period, beside what it moves."""
+"""Distance, in addition to the beam's motion, within which it may touch during a period."""
 _SMALL = 0.01
-"""Displacement, as a share of the rigid beam's, below which the absolute error counts: there the
+"""Displacement, as a fraction of the rigid beam's, below which the absolute error counts: there the
 beam hardly follows the motor."""
 _SWEEPS = 3
 """Over several obstacles that the beam touches in one substep."""
 
 
 class AttachedObstacles:
-    """What the beam meets, attached to the plant.
+    """Obstacles and knocks, attached to the plant.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class AttachedObstacles:
         Force on the beam over each substep of the last period, positive towards a positive angle.
     substeps : int
         Substeps of a period.
-    bodies : tuple of Encounter
+    bodies : tuple of Disturbance
         The obstacles and knocks.
     """
 
@@ -121,14 +121,14 @@ class AttachedObstacles:
         return np.column_stack([self._turned, self._own[:-2]])
 
     def attached(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Extend motor and beam by what the forces do to the beam.
+        """Extend motor and beam by the effect of the forces on the beam.
 
         Returns
         -------
         model
             With more states for each force, whose torque acts on the shaft.
         of_force
-            What each force adds to the state's derivative, (n, bodies).
+            Effect of each force on the state's derivative, (n, bodies).
         """
         bodies, own_states = self._at_m.size, self._b.size
         n, more = model.b.size, bodies * own_states
@@ -183,7 +183,8 @@ class AttachedObstacles:
         phi, whole = propagator(model, step_s)
         displacement_rows = self.displacement_rows
 
-        # Without a force: the states' share, row by row, and that of the torques column by column.
+        # Without a force: contribution of the states, row by row, and of the torques, column by
+        # column.
         rows = np.empty((steps, bodies, n))
         row = displacement_rows
         for j in range(steps):
@@ -199,7 +200,7 @@ class AttachedObstacles:
         free = np.column_stack([rows.reshape(-1, n), torques.reshape(-1, 2)])
         free = np.column_stack([free, free[:, :n] @ friction])
 
-        # What a force of 1 N over one substep leaves of the state after j more.
+        # State that remains of a force of 1 N over one substep, j substeps later.
         left = np.empty((steps, n, bodies))
         left[0] = held_inputs(model, of_force, step_s)
         for j in range(1, steps):
@@ -208,7 +209,7 @@ class AttachedObstacles:
         kernel[0] += self._direct[:-2]
 
         def effect_on(row: Real, direct: Real, instant_s: float) -> Real:
-            """Return what each substep's force adds to an output at an instant."""
+            """Return the effect of each substep's force on an output at an instant."""
             at = instant_s / step_s
             number = min(int(at), steps - 1)
             fraction = at - number
@@ -244,11 +245,11 @@ class AttachedObstacles:
         )
 
     def nothing(self, displacement_m: Real, time_s: float) -> bool:
-        """Tell whether the beam can have touched nothing over a period without a force.
+        """Return whether the beam cannot have touched anything over a period without a force.
 
         Parameters
         ----------
-        place_m
+        displacement_m
             Displacement at each body at its end, shape (bodies,).
         time_s
             Time at its start.
@@ -334,7 +335,7 @@ class AttachedObstacles:
         return forces
 
     def _meet(self, march: "March", walls: "list[_Wall]") -> None:
-        """March through a period; what the walls push is written into their forces.
+        """Compute the walls' forces, substep by substep, through a period.
 
         Forces of the substeps to come are zero, so that whole rows may be summed.
         """
@@ -380,14 +381,14 @@ class AttachedObstacles:
             j += 1
 
     def take_over(self, state: Real, other: "AttachedObstacles | None") -> Real:
-        """Go on where another contact of the same beam is, whose bodies are the first of these.
+        """Continue from another contact of the beam, whose bodies are the first of these.
 
         Parameters
         ----------
         state
             State of the plant with the other contact.
         other
-            None: the beam met nothing yet.
+            None: there was no contact before.
 
         Returns
         -------
@@ -415,14 +416,14 @@ class AttachedObstacles:
         return whole
 
     def end(self, body: Disturbance, time_s: float) -> None:
-        """Take an obstacle away."""
+        """Remove an obstacle."""
         self._obstacles = [
             (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
             for index, each, k in self._obstacles
         ]
 
     def take(self, march: "March", forces_n: Real, free_m: Real) -> None:
-        """Go on from what `forces` found last."""
+        """Continue from the last result of `forces`."""
         self.forces_n = forces_n
         self._penetration_m = self._ends_m
         self._displacement_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)

@@ -1,8 +1,8 @@
 """Physics of the simulated rig: motor, clamp and beam between two ticks.
 
 Motor and beam are one linear model, stepped exactly for torques that are constant between the
-instants at which commands arrive. Coulomb friction, saturation and delays stand around it. Nothing
-here quantises or adds noise: that is what the simulated devices do with the values at a tick.
+instants at which commands arrive. Coulomb friction, saturation and delays are added to it.
+Quantisation and noise are those of the simulated devices, not of the plant.
 """
 
 from collections import deque
@@ -33,7 +33,7 @@ _OF_OBSTACLES = (
 
 _FRICTION_SWEEPS = 4
 _SAME_FRICTION = 1e-3
-"""Change of the Coulomb friction, as a share of the whole, that an obstacle is not told of."""
+"""Change of the Coulomb friction, as a fraction of the whole, that the contact may neglect."""
 
 _STENCIL = 4
 """Readings through which the value between two of them is taken."""
@@ -73,7 +73,7 @@ class SimulatedPlant:
     RealisationError
         If the beam's damping cannot be realised, at the stiffness that it drifts to included.
     ObstacleError
-        If an obstacle is not written as it should be, or lies beyond the beam's tip.
+        If an obstacle has a syntax error, or lies beyond the beam's tip.
 
     Notes
     -----
@@ -260,7 +260,7 @@ class SimulatedPlant:
         return max(self._periods, 0) * self._period_s
 
     def become(self, other: "SimulatedPlant") -> None:
-        """Become another plant, at rest at the angle of this one, the drive off.
+        """Adopt another plant's parameters, at rest at the present angle, with the drive off.
 
         Parameters
         ----------
@@ -276,7 +276,7 @@ class SimulatedPlant:
         self.angle_rad = self.sensed_angle_rad = angle_rad
 
     def meet(self, prepared: "SimulatedPlant") -> None:
-        """Meet the obstacles of another plant from here on, in the state of this one.
+        """Use the obstacles of another plant from now on, in the present state.
 
         Parameters
         ----------
@@ -293,12 +293,12 @@ class SimulatedPlant:
         self._vectors[0][0][: state.size] = state
 
     def end_obstacle(self, obstacle: Disturbance) -> None:
-        """Take an obstacle away, if there is such a one."""
+        """Remove an obstacle, if there is one like this."""
         if self._contact is not None:
             self._contact.end(obstacle, self.elapsed_s)
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque to exert from this tick on, after the actuation delay.
+        """Set the torque from this tick on, after the actuation delay; return it.
 
         Returns
         -------
@@ -315,7 +315,7 @@ class SimulatedPlant:
         return torque_nm
 
     def advance(self, n_periods: int = 1) -> None:
-        """Go to the tick `n_periods` from here, with the last command repeated at those between."""
+        """Advance by `n_periods` ticks, with the last command repeated at those between."""
         n = self._states
         torques = self._torques
         for _ in range(n_periods):
@@ -394,21 +394,21 @@ class SimulatedPlant:
             self.sensed_shear_n = self._sensed_shears[0]
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
-        """Set what is told of half a jump of the motor's torque at a tick."""
+        """Set the effect of half a jump of the motor's torque on the outputs at a tick."""
         self._jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
         self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
         self._sensed_jump_gain = self._jump_gain if self._jump_is_sensed else 0.0
         self._sensed_shear_jump_gain = self._shear_jump_gain if self._jump_is_sensed else 0.0
 
     def _take_stiffness(self, drift: StiffnessDrift) -> None:
-        """Take what is not in the matrices of a step, which have changed by themselves."""
+        """Update the quantities that depend on the stiffness and are not in the step matrices."""
         self._friction_effects = drift.arrays[2].tolist()
         self._set_jump_gains(*drift.arrays[3].tolist())
 
     def _touch(self, march: March, input_: Real, output: Real, *, turns: bool) -> None:
-        """Add what the obstacles do to a step that was made without them.
+        """Add the effect of the obstacles to a step computed without them.
 
-        Friction acts on the touch and the touch on friction: they are found in turn, from the
+        Friction and contact depend on each other: they are computed in turn, beginning with the
         friction of the period before.
         """
         contact = self._contact
@@ -444,7 +444,7 @@ class SimulatedPlant:
         sensed_torque: float,
         sensed_shear: float,
     ) -> tuple[float, float, float, float, float]:
-        """Add what the force of the air does at once to the outputs at the end of a step."""
+        """Add the immediate effect of the air's force to the outputs at the end of a step."""
         assert self._air is not None
         speed_m_s = output[self._states + OUTPUTS :]
         if free and self._friction_nm:

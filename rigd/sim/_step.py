@@ -1,7 +1,7 @@
 """One period of the simulated rig as matrices: motor and beam, on a free and on a locked shaft.
 
-From the state, the motor's torque before and after it changes, and the friction, to the state at
-the period's end and all that sensors and friction are to be told of it.
+The input is the state, the motor's torque before and after it changes, and the friction; the output
+is the state at the period's end and the quantities for sensors and friction.
 """
 
 from dataclasses import replace
@@ -118,11 +118,11 @@ def arrays_at(
     period_s: float,
     instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real, Real]:
-    """Compute what depends on the stiffness of a beam that drifts.
+    """Compute the arrays of a step for a beam whose stiffness has drifted.
 
     Parameters
     ----------
-    share
+    stiffness_ratio
         The stiffness over that at the start.
     parameters, simulation
         As for `models_of`, at the start.
@@ -136,7 +136,7 @@ def arrays_at(
     step, locked_step : (n + 8, n + 3)
     friction_effects : (8,)
     per_torque : (2,)
-        What the motor's torque adds at once to torque and shear of the sensor.
+        Immediate effect of the motor's torque on torque and shear of the sensor.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def arrays_at(
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Return the whole periods in a delay, and what is left of it in seconds.
+    """Return the whole periods in a delay, and the remainder in seconds.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def _step(
         return at_once(model.shear, model.shear_per_torque, instant_s)
 
     def at_once(of_state: Real, per_torque: float, instant_s: float) -> Real:
-        """Row of what follows the torque at once."""
+        """Return the row of the immediate effect of the torque."""
         row: Real = of_state @ state_at(instant_s)
         apart_s = instant_s - switch_s
         if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
@@ -242,7 +242,7 @@ def _step(
 def _output_rows(
     model: CoupledModel, end: Real, torque: Real, holding_torque: Real
 ) -> tuple[Real, ...]:
-    """Rows of the state at a period's end, and of what is told of it beside the sensors."""
+    """Return the rows of the state at a period's end, and of outputs other than the sensors'."""
     return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
 
 
@@ -254,7 +254,7 @@ def held_of(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """One period under a held force of the air: what it adds to [next state, outputs].
+    """Return the effect of a constant force of the air over a period on [next state, outputs].
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ class StiffnessDrift:
     fastest_rad_s
         Largest natural frequency in the arrays.
     arrays_at
-        Gives them for a stiffness over that at the start.
+        Returns the arrays for a ratio of the stiffness to that at the start.
 
     Attributes
     ----------
@@ -78,17 +78,17 @@ class StiffnessDrift:
         self._per_period = abs(rate_per_s) * period_s / MOST_DRIFT
 
     def renew(self, periods: int) -> bool:
-        """Write the arrays as they are to be for the coming periods, if it is time to.
+        """Update the arrays for the coming periods, if it is time to.
 
         Parameters
         ----------
         periods
-            Periods since the drift began, each of which is to be asked for.
+            Periods since the drift began; call it for every period.
 
         Returns
         -------
         bool
-            Whether they are others now.
+            Whether the arrays have changed.
         """
         if periods < 0 or periods % self._block:
             return False

@@ -1,4 +1,4 @@
-"""What the loop relies on, of every drive with its sensor."""
+"""Behaviour of drive and sensor that the loop relies on."""
 
 import json
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from rigd.devices.contracts import Devices, Wrench
 _PERIOD_NS = 1_000_000
 _TORQUE_NM = 0.3
 _ROUNDED = 0.1
-"""Share of a torque by which a drive may round it."""
+"""Fraction of a torque by which a drive may round it."""
 
 
 def _must(condition: bool, message: str) -> None:

@@ -84,8 +84,8 @@ def beam_torque(
 
     Notes
     -----
-    Eq. 25 on a line ``s = sigma + j omega``, whose ``exp(-sigma t)`` keeps the record's end, where
-    the beam still rings, from leaking into its beginning.
+    Eq. 25 on a line ``s = sigma + j omega``, whose ``exp(-sigma t)`` preserves the record's end,
+    where the beam still rings, from leaking into its beginning.
 
     Examples
     --------
@@ -208,7 +208,7 @@ def write_session(
     metadata : mapping of str to str, optional
         Further metadata, or other values of them.
     segments : mapping, optional
-        In place of those of the signals.
+        Used instead of those of the signals.
     ticks, t_ns, status : array (n,), optional
         Ticks, times in ns, and status bits; by default no tick is missing, and nothing is amiss.
     outcome : str

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 Log = Callable[..., None]
 
 SYNC_TIMEOUT_PERIODS = 30
-"""After how many periods without a SYNC a drive in operation faults, unless told otherwise: more
-than a host may miss by its profile, and sooner than its heartbeat is given up. Real drives differ
-from 2 upwards."""
+"""Default number of periods without a SYNC after which a drive in operation faults: more than a
+host may miss by its profile, and less than its heartbeat timeout. Real drives differ from 2
+upwards."""
 
 # Error codes of CiA 301 and 402.
 _CONNECTION_ENDED = 0x8100
@@ -100,8 +100,8 @@ class DriveNode:
         After how long without a SYNC a drive in operation faults; by default
         `SYNC_TIMEOUT_PERIODS` of its SYNC period.
     file
-        Device file of the drive it stands for: it has the objects of that one, with types, access
-        rights, limits and values at power-on, and no others.
+        Device file of the drive that it simulates: it has the objects of that one, with types,
+        access rights, limits and values at power-on, and no others.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class DriveNode:
     angle_offset_counts : int
         Added to the position: an encoder that jumped.
     sto_dropped : bool
-        The wired stop is pressed: it takes the torque away at once, and keeps the drive off for as
+        The wired stop is pressed: it removes the torque at once, and the drive stays off for as
         long as it lasts. The drive goes to fault with the profile's ``sto_error_code``, or where
         there is none to switch on disabled.
 
@@ -134,11 +134,11 @@ class DriveNode:
     -----
     A SYNC in NMT operational first lets a waiting RPDO take effect, then calls `advance`, then
     sends the TPDOs. Since the plant's own delay covers the whole way of a torque, a torque that
-    comes in after SYNC k and takes effect at SYNC k + 1 is handed over while the plant still
-    stands at k.
+    comes in after SYNC k and takes effect at SYNC k + 1 is handed over while the plant is still at
+    tick k.
 
-    Before it calls `tick` the owner has to hand over the frames that came before that time, else
-    a pause of the owner looks like a silent host.
+    Before it calls `tick` the owner has to hand over the frames that came before that time, else a
+    pause of the owner appears as a silent host.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class DriveNode:
         self._compile()
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Take a frame that somebody else sent."""
+        """Receive a frame."""
         if self._nmt is Nmt.INITIALISING:
             self._boot()
         if can_id == self._sync_id:
@@ -270,7 +270,7 @@ class DriveNode:
                     self._transmit(pdo.can_id, data)
 
     def emergency(self, code: int, register: int, vendor: bytes) -> None:
-        """Have the drive fail with an error code, bits of the error register, vendor's bytes."""
+        """Put the drive in fault with an error code, error register bits, and vendor's bytes."""
         self._fail(code, register, vendor)
 
     def reset(self) -> None:
@@ -278,11 +278,11 @@ class DriveNode:
         self._boot()
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which makes no difference here."""
+        """Simulate a power cycle, which equals a reset here."""
         self.reset()
 
     def state_object(self, index: int, sub: int, value: int | None) -> None:
-        """Have an object hold another value, or be absent."""
+        """Set an object to another value, or make it absent."""
         self._objects.override(index, sub, value)
 
     @property
@@ -440,7 +440,7 @@ class DriveNode:
         self._arm()
 
     def _arm(self) -> None:
-        """Look up which identifier is for whom, and which PDOs go with the SYNC."""
+        """Build the table of identifiers, and the list of synchronous PDOs."""
         self._sync_id = self._own.sync_cob_id.value
         self._sync_length = 1 if self._own.sync_overflow.value else 0
         active = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
@@ -527,7 +527,7 @@ class DriveNode:
             self._own.error_code.value = code
 
     def _clear(self, *codes: int) -> None:
-        """Take errors back whose cause is gone; those of a fault stay until its reset."""
+        """Clear errors whose cause is gone; those of a fault stay until its reset."""
         if self._machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
@@ -576,7 +576,7 @@ class DriveNode:
             self._emergencies.clear(*(self._emergencies.active.keys() - standing))
 
     def _refresh_torque(self) -> None:
-        """Hand the torque that follows from the dictionary to the plant, if it is another one."""
+        """Pass the torque that follows from the dictionary to the plant, if it has changed."""
         if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         own = self._own

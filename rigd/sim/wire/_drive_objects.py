@@ -58,7 +58,7 @@ _POWERED = (
 
 
 class PdsStateMachine:
-    """States and what leads from one to another.
+    """States and transitions of the power drive system.
 
     Parameters
     ----------
@@ -67,15 +67,15 @@ class PdsStateMachine:
     entered
         Called with the state left after each change; `state` is then the new one.
     may_switch_on
-        Asked before the first step up from switch on disabled.
+        Called before the first step up from switch on disabled.
     may_enable
-        Asked before operation is enabled.
+        Called before operation is enabled.
     may_reset
-        Asked at a fault reset, whether no cause of the fault stands.
+        Called at a fault reset; True if no cause of the fault persists.
 
     Attributes
     ----------
-    state : State
+    state : PdsState
         The present one.
     """
 
@@ -105,7 +105,7 @@ class PdsStateMachine:
         self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def control(self, word: int) -> None:
-        """Take a controlword."""
+        """Process a controlword."""
         reset_bit = word & _FAULT_RESET
         rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
         if self.state is PdsState.FAULT:
@@ -351,11 +351,11 @@ def add_drive_objects(
 
 
 def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
-    """Have the objects that a drive's file has, and their values at power-on.
+    """Use the objects of a drive's file, and their values at power-on.
 
-    What the file does not tell, or cannot, is as without one: rated torque, limits of zero, and
-    identity. A file that does not tell the modes is taken to mean cyclic synchronous torque where
-    it has a target torque.
+    Values that the file does not state are as without one: rated torque, limits of zero, and
+    identity. A file that does not state the modes is taken to mean cyclic synchronous torque if it
+    has a target torque.
 
     Raises
     ------

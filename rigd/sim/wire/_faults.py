@@ -30,11 +30,11 @@ Deliver = Callable[[int, bytes, object], None]
 """Takes identifier, data and origin of what gets through."""
 
 SERIAL = -1
-"""Stands for the identifier of what a serial line carries."""
+"""Pseudo-identifier of the data on a serial line."""
 
 
 class FaultError(WrongUseError):
-    """A fault is not written as it should be, or this rig cannot have it; the message says why."""
+    """A fault has a syntax error, or is not possible on this rig; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ _MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
 DISTURBANCES = ("obstacle", "knock")
-"""Kinds that the beam meets; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
+"""Kinds that disturb the beam; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
@@ -156,7 +156,7 @@ def parse_fault(spec: str) -> Fault:
     Raises
     ------
     FaultError
-        Naming the word that is wrong and what may stand in its place.
+        If a word is wrong; the message states what is allowed.
 
     Examples
     --------
@@ -259,18 +259,18 @@ class _Active:
 
 
 class FaultyLine:
-    """The way of one sender's frames to everybody else, with the faults on it.
+    """Line from one sender to all others, with the faults on it.
 
     Parameters
     ----------
     sender
         Sender of the frames, for the log.
     deliver
-        Takes what gets through.
+        Receives the frames that pass.
     postpone
         Calls something after so many seconds.
     log
-        Told of each frame that a fault hits.
+        Called for each frame that a fault hits.
     """
 
     def __init__(
@@ -297,13 +297,13 @@ class FaultyLine:
         self._active.append(_Active(fault))
 
     def end(self, kind: str | None) -> list[str]:
-        """Let the faults of a kind, or all, act no more; return the kinds of those that did."""
+        """End the faults of a kind, or all; return the kinds of those that were active."""
         over = [fault for fault in self._active if kind in (None, fault.kind)]
         self._active = [fault for fault in self._active if fault not in over]
         return [fault.kind for fault in over]
 
     def send(self, can_id: int, data: bytes, origin: object = None) -> None:
-        """Let a frame, or a record of a serial line, go the way of this line."""
+        """Send a frame, or a record of a serial line, over this line."""
         if not self._active and not self._held:
             self._deliver(can_id, data, origin)
             return
@@ -342,7 +342,7 @@ class FaultyLine:
 
 _FLUSH_S = 0.2
 _SILENT = ("torque", "sdo write", *LINE_KINDS)
-"""Events that happen too often to be told on the terminal."""
+"""Events too frequent to be shown on the terminal."""
 
 
 class EventLog:
@@ -353,7 +353,7 @@ class EventLog:
     path
         Path of the new file of JSON lines; None for none.
     quiet
-        Tell nothing on the terminal.
+        Whether nothing is shown on the terminal.
 
     Attributes
     ----------
@@ -387,7 +387,7 @@ class EventLog:
             self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
 
     def print_line(self, line: str) -> None:
-        """Tell the operator; a terminal that has gone is none of our business."""
+        """Print a line for the operator; ignore a closed terminal."""
         if not self._quiet:
             with suppress(OSError, ValueError):
                 sys.stdout.write(f"{line}\n")

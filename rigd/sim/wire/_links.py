@@ -72,7 +72,7 @@ _VIRTUAL_KINDS = ("vcan", "vxcan")
 
 
 class _LinkConnection:
-    """One connection: what has come of an unfinished frame, and what has not gone of one."""
+    """One connection, with its incomplete received frame and its unsent bytes."""
 
     def __init__(self, link: socket.socket, number: int) -> None:
         self.link = link
@@ -89,11 +89,11 @@ class VirtualBus:
     path
         Path of the socket.
     handlers
-        Handlers of the event loop, by file descriptor; kept up to date.
+        Handlers of the event loop, by file descriptor; updated here.
     on_frames
         Gets what a client sends.
     on_clients
-        Told when a client has come or gone, and how many there are.
+        Called when a client connects or disconnects, with their number.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ class VirtualCan:
 
 
 def listen(path: Path) -> socket.socket:
-    """Return a listening Unix socket; what a dead process left in its place goes.
+    """Return a listening Unix socket; remove one that a dead process has left.
 
     Raises
     ------
@@ -309,8 +309,8 @@ def is_virtual(channel: str) -> bool:
 def interface_kind(name: str) -> str:
     """Return what the kernel calls the kind of a network interface; empty for hardware.
 
-    A serial CAN adapter stands among the virtual devices of ``/sys`` too, so only the kernel's own
-    word counts (``IFLA_INFO_KIND``).
+    A serial CAN adapter is also among the virtual devices of ``/sys``, so only the kernel's own
+    attribute counts (``IFLA_INFO_KIND``).
     """
     try:
         index = socket.if_nametoindex(name)
@@ -325,7 +325,7 @@ def interface_kind(name: str) -> str:
 
 
 def kind_in_reply(reply: bytes) -> str:
-    """Return the kind of interface that a message RTM_NEWLINK tells of."""
+    """Return the kind of interface in a message RTM_NEWLINK."""
     if len(reply) < 32 or struct.unpack_from("=H", reply, 4)[0] != _RTM_NEWLINK:
         return ""
     length = struct.unpack_from("=I", reply)[0]
@@ -364,17 +364,17 @@ _LINE_BYTES = 4096
 class PtyLine:
     """The sensor's end of a serial line.
 
-    While the other end is not open, what is sent is lost, as on a real line. A terminal with
-    a closed end is always "readable", so it is looked at from time to time instead.
+    While the other end is not open, what is sent is lost, as on a real line. A terminal with a
+    closed end is always "readable", so it is polled from time to time instead.
 
     Parameters
     ----------
     handlers
-        Handlers of the event loop, by file descriptor; kept up to date.
+        Handlers of the event loop, by file descriptor; updated here.
     on_bytes
         Gets what the host sends.
     on_open
-        Told when the host opens the port, and when it closes it.
+        Called when the host opens the port, and when it closes it.
 
     Attributes
     ----------
@@ -414,7 +414,7 @@ class PtyLine:
             self.lost += len(data) - sent
 
     def poll(self) -> None:
-        """Find out whether the host has opened the port meanwhile."""
+        """Check whether the host has opened or closed the port."""
         if not self._open and self._ours >= 0:
             self._receive()
 
