@@ -1,4 +1,4 @@
-"""A campaign: all sessions analysed in parallel, then what they say together."""
+"""A campaign: all sessions analysed in parallel, then their combined results."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ class CampaignResult:
         Structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
     modal : PooledModal or None
-        Modal model of all sessions, and what it says of a nearly uniform beam; None unless two
+        Modal model of all sessions, and the nearly uniform beam estimated from it; None unless two
         sessions show a common mode.
     verdict : CampaignVerdict or None
-        Which of them the data support, and what else they say; None without any.
+        Structure that the data support, and further findings; None without any.
     validation : tuple of LeftOutError
         Session by session; empty with fewer than three sessions.
     lost_trials : tuple of LostTrial
@@ -105,7 +105,7 @@ class CampaignResult:
 
     @property
     def headline(self) -> PooledEstimate | None:
-        """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
+        """Pooled estimate whose numbers are reported, None without any: see `freest_estimate`."""
         return freest_estimate(self.pooled)
 
     @property
@@ -117,7 +117,7 @@ class CampaignResult:
 
     @property
     def validity(self) -> Validity:
-        """How exact the linear model is for the sessions: that of the worst."""
+        """Validity of the linear model for the sessions: that of the worst."""
         return worst(each.validity for each in self.sessions)
 
     @property
@@ -163,10 +163,10 @@ def campaign(
         Address of a Dask scheduler whose workers are used instead; they find the files under the
         same absolute paths.
     uniformity : float, optional
-        Relative standard deviation of each mode's frequency from that of a uniform beam, in place
-        of what the files state.
+        Relative standard deviation of each mode's frequency from that of a uniform beam, instead of
+        that stated in the files.
     workers : Workers, optional
-        Workers that are ready already, in place of `jobs` and `dask`; they are left open.
+        Existing workers, used instead of `jobs` and `dask`; they are left open.
     on_progress : callable, optional
         Called with the steps done, their number and a file's name.
 
@@ -231,7 +231,7 @@ def campaign_result(
     validation: Sequence[LeftOutError] = (),
     lost: Sequence[LostTrial] = (),
 ) -> CampaignResult:
-    """Say what sessions of one experiment tell together.
+    """Return the combined result of sessions of one experiment.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def campaign_result(
 def _of_one_experiment(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
-    """Set aside what failed, and what is not the experiment that most of the sessions are."""
+    """Set aside failures, and sessions that differ from the most common experiment."""
     usable = [result for result in results if isinstance(result, SessionAnalysis)]
     if not usable:
         return [], [result for result in results if isinstance(result, SessionFailure)]
@@ -306,9 +306,9 @@ def _of_one_experiment(
 def _alike_by_welch(
     sessions: list[SessionAnalysis], failures: list[SessionFailure]
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
-    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without.
+    """Use Welch's fits for all sessions or for none: set aside exceptions, or omit the fits.
 
-    A search is never set aside: its record tells as much as any.
+    A search is never set aside: its record is as informative as any.
     """
     without = [each for each in sessions if not each.frequency_hz.size]
     if not without:
@@ -330,7 +330,7 @@ def _alike_by_welch(
 def _labelled(
     results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
-    """Take the specimens' labels for what they say: see `labelled`."""
+    """Use the specimens' labels: see `labelled`."""
     stated = iter(labelled([each.experiment for each in results if each.experiment]))
     return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
 
@@ -341,9 +341,9 @@ def _reason_against(
     as_in: str,
     before: Sequence[SessionAnalysis],
 ) -> str | None:
-    """Say why a session does not belong to those it came with, None if nothing speaks against.
+    """Return why a session does not belong to the others, None if it does.
 
-    `as_in` says of the common one whether it stands for most.
+    `as_in` states whether the common one represents most of them.
     """
     experiment = result.experiment
     difference = experiment and common.experiment.difference(experiment)

@@ -32,7 +32,7 @@ def chance(p_value: float) -> str:
 
 
 def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
-    """Say what parameters are estimated from, and which tolerance of the geometry they have."""
+    """Describe the basis of the parameters, and their tolerance of the geometry."""
     stated = modal.stated[-1]
     given = f"{100 * stated:g} % as the files state it"
     if len(modal.stated) > 1:
@@ -57,7 +57,7 @@ def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
 
 
 def slope(found: PooledOrder, modal: PooledModal) -> str:
-    """Say what is known of an order as the slope of a loss over the modes in sight.
+    """Describe an order as the slope of a loss over the visible modes.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
 def if_exact(
     freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
 ) -> list[str]:
-    """Say what the orders are on condition that the beam is exactly uniform.
+    """Describe the orders on condition that the beam is exactly uniform.
 
-    Nothing where a uniform beam does not predict the modes.
+    Empty if a uniform beam does not predict the modes.
     """
     if modal is None or modal.uniform_beam.status == "refused":
         return []
@@ -114,7 +114,7 @@ def if_exact(
 
 
 def sweeps(found: OppositeSweeps | None) -> list[str]:
-    """Say whether rising and falling sweeps show the same modes."""
+    """Describe whether rising and falling sweeps show the same modes."""
     if found is None:
         return []
     which = f"{found.rising} rising and {found.falling} falling sweeps"
@@ -146,7 +146,7 @@ def _difference(each: ModeInSweeps) -> str:
 def experiments(
     found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
 ) -> list[str]:
-    """Say which sweeps would decide whether something changes along the records."""
+    """Recommend sweeps that decide whether the specimen changes during the records."""
     if found is not None and found.changed:
         modes = listed([str(each.mode) for each in found.changed])
         return [

@@ -98,7 +98,7 @@ def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
 def _flagged(
     numbers: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
 ) -> Numbers:
-    """Flag what sessions differ in, what orders share their reasons, and modes that do not show."""
+    """Flag quantities that differ between sessions, doubtful orders, and hidden modes."""
     flags, mixed = _flags(orders), campaign.homogeneity.is_mixed
 
     def of_mixture(quantity: str) -> str | None:
@@ -126,7 +126,7 @@ def _flagged(
 
 
 def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:
-    """Take what the lowest BIC gives, on condition that its orders are true."""
+    """Return the estimate of the lowest BIC, on condition that its orders are true."""
     conditional = campaign.pooled[0]
     if conditional is pooled:
         return None
@@ -166,7 +166,7 @@ def _parameters(
 
 
 def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
-    """Reasons against an order, which its coefficient shares."""
+    """Return the reasons against each order, also for its coefficient."""
     return {
         name: each.reason
         for each in orders

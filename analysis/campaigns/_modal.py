@@ -3,7 +3,7 @@
 Each session's noise averages out, an unevenness of the specimen does not: it is common to all. So
 the tolerance of the geometry is added to the covariance of the pooled constants, whatever the
 number of sessions. Rising and falling sweeps pass each mode at different times, so their constants
-differ where something changes along the records.
+differ if the specimen changes during the records.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _FEWEST: Final = 2
 _NEARLY_ALL: Final = 0.9
-"""Share of the sessions that must show a mode."""
+"""Fraction of the sessions that must show a mode."""
 
 _SIGNIFICANT: Final = 0.01
 """Level of all modes together at which rising and falling sweeps differ."""
@@ -79,7 +79,7 @@ class PooledModal(ModalEstimate):
 
     @property
     def leads(self) -> bool:
-        """Whether modes are its own, and not those of an exactly uniform beam."""
+        """Whether the reported modes are its own, and not those of an exactly uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property

@@ -44,7 +44,7 @@ class ParameterStatistics:
     mean, median, std, min, max : float
         std with K − 1 in the denominator, NaN of a single session.
     at_bounds : int
-        Sessions in which it rests on the edge of the range searched.
+        Sessions in which it is at a bound of the range searched.
     """
 
     structure: str
@@ -168,7 +168,7 @@ def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, .
 
 
 def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
-    """Those of Table 5 and Figure 8: the paper's two, or without them the two of least WMSE."""
+    """Return the models of Table 5 and Figure 8: the paper's two, else the two of least WMSE."""
     named = tuple(m for m in models if (m.structure, m.weighting) in BEST)
     return named if len(named) == len(BEST) else tuple(sorted(models, key=_wmse)[:2])
 
@@ -248,7 +248,7 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RankedStructure:
-    """How one structure stands with all sessions.
+    """Rank of one structure over all sessions.
 
     Attributes
     ----------
@@ -278,7 +278,7 @@ class RankedStructure:
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Name in tables."""
         return self.structure
 
 

@@ -26,7 +26,7 @@ FEWEST: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class LeftOutError:
-    """Error of one model in one session, of which it has seen nothing.
+    """Error of one model in a session that was not used for it.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class LostTrial:
 
 @dataclass(frozen=True, slots=True)
 class PlantPrediction:
-    """What others say of a session: a model's name and its plant, the session's own beside it."""
+    """Plant predicted for a session by the other sessions, with the session's own estimate."""
 
     method: str
     name: str
@@ -77,7 +77,7 @@ class PlantPrediction:
 
 
 def forecasts(sessions: Sequence[SessionAnalysis], left_out: int) -> tuple[PlantPrediction, ...]:
-    """Models of all sessions but one, to be tried on that one."""
+    """Return the models of all sessions but one, for the prediction of that one."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
     own = {each.name: each.plant for each in session.record_estimates}
@@ -99,9 +99,9 @@ def validate(
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
-    """Try every session once, and account for each trial: done, or lost and why.
+    """Predict every session from the others; return the errors, and the lost trials with reasons.
 
-    What was found of the sessions is kept though all workers may go.
+    Results so far are retained even if all workers are lost.
     """
     trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
     try:
@@ -125,7 +125,7 @@ def left_out_errors(
 ) -> tuple[LeftOutError, ...] | LostTrial:
     """Read a session and compare its torque with what each model predicts from its angle.
 
-    A session that the whole-record estimator cannot use is told, not raised: it is one of many.
+    An error of one session is returned, not raised, because the others are still usable.
     """
     from analysis.identify import Comparison
     from analysis.record import load_record

@@ -2,7 +2,7 @@
 
 ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
 scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
-matrix in place of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
+matrix instead of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
 likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
 scatter in each of eight parameters.
 
@@ -298,8 +298,8 @@ def determines_damping(estimate: RecordEstimate) -> bool:
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     """Pool one structure; None if fewer than two sessions determine its damping.
 
-    A setting of rig or specimen (the tool inertia, mostly) that rests on its bound in some
-    session has no place in the common covariance; the plant gets its plain mean.
+    A setting of rig or specimen (mostly the tool inertia) that is at a bound in some session is not
+    in the common covariance; the plant gets its plain mean.
     """
     used = list(filter(determines_damping, estimates))
     if len(used) < _FEWEST:
@@ -334,11 +334,11 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
 
     Damping and offsets of the modes belong to the specimen: one value for all sessions, and a
     scatter between them if they differ by more than their uncertainties; each costs the logarithm
-    of the number of all data. What the sessions lose by sharing a value follows from their own
+    of the number of all data. The likelihood lost by a common value follows from the sessions'
     estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
     beam are each session's own, with every structure alike, and so cost nothing here. A parameter
-    that some session leaves undetermined cannot be shared: it counts in every session. One session
-    shares with none, and loses nothing.
+    that some session leaves undetermined cannot be common: it counts in every session. A single
+    session loses nothing.
     """
     of_specimen = STRUCTURES[estimates[0].structure].free
     shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]

@@ -1,4 +1,4 @@
-"""Sentences of a campaign's verdict: whether it is of one specimen, and what its damping is."""
+"""Sentences of a campaign's verdict: whether there is one specimen, and its damping."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 # Names and numbers
 
 _NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
-"""Names of what a letter alone would not call to mind."""
+"""Names of quantities whose symbol alone is not clear."""
 _FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
-"""Units smaller than a single record's: of the scatter between sessions more digits are told."""
+"""Units smaller than a single record's, because scatter between sessions needs more digits."""
 _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _LEAST: Final = 1e-99
@@ -70,7 +70,7 @@ def with_unit(parameter: str) -> str:
 
 
 def probability(chance: float) -> str:
-    """Write a probability that may be too small for a number, but is not 0.
+    """Format a probability that may be too small for a number, but is not 0.
 
     Examples
     --------
@@ -82,7 +82,7 @@ def probability(chance: float) -> str:
 
 
 def percent(fraction: float) -> str:
-    """Write a share that may be next to 1, but is not 1.
+    """Format a fraction that may be close to 1, but is not 1.
 
     Examples
     --------
@@ -107,14 +107,14 @@ _SLIGHT: Final = 2e-3
 
 
 def specimens(found: Homogeneity) -> list[str]:
-    """Say first that sessions are not of one specimen; nothing if they are."""
+    """Describe that sessions are not of one specimen; empty if they are."""
     stated = _stated(found.specimens) if len(found.specimens) > 1 else []
     leading = found.leading
     return stated if leading is None else [*stated, *_differing(found, leading)]
 
 
 def title(text: str, found: Homogeneity) -> str:
-    """Say in a title that what is under it is pooled over a mixture.
+    """Add to a title that its values are pooled over a mixture.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _differing(found: Homogeneity, leading: Heterogeneity) -> list[str]:
 
 
 def _slight(found: Homogeneity) -> str:
-    """Say where a scatter is many standard deviations only because these are so small."""
+    """Describe a scatter of many standard deviations only because these are small."""
     frequencies = [each for each in found.quantities if each.quantity.startswith("frequency_hz")]
     mixed = [each for each in frequencies if each.mixed]
     if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
@@ -169,7 +169,7 @@ def _slight(found: Homogeneity) -> str:
 
 
 def _scatter(each: Heterogeneity) -> str:
-    """Say by how much one quantity scatters, of its own uncertainty and of its size."""
+    """Describe the scatter of a quantity, relative to its uncertainty and to its size."""
     percents = percent(each.i_squared)
     equals = "" if percents.startswith(">") else "= "
     size = _rounded([each.between_std], each)
@@ -182,7 +182,7 @@ def _scatter(each: Heterogeneity) -> str:
 
 
 def _where(each: Heterogeneity) -> str:
-    """Say which sessions lie together, or where the outermost are."""
+    """Describe the groups of sessions, or the outermost ones."""
     name, _, _ = label(each.quantity)
     values = {file: (value, std) for file, value, std in each.values}
     if each.groups:
@@ -204,7 +204,7 @@ def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, f
 
 
 def _rounded(values: Sequence[float], each: Heterogeneity) -> str:
-    """Write a mean with the digits that tell it from the others."""
+    """Format means with enough digits to distinguish them."""
     _, factor, unit = label(each.quantity)
     digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
     times = "·" if unit.startswith("10") else " "
@@ -238,7 +238,7 @@ def answer(
     lambda_: PooledOrder,
     validation: Sequence[LeftOutError],
 ) -> str:
-    """Say of which orders the dampings are, and how well the classical and the freest type predict.
+    """Describe the orders of the dampings, and the predictions of the classical and freest types.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def answer(
 
 
 def _answered(found: PooledOrder) -> str:
-    """Say in a few words of which order a damping is."""
+    """Describe the order of a damping in a few words."""
     if found.exact is not None:
         return _effective(found)
     of = _OF[found.order]
@@ -287,7 +287,7 @@ def _answered(found: PooledOrder) -> str:
 
 
 def _effective(found: PooledOrder) -> str:
-    """Say in a few words how a loss grows over the modes in sight."""
+    """Describe the growth of a loss over the visible modes in a few words."""
     loss = LOSSES[found.order]
     if found.value is None or found.interval is None or found.reason is not None:
         return f"{loss} with a slope that is not established"
@@ -302,7 +302,7 @@ def _effective(found: PooledOrder) -> str:
 
 
 def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
-    """Say of which structure the numbers are, and which simpler one would do.
+    """Describe the structure of the numbers, and a simpler sufficient one.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
 
 
 def sizes(found: Sequence[Size]) -> list[str]:
-    """Say how large each damping is where it depends least on its order."""
+    """Describe each damping at its pivot frequency, where it depends least on its order."""
     factors = []
     for each in found:
         if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
@@ -350,7 +350,7 @@ def selected(
     alone: Mapping[str, int],
     sessions: int,
 ) -> str:
-    """Name the structure that all sessions together select, its equals, and who agrees.
+    """Describe the structure that all sessions select together, its equals, and the agreement.
 
     Parameters
     ----------
@@ -379,7 +379,7 @@ def selected(
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
-    """Say whether the residual of a structure is noise.
+    """Describe whether the residual of a structure is noise.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
 
 
 def noise_alone(adequate: int, sessions: int) -> str:
-    """Say in how many sessions the residual is noise.
+    """State in how many sessions the residual is noise.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def noise_alone(adequate: int, sessions: int) -> str:
 
 
 def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
-    """Say how the modes are damped.
+    """Describe the damping of the modes.
 
     Parameters
     ----------
@@ -437,7 +437,7 @@ def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[st
 
 
 def order(found: PooledOrder) -> str:
-    """Say what is known of one order."""
+    """Describe the estimate of one order."""
     name, of = found.order, _OF[found.order]
     counts = {f"“{status}”": count for status, count in found.alone.items()}
     alone = f" {in_single_sessions(counts, sum(counts.values()))}"
@@ -471,7 +471,7 @@ def welch_bias(
     *,
     comparable: bool,
 ) -> list[str]:
-    """Say by how much the Welch fits of the type that the numbers are of are biased.
+    """Describe the bias of the Welch fits of the reported type.
 
     Parameters
     ----------
@@ -508,7 +508,7 @@ def welch_bias(
 
 
 def _biased(each: ParameterBias) -> str:
-    """Say what a Welch fit's parameter is, and by how much that is above or below."""
+    """Describe a parameter of a Welch fit and its bias."""
     symbol, factor, unit = label(each.parameter)
     value, scatter = to_uncertainty((each.welch, each.welch_std), each.welch_std, factor)
     (record,) = to_uncertainty((each.record,), each.record_std, factor)
@@ -543,7 +543,7 @@ def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str
 
 
 def scatter(best: PooledEstimate) -> str:
-    """Say whether the sessions repeat: one alarm in a hundred campaigns that do is false."""
+    """Describe whether the sessions repeat, with one false alarm in a hundred campaigns."""
     level = _SIGNIFICANT / max(len(best.parameters), 1)
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
@@ -565,7 +565,7 @@ def scatter(best: PooledEstimate) -> str:
 
 
 def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
-    """Say how well the sessions predict one that they have not seen.
+    """Describe how well the sessions predict an unseen one.
 
     Parameters
     ----------
@@ -594,14 +594,14 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
 
 
 def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
-    """Account for the sessions that were to be predicted and were not.
+    """Describe the sessions that were to be predicted and were not.
 
     Parameters
     ----------
     lost : sequence of LostTrial
         Sessions that were not predicted.
-    asked : int
-        How many were to be.
+    requested : int
+        Number of sessions to be predicted.
     """
     if not lost:
         return []
@@ -616,7 +616,7 @@ def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
 
 
 def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
-    """Say what single sessions find, and how many of them.
+    """Describe the findings of single sessions with their numbers.
 
     Parameters
     ----------
@@ -631,7 +631,7 @@ def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
 
 
 def _damping(structure: str) -> str:
-    """Say which kinds of damping a structure has, and of which orders."""
+    """Describe the kinds of damping of a structure, and their orders."""
     shape = STRUCTURES[structure]
     kinds = [
         f"{what} damping ({order} {'free' if order in shape.free else '= 1'})"

@@ -47,8 +47,8 @@ DEFAULT: Final = "default"
 class DefaultCommandGroup(TyperGroup):
     """A group in which a first argument that names no subcommand goes to the default command.
 
-    The default command stands in the group's place from the parsing on, so its usage, help and
-    errors are those of a command without subcommands.
+    The default command replaces the group from the parsing on, so its usage, help and errors are
+    those of a command without subcommands.
     """
 
     # Typer's click is its own in some versions and the package of that name in others, so there is
@@ -98,7 +98,7 @@ Version = Annotated[
 
 _EXIT_INTERRUPTED: Final = 130
 _GARBAGE: Final = 20_000
-"""Objects more than before from which garbage is looked for."""
+"""Number of new objects that triggers a garbage collection."""
 
 _COMMANDS: Final = {
     "touch": "Estimate where, when and how hard the antenna met something.",
@@ -145,8 +145,8 @@ def main() -> None:
     """Entry point of the command."""
     raise_on(signal.SIGINT)
     use_one_thread()
-    # Figures are made of many objects that live until they are drawn: to look among them for
-    # garbage every 700 takes a twentieth of all time.
+    # Figures consist of many objects that live until they are drawn: a garbage collection every 700
+    # takes a twentieth of all time.
     gc.set_threshold(_GARBAGE)
     _quieten_libraries()
     with standard_streams():
@@ -157,10 +157,10 @@ def main() -> None:
 
 
 def _quieten_libraries() -> None:
-    """Keep warnings that libraries address to programmers off the operator's terminal.
+    """Suppress warnings of libraries, which are meant for programmers.
 
-    A record that suits no model drives searches where numbers overflow; what becomes of it is said
-    in the verdict. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
+    A record that suits no model drives searches where numbers overflow; the verdict reports the
+    result. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
     """
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
@@ -267,7 +267,7 @@ def analyze(
         str | None,
         typer.Option(metavar="ADDRESS", help="Campaign: run on this Dask scheduler."),
     ] = None,
-    version: Version = False,  # noqa: ARG001 - its callback has told it
+    version: Version = False,  # noqa: ARG001 - its callback has printed it
 ) -> None:
     """Identify the damping of a slewing beam from recorded sessions.
 
@@ -381,7 +381,7 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
 
 
 def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
-    """Tell what is wrong with the other files of a campaign, and report the one that is left."""
+    """Print the errors of the other files of a campaign, and report the remaining one."""
     for failure in single.failures:
         complain(failure.message)
     typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)

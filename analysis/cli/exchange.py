@@ -395,7 +395,7 @@ _RATES_HZ: Final = (1.0, 1e6)
 
 
 def _explained(run: Callable[[], None]) -> int:
-    """Run a command and return its exit code; what went wrong is said in a sentence or two."""
+    """Run a command and return its exit code; print errors in a sentence or two."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError

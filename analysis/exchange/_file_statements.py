@@ -1,4 +1,4 @@
-"""What a file states of itself (units, rate, times, starts, scales) against what the user states.
+"""Comparison of a file's statements (units, rate, times, starts, scales) with the user's.
 
 A contradiction is refused, with both statements. `ImportPlan.ignore_file_metadata` lets the user's
 count; then it is a warning, and the session's metadata have it.
@@ -52,7 +52,7 @@ _JITTER_SHOWN: Final = 0.01
 
 
 def time_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
-    """Place the samples in time, by the channel of times or by the rate stated."""
+    """Return the time base, by the channel of times or by the rate stated."""
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
         return from_time_stamps(path, plan.time.channel, time_s)
@@ -80,7 +80,7 @@ class FileStatements:
     ignored: list[str] = field(default_factory=list)
 
     def contradict(self, statement: str, remedy: str) -> None:
-        """Refuse a file that contradicts the plan, or note that the plan overrides it."""
+        """Raise if a file contradicts the plan, or note that the plan overrides it."""
         if not self.plan.ignore_file_metadata:
             raise ExchangeError(
                 f"{self.path}: {statement}; {remedy}, or let your options count with "
@@ -95,7 +95,7 @@ class FileStatements:
         Raises
         ------
         ExchangeError
-            If the file clearly says another unit.
+            If the file clearly states another unit.
         """
         for choice in self.plan.choices:
             label = channels[choice.channel].unit_label.strip()
@@ -119,7 +119,7 @@ class FileStatements:
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:
-        """Refuse values to which a scale of the file could not be applied."""
+        """Raise if a scale of the file could not be applied to the values."""
         for name, channel in channels.items():
             if channel.unapplied_scale:
                 self.contradict(
@@ -129,7 +129,7 @@ class FileStatements:
                 )
 
     def timebase(self, channels: Mapping[str, SourceChannel]) -> Timebase:
-        """Place the samples in time, and compare that with the rate and the times of the file.
+        """Return the time base; compare it with the rate and the times of the file.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class FileStatements:
         return found
 
     def _another_rate(self, name: str, own_hz: float, rate_hz: float) -> None:
-        """Judge a rate of the file that is not the one used."""
+        """Handle a rate of the file that is not the one used."""
         time = self.plan.time
         statement = f"the file says that '{name}' was sampled at {own_hz:.6g} Hz"
         is_default = own_hz == _DEFAULT_RATE_HZ
@@ -241,20 +241,20 @@ class FileStatements:
     def align(
         self, channels: Mapping[str, SourceChannel], base: Timebase
     ) -> tuple[Mapping[str, SourceChannel], Mapping[str, float]]:
-        """Cut channels that begin at different times to the samples that they share.
+        """Trim channels that begin at different times to their common interval.
 
         Returns
         -------
         channels : mapping of str to SourceChannel
             Channels of one length.
         delays_s : mapping of str to float
-            Channel → how much older its values are than those of the angle in the same place: what
-            whole samples leave.
+            Channel → age of its values relative to those of the angle at the same index: the
+            remainder after whole samples.
 
         Raises
         ------
         ExchangeError
-            If the channels share no time, or have different lengths without a reason.
+            If the channels have no common time, or different lengths without a reason.
         """
         time, plan = self.plan.time, self.plan
         starts = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}

@@ -2,8 +2,8 @@
 
 Nothing is guessed: channels, units and circumstances are the user's to state (`ImportPlan`). Stated
 units are compared with those of the file, the time stamps with a uniform rate, and the torque with
-what the undamped beam would ask for. Values that are not finite are held and flagged, as in the
-session format.
+that of the undamped beam. Values that are not finite are held and flagged, as in the session
+format.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class ImportPlan:
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecord:
-    """What became of a file.
+    """Result of an import.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class ImportedRecord:
 
 
 _JITTER_REPORTED: Final = 0.01
-"""Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
+"""Distance of a time stamp from its tick, in periods, from which it is reported."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
@@ -207,7 +207,7 @@ def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
 
 
 def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
-    """Refuse a rate at which no record shows the beam; warn of a time next to none."""
+    """Raise if no record at this rate shows the beam; warn of a very short time."""
     beam, times = plan.specimen.beam, plan.time
     first_hz, duration_s = first_mode_hz(beam), (int(base.ticks[-1]) + 1) / base.rate_hz
     remedy = (
@@ -233,7 +233,7 @@ def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
 def _columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Fields of the samples in their units; what becomes infinite is for others to judge."""
+    """Return the fields of the samples in SI units; infinite values are handled later."""
     columns = {}
     with np.errstate(over="ignore"):
         for name, choice in plan.channels.items():
@@ -263,7 +263,7 @@ def _segments(
 def _missing_sentences(
     titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
 ) -> list[str]:
-    """Sentences on what of the record is missing."""
+    """Return sentences on missing parts of the record."""
     found = []
     if first:
         found.append(
@@ -295,7 +295,7 @@ def _on_grid(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[n
 def _metadata(
     source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
 ) -> dict[str, str]:
-    """Everything that the session is to say of itself and of where it came from."""
+    """Return the metadata of the session and of its source."""
     beam = plan.specimen.beam
     numbers = {
         "rate_hz": rate_hz,
@@ -411,12 +411,12 @@ the first antiresonance (at 4.4) for damping not to matter, and above the freque
 paper's external damping outweighs the inertia."""
 
 _CERTAIN: Final = 6.0
-"""Standard deviations from zero that the factor between torque and model must have to judge at
-all: a motion that does not reach these frequencies tells nothing."""
+"""Distance from zero, in standard deviations, that the factor between torque and model must have
+for a decision: a motion that does not reach these frequencies gives none."""
 
 _TAPER: Final = 0.05
-"""Share of the record at either end over which it is faded: a record may begin and end in motion,
-and the paper's chirp passes these frequencies early."""
+"""Fraction of the record at either end over which it is faded: a record may begin and end in
+motion, and the paper's chirp passes these frequencies early."""
 
 _FACTOR: Final = 3.0
 """Largest factor between torque and model that damping and a wrong mass may account for. The units
@@ -429,7 +429,7 @@ def unlikely_torque(
     rate_hz: float,
     specimen: SpecimenFile,
 ) -> str | None:
-    """Compare the torque with what the undamped beam would ask for, beside its first resonance.
+    """Compare the torque with that of the undamped beam on either side of its first resonance.
 
     Parameters
     ----------
@@ -441,7 +441,7 @@ def unlikely_torque(
     Returns
     -------
     str or None
-        What is odd and what to check; None if nothing is, or the motion does not tell.
+        Anomaly and remedy; None if there is none, or the motion does not decide it.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)

@@ -71,7 +71,7 @@ def _vectors(
     listed: Sequence[tuple[str, tuple[int, ...], str]],
     load: Callable[..., Mapping[str, Any]],
 ) -> dict[str, SourceChannel]:
-    """Load the variables that are asked for, once their sizes as listed have been looked at."""
+    """Load the requested variables after a check of their listed sizes."""
     shapes = {name: shape for name, shape, _ in listed}
     variables = {name: _element(_split(name, shapes)[0])[0] for name in names}
     for name, variable in variables.items():
@@ -121,7 +121,7 @@ def _label(path: Path, name: str, contents: Mapping[str, Any]) -> str:
 
 
 def _split(name: str, variables: Container[str]) -> tuple[str, list[str], int | None]:
-    """Take ``log.angle#2`` apart into variable, fields and column (from 0)."""
+    """Split ``log.angle#2`` into variable, fields and column (from 0)."""
     column = None
     if name not in variables:
         whole, mark, number = name.rpartition("#")
@@ -135,7 +135,7 @@ _INDEXED: Final = re.compile(r"(.+)\((\d+)\)")
 
 
 def _element(text: str) -> tuple[str, int | None]:
-    """Take ``log(2)`` apart into the name and the element's place from 0 on, None without one."""
+    """Split ``log(2)`` into the name and the element's index from 0 on, None without one."""
     found = _INDEXED.fullmatch(text)
     return (found[1], int(found[2]) - 1) if found else (text, None)
 
@@ -300,7 +300,7 @@ def _hdf5_link(group: Any, name: str, h5py: Any) -> object:  # noqa: ANN401
 
 
 def _stored_elsewhere(path: Path, name: str) -> ExchangeError:
-    """Make the error for a channel whose samples are in another place or file, unlike MATLAB's."""
+    """Return the error for a channel whose samples are stored elsewhere, unlike MATLAB's."""
     return ExchangeError(
         f"{path}: '{name}' is a link or refers to samples stored elsewhere, which are not read; "
         "save the channel itself with save('-v7', …)."
@@ -338,7 +338,7 @@ _LARGEST_EXACT: Final = 2**53
 
 
 def _value(key: str, text: str) -> str | float | NDArray[Any]:
-    """Return what a text of the session's metadata stands for."""
+    """Return the value of a text of the session's metadata."""
     parts = [part.strip() for part in text.split(",")]
     words = key in _WORDS or (key.startswith(META_PREFIX) and not unit_of(key))
     if words or not all(map(_NUMBER.fullmatch, parts)):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SpecimenFile:
-    """What is moved.
+    """Specimen and clamp of an imported record.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ class SpecimenFile:
 def read_specimen(path: Path) -> SpecimenFile:
     """Read ``[beam]`` and, as far as they are stated, tool inertia, tilt and ``[uncertainty]``.
 
-    A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
-    Nothing else of a profile is used: delays, rate and limits are those of the rig's own recorder.
+    A number is plain or, as in a profile, ``{ value = 0.98, source = "measured" }``. Nothing else
+    of a profile is used: delays, rate and limits are those of the rig's own recorder.
 
     Raises
     ------

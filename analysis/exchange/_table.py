@@ -1,4 +1,4 @@
-"""What is exported: named columns with units over one axis, the same for every format."""
+"""Table for export: named columns with units over one axis, the same for every format."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ExportColumn:
     name : str
         With the unit as its suffix.
     title : str
-        What it is, in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
+        Title in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
     unit : str
         "" without a unit.
     values : ndarray, shape (n,)
@@ -55,11 +55,10 @@ class ExportTable:
     ----------
     source : str
         Name of the session file.
-    axis : Column
+    axis : ExportColumn
         Time or frequency, increasing.
-    columns : tuple of Column
-    information : mapping of str to str
-        How it came about, for formats that have room for it.
+    columns : tuple of ExportColumn information : mapping of str to str
+        Its origin, for formats that can store it.
     """
 
     source: str
@@ -81,7 +80,7 @@ _TITLES: Final = {
 
 
 def record_table(path: Path) -> ExportTable:
-    """Read the samples of a session as recorded: gaps stay, and flags stand beside the values.
+    """Return the samples of a session as recorded: gaps remain, and flags are a column.
 
     Raises
     ------

@@ -53,7 +53,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read functions of time, as `analysis.exchange._source.read_source` asks for.
 
     A channel is ``#2``, the second data set of type 58, or the text of its first identification
-    line if no other has the same; ``abscissa`` is the times of the first that is asked for.
+    line if no other has the same; ``abscissa`` is the times of the first requested one.
     """
     try:
         import pyuff
@@ -221,7 +221,8 @@ _EVEN_IN_TEXT, _EVEN_IN_BINARY = 1e-2, 1e-6
 format has six digits for either. In binary the abscissae themselves are the better choice."""
 
 _SAME_INCREMENT: Final = 1e-10
-"""Relative error of the increment at which, in binary, a short record tells its rate as well."""
+"""Relative error of the increment at which, in binary, a short record determines its rate as
+well."""
 
 _GENERAL_FUNCTION, _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 0, 1, 4, 6
 _TIME_AXIS, _FREQUENCY_AXIS, _GENERAL, _UNKNOWN = 17, 18, 1, 0
@@ -249,7 +250,7 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     Parameters
     ----------
     table : ExportTable
-        Integer columns (ticks, flags) are left out: the format has no place for them.
+        Integer columns (ticks, flags) are left out: the format cannot store them.
     stream : file, open for writing bytes
     binary : bool
         Whether numbers are written as 8-byte floats (58b) or with 13 digits.

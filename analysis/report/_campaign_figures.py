@@ -177,7 +177,7 @@ def _panel(
 _MOST_POINTS: Final = 500
 _WIDE_COLUMNS: Final = 1500
 _MOST_LINES: Final = 40
-"""Most sessions drawn: more would not be told apart."""
+"""Most sessions drawn: more would not be distinguishable."""
 SESSION: Final = "#A8A8A8"
 """Colour of a single session's response."""
 _PAIR: Final[tuple[dict[str, Any], ...]] = (
@@ -272,7 +272,7 @@ def _response_panel(
 
 
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
-    """Choose sessions to be drawn beside each other, spread over the campaign."""
+    """Choose sessions to be drawn together, spread over the campaign."""
     last = len(campaign.sessions) - 1
     chosen = np.unique(np.linspace(0, last, _MOST_LINES).round().astype(int))
     return [campaign.sessions[number] for number in chosen]
@@ -287,7 +287,7 @@ def draw_session(
     dots: int,
     alpha: float = 1.0,
 ) -> Line2D:
-    """Draw one session's response behind what is told of all; return the line of its magnitude."""
+    """Draw one session's response behind those of all; return the line of its magnitude."""
     (line,) = magnitude.plot(
         *_line(frequency_hz, magnitude_db(response), columns), color=SESSION, linewidth=0.5,
         alpha=alpha, rasterized=True,
@@ -336,7 +336,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     axes = figure.add_axes(
         (2.0 / width_in, 0.5 / height_in, 1 - 2.2 / width_in, _ROW_IN * len(models) / height_in)
     )
-    rng = np.random.default_rng(0)  # so that equal errors lie side by side
+    rng = np.random.default_rng(0)  # equal errors are then side by side
     for row, (_, _, weighting, errors) in enumerate(models):
         color = style.GREEN if weighting is None else colors[weighting]
         values = 100 * np.array([each.error for each in errors])

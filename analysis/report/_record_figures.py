@@ -2,13 +2,12 @@
 
 Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
 
-The parameters of a fractional damping are correlated and hard to compare; what they make together
-at one frequency is neither.
+The parameters of a fractional damping are correlated and hard to compare; their combined effect at
+one frequency is neither.
 
-What a fit leaves of the torque: its spectrum, whether it is white, and when it is large.
-
-A model that is right leaves noise. What is left at a resonance, or while the sweep passes one, is
-what the model lacks.
+Residual of the torque: its spectrum, whether it is white, and when it is large. A correct model
+leaves noise. A residual at a resonance, or while the sweep passes one, shows a deficiency of the
+model.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 _LABEL_IN: Final = 0.15
 """Height of a label with the space that it needs."""
 _LABELS_CLOSE: Final = 1 / math.log10(2.0)
-"""Labels for which a decade must have room if 1, 2 and 5 are to stand apart in it."""
+"""Labels for which a decade must have room to be labelled at 1, 2 and 5."""
 
 
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
@@ -160,7 +159,7 @@ def _magnitude(
 
 
 def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
-    """Choose what is shown of a mode: so much that a bin of a short record lies inside, too."""
+    """Return the range shown of a mode, at least one bin of a short record."""
     spacing_hz = float(np.diff(frequency_hz).max())
     relative_width = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
     half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
@@ -175,7 +174,7 @@ _CURVE_STYLES: Final = {
     "total": (style.BLUE, "-"),
 }
 _SPAN: Final = 300.0
-"""Largest ratio of the axis's ends: what is smaller yet does not matter beside the total."""
+"""Largest ratio of the axis's ends: still smaller values do not matter for the total."""
 
 
 def loss_figure(
@@ -257,7 +256,7 @@ def _curves(
     both = None not in curves.values()
     drawn = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
-        # Parts of which one is not known are not told apart; alone, a part is the total.
+        # If one part is unknown, the parts are not distinguished; alone, a part is the total.
         if factor is None or (order is not None and (not both or withheld)):
             continue
         color, dash = _CURVE_STYLES[label]
@@ -383,15 +382,15 @@ def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def residual_power(
     analysis: RecordAnalysis, residual: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power of the whitened residual in stretches of the record, 1 if chance is all that remains.
+    """Return the power of the whitened residual in intervals of the record, 1 for pure noise.
 
     The residual's spectrum in the band, transformed back, is the complex envelope of the whitened
     residual; K bins give K independent values over the record.
 
     Returns
     -------
-    times_s, power : ndarray, shape (stretches,)
-        Middles of the stretches from the first sample compared on, and mean power in them.
+    times_s, power : ndarray, shape (intervals,)
+        Middles of the intervals from the first sample compared on, and mean power in them.
     """
     spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bins = residual.size
@@ -407,7 +406,7 @@ def residual_power(
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """A figure, the name of its files, and what is seen in it."""
+    """A figure, the name of its files, and its description."""
 
     name: str
     figure: Figure
@@ -507,7 +506,7 @@ def _curve(whole: WholeRecord) -> str:
 
 
 def _reasons(headline: Headline) -> str:
-    """Say why points are hollow."""
+    """Describe why points are hollow."""
     reasons = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )

@@ -122,7 +122,7 @@ def _inertia(participation: Quantity | None) -> tuple[Cell, Cell]:
 
 
 def _modal_notes(whole: WholeRecord) -> Iterator[str]:
-    """Say how well the modal model fits, and which of its resonances are not the beam's."""
+    """Describe the fit of the modal model, and its resonances that are not the beam's."""
     modal = whole.headline.modal
     if modal is None:
         return
@@ -147,8 +147,8 @@ def _modal_notes(whole: WholeRecord) -> Iterator[str]:
 def parameters_table(whole: WholeRecord) -> Table:
     """All parameters with their uncertainty; those with a flag are marked, with the reason.
 
-    Where the file states how well the scales are known, the intervals that include them stand
-    beside the statistical ones.
+    Where the file states how well the scales are known, the intervals that include them are shown
+    with the statistical ones.
     """
     headline = whole.headline
     combined = whole.combined
@@ -196,7 +196,7 @@ def parameter_names(headline: Headline) -> tuple[str, ...]:
 
 
 def _condition(headline: Headline) -> str:
-    """Say on which condition parameters are what a table has."""
+    """Describe the condition under which the parameters of a table hold."""
     found = headline.tolerant
     if found is None:
         exact = "" if headline.modal is None else f", {EXACT_CONDITION}"
@@ -264,7 +264,7 @@ def sizes_table(whole: WholeRecord) -> Table:
 
 
 def condition_table(whole: WholeRecord) -> Table | None:
-    """Set what a simpler structure would give beside what is told; None if none would do."""
+    """Compare the reported values with those of a simpler structure; None if none suffices."""
     headline: Numbers = whole.headline.exact or whole.headline
     simpler = headline.simpler
     if simpler is None:
@@ -374,7 +374,7 @@ def _size_row(headline: Headline, each: Size) -> tuple[Entry, ...]:
 
 
 def _quantity_cells(each: Quantity, factor: float = 1.0) -> tuple[Cell, ...]:
-    """Show a quantity, its standard deviation and the ends of its interval."""
+    """Return the cells of a quantity, its standard deviation and the ends of its interval."""
     return estimate((each.value, each.std, *_ends(each)), each.std, factor)
 
 
@@ -383,7 +383,7 @@ def _ends(quantity: Quantity) -> tuple[float | None, float | None]:
 
 
 def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
-    """Say once what each mark means."""
+    """List the meaning of each mark once."""
     reasons = dict.fromkeys(each.flag for each in quantities if each.flag is not None)
     return tuple(f"{MARK} {reason}." for reason in reasons)
 
@@ -407,7 +407,7 @@ def _correlation(own: bool, value: float) -> Cell:
 
 
 def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
-    """Damping ratios of free vibration by amplitude, if the record tells; else no table."""
+    """Return the damping ratios of free vibration by amplitude; no table without them."""
     found = whole.verdict.damping_with_amplitude
     if not found:
         return ()

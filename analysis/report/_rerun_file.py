@@ -77,7 +77,7 @@ _MOST_IN_WORDS: Final = 2
 _SCALARS: Final = "Scalars:scalars"
 """Rerun's name of the values of a plot."""
 _GROUPS: Final = 400
-"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
+"""Groups of points along the axis, two drawn per group: enough for the pixels of a view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +87,14 @@ class ChartCurve:
     Attributes
     ----------
     name
-        Where Rerun keeps it, under the chart.
+        Its entity in Rerun, under the chart.
     key
-        How it looks.
+        Its style.
     values
         Shape (n,), at the frequencies that were fitted.
     dotted
-        Whether the values stand for themselves: a line would run up and down wherever noise takes
-        a phase from one end of its axis to the other.
+        Whether the values are drawn as points: a line would run up and down wherever noise takes a
+        phase from one end of its axis to the other.
     """
 
     name: str
@@ -170,7 +170,7 @@ def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     tables
         The same in numbers, as plain text.
     stream
-        Takes the drawings.
+        Receives the drawings.
     """
     for page in pages(analysis):
         _draw_page(page, stream)
@@ -337,13 +337,13 @@ class Lines:
     Attributes
     ----------
     entity
-        Where Rerun keeps them.
+        Their entity in Rerun.
     title
         Title of the view, with the unit.
     names, colors, widths
-        Look of each line, from the lowest to the topmost.
+        Style of each line, from the lowest to the topmost.
     values
-        Makes of the torque the lines' values (n, lines).
+        Computes the lines' values (n, lines) from the torque.
     """
 
     entity: str
@@ -426,7 +426,7 @@ def record_page(whole: WholeRecord) -> ChartPage:
 def draw_record(
     whole: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
 ) -> None:
-    """Draw what the whole record gave: verdict, response, and torque over time.
+    """Draw the results of the whole record: verdict, response, and torque over time.
 
     Parameters
     ----------
@@ -437,7 +437,7 @@ def draw_record(
     tables
         Its tables, as plain text.
     stream
-        Takes the drawings.
+        Receives the drawings.
     """
     sentences = [
         *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
@@ -471,7 +471,7 @@ def record_tab(whole: WholeRecord, torque: TorqueInBand) -> rrb.Container:
 
 
 def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesView:
-    """Return a view of the whole session, wherever its time stands."""
+    """Return a view of the whole session, independent of the current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -517,7 +517,7 @@ def check_rerun_file(path: Path) -> None:
 
 
 def write_rerun_file(result: RecordResult, path: Path) -> None:
-    """Write the session in the layout of the live view, and in front of it what was found in it.
+    """Write the session in the layout of the live view, preceded by its results.
 
     Parameters
     ----------

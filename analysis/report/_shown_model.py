@@ -26,7 +26,7 @@ class ShownModel:
     Attributes
     ----------
     name : str
-        As captions call it.
+        Name in captions.
     modal : ModalFit or None
     beam : RecordFit
         Shown where there is no modal model.
@@ -44,11 +44,11 @@ class ShownModel:
 
     @classmethod
     def of(cls, headline: Headline, record: Record) -> ShownModel:
-        """Choose it for a record.
+        """Choose the model for a record.
 
         Parameters
         ----------
-        told : Headline
+        headline : Headline
             Headline of the record.
         record : Record
         """

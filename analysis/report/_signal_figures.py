@@ -1,4 +1,4 @@
-"""Figures of a record's signals, beside what the fitted plant makes of its angle."""
+"""Figures of a record's signals, with the response of the fitted plant to its angle."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _LARGEST_FRACTION: Final = 1 / 8
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One stretch of the record.
+    """One interval of the record.
 
     Attributes
     ----------
     name
-        What is seen there.
+        Name of the interval.
     samples
         Range of samples.
     first_s, last_s
@@ -55,7 +55,7 @@ class Moment:
 
 
 def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
-    """Where the torque rings most at each of the first modes that the sampling can show."""
+    """Return the intervals of strongest vibration, one for each mode that the sampling shows."""
     duration_s = len(record.time_s) / record.rate_hz
     moments = []
     modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
@@ -82,7 +82,7 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
 
 
 def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
-    """Shade the stretches in the panel of the whole record, numbered from 1."""
+    """Shade the intervals in the panel of the whole record, numbered from 1."""
     for number, moment in enumerate(moments, start=1):
         axes.axvspan(moment.first_s, moment.last_s, color=style.SHADE, linewidth=0, zorder=0)
         axes.text(
@@ -93,7 +93,7 @@ def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
 
 
 def enlarge(axes: Axes, number: int, moment: Moment) -> None:
-    """Make a panel the enlargement of one stretch, which is numbered like its mark."""
+    """Turn a panel into the enlargement of one interval, numbered like its mark."""
     axes.set_title(f"{number}  {moment.name}", fontsize=8.5, fontweight="normal")
     axes.set_xlim(moment.first_s, moment.last_s)
     axes.set_facecolor("#FCFAF4")
@@ -221,7 +221,7 @@ def _whole(
 def _detail(
     axes: Axes, record: Record, lines: Iterable[Line], column: int, moment: Moment, label: str
 ) -> None:
-    """Draw one stretch of signals; the first panel of a row says what they are."""
+    """Draw one interval of signals; the first panel of a row has the legend."""
     for values, line_style in lines:
         axes.plot(record.time_s[moment.samples], values[moment.samples], **line_style)
     enlarge(axes, column + 1, moment)

@@ -30,7 +30,7 @@ _WIDTH: Final = 120
 
 
 def as_text(shown: RenderableType) -> str:
-    """Return what a terminal would show, as plain text."""
+    """Return a renderable as plain text."""
     console = Console(width=_WIDTH, color_system=None, force_terminal=False)
     with console.capture() as capture:
         console.print(shown)
@@ -59,7 +59,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
             shown += spaced((fit_tables.welch_fits_table(welch),))
         shown += _warnings(result.warnings)
     else:
-        # Why Welch's fits are left out was told when they were.
+        # The reason for missing Welch fits was reported before.
         shown += _warnings(each for each in result.warnings if not each.startswith(LEFT_OUT))
     return Group(*shown)
 
@@ -86,7 +86,7 @@ def _main_results(whole: WholeRecord) -> RenderableType:
 
 
 def _bare(table: Table, caption: str = "") -> Table:
-    """Leave of what stands around a table the reasons for marked numbers."""
+    """Return a table with only those notes that explain marked numbers."""
     notes = tuple(note for note in table.notes if note.startswith(MARK))
     return replace(table, caption=caption, notes=notes)
 
@@ -181,7 +181,7 @@ def spaced(shown: Iterable[Table]) -> Iterator[RenderableType]:
 # Damping in sentences
 
 _SMALL: Final = 1e-3
-"""Sizes below are told in the power of ten that zeta has in the paper."""
+"""Sizes below are shown in the power of ten that zeta has in the paper."""
 
 _SYMBOLS: Final = {
     "internal": ("ζ", "", "zeta", "alpha", "α"),
@@ -190,11 +190,11 @@ _SYMBOLS: Final = {
 
 
 def damping_sentences(headline: Headline) -> tuple[str, ...]:
-    """Say how the modes are damped, and by which internal and external damping.
+    """Describe the damping of the modes, and the internal and external damping.
 
-    Nothing is said about modes that the record does not show, nor about any where no number is the
-    antenna's. Where part of the record is unexplained the numbers are named as what they would be,
-    without intervals.
+    Modes that the record does not show are omitted, and all if no number is the antenna's. Where
+    part of the record is unexplained the numbers are named as what they would be, without
+    intervals.
 
     Returns
     -------
@@ -220,7 +220,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     found.extend(
         f"The {each.damping} damping {_size(each)}{_order(headline, each)}."
         for each in headline.sizes
-        # A coefficient that holds for one assumed order says nothing of the antenna.
+        # A coefficient for an assumed order is no property of the antenna.
         if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(headline, each))
     )
     return tuple(found)

@@ -29,7 +29,7 @@ _TITLES: Final = {
     "ln_residue": "Residue, magnitude",
     "residue_phase_rad": "Residue, phase",
 }
-"""Modal constants as people read them; all but the phase are compared by their logarithms."""
+"""Titles of the modal constants; all but the phase are compared by their logarithms."""
 
 _PER_CENT: Final = 100.0
 
@@ -103,7 +103,7 @@ def _frame(axes: Axes, modes: tuple[int, ...], reach: float, *, least: float = 0
 
 
 def uniformity_description(test: UniformBeamTest) -> str:
-    """Say what the figure shows, and with which result."""
+    """Describe the figure and its result."""
     return (
         "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rigd.touch import Estimated
 
 _LOPSIDED = 0.25
-"""Distance of a value from the middle of its interval, as a share of that, from which on the
-ends are told instead."""
+"""Distance of a value from the middle of its interval, relative to the interval, above which the
+ends are shown instead."""
 _KINDS = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
@@ -95,7 +95,7 @@ def _cell(found: Estimated | None, start: float) -> Cell:
 
 
 def session_lines(session: TouchedSession) -> list[str]:
-    """Say what was found in a session, and by what model.
+    """Return the lines on a session's touches, and on the model.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def session_lines(session: TouchedSession) -> list[str]:
 
 
 def model_words(session: TouchedSession) -> str:
-    """Say where the model of the beam comes from."""
+    """Describe the source of the beam model."""
     source = session.model.source
     return "the nominal beam of the attached profile" if source == "profile" else source
 
@@ -211,7 +211,7 @@ def write_touch_report(
 
 
 def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Collect what is known of sessions, model and estimator."""
+    """Collect the facts on sessions, model and estimator."""
     return [
         (
             "Sessions",
