@@ -112,9 +112,9 @@ _COMMANDS: Final = {
 _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
-Figures, tables and JSON go to session.report/ beside the file (session.report-2/ if that exists).
+Figures, tables and JSON go to session.report/ next to the file (session.report-2/ if that exists).
 Several files are a campaign: statistics, nominal models, pooled estimate and validation go to
-campaign.report/ beside the first. Sessions that do not suit Welch's method (steps, multisines,
+campaign.report/ next to the first. Sessions that do not suit Welch's method (steps, multisines,
 narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
 Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""

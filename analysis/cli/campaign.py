@@ -75,8 +75,8 @@ def campaign_command(
     CampaignError
         None of the files could be used, or the workers could not be had.
     SingleSessionError
-        Only one of the files could be used, which makes no campaign: nothing was
-    written. OutputExistsError, OutputError
+        Only one of the files could be used, which makes no campaign: nothing was written.
+    OutputExistsError, OutputError
         Something cannot be written.
     """
     from analysis.campaigns import campaign

@@ -306,8 +306,8 @@ def from_time_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> T
     if stray.size:
         raise ExchangeError(
             f"{path}: the time '{channel}' of sample {stray[0] + 1} is {time_s[stray[0]]}, so its "
-            "place is unknown; repair the times, or give --rate-hz instead of --time if no sample "
-            "is missing."
+            "position is unknown; repair the times, or give --rate-hz instead of --time if no "
+            "sample is missing."
         )
     steps_s = np.diff(time_s)
     backward = np.flatnonzero(steps_s <= 0.0)

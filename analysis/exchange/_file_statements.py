@@ -209,7 +209,7 @@ class FileStatements:
             self.contradict(
                 f"the time {name} of sample {int(np.argmax(steps == 0.0)) + 2} is that of the one "
                 "before it",
-                "remove what stands twice",
+                "remove what is stated twice",
             )
             return
         step = float(values[-1] - values[0]) / (len(values) - 1)

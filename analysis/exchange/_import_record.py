@@ -202,7 +202,7 @@ def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
     year = 1970 + changed_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
         f"By its time stamp the file was changed about the year {year:.0f}, which a session cannot "
-        "state; the time of this import stands as the session's start."
+        "state; the time of this import is used as the session's start."
     )
 
 

@@ -83,7 +83,7 @@ def _functions(
         if name != ABSCISSA
     }
     if not numbers:
-        raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was asked for.")
+        raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was requested.")
     channels, times, units = {}, [], []
     for name, number in numbers.items():
         function = file.read_sets(set_numbers[number])

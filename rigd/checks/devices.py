@@ -162,7 +162,7 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
             "sensor",
             "counts and units",
             "assumed, below",
-            "told by the sensor",
+            "reported by the sensor",
             Verdict.WARNING,
             f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
         )

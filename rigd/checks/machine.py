@@ -25,9 +25,9 @@ _TRY = """
 import json, sys
 from rigd.engine.realtime import Precedence, obtain
 priority, below, cpu = map(int, sys.argv[1:])
-beside = Precedence(below, cpu)
-supervision = beside.take()
-beside.release()
+other = Precedence(below, cpu)
+supervision = other.take()
+other.release()
 print(json.dumps([obtain(priority=priority, cpu=cpu), supervision]))
 """
 _ROWS = {"supervision": "supervisor and recorder"}
@@ -75,7 +75,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
         yield Row("real time", "rights", f"could not be tried: {error}", "", Verdict.WARNING)
         return
     if settings.priority == 0:
-        yield Row("real time", "scheduling", "not asked for", "", Verdict.OK)
+        yield Row("real time", "scheduling", "not requested", "", Verdict.OK)
     for name, text in obtained.items():
         lacking = (
             text.startswith(REFUSED)

@@ -31,7 +31,7 @@ MAY_BE_UNKNOWN: Final = {
         "less"
     ),
     "motor.continuous_torque_nm": (
-        "data sheet of the motor: torque that it bears for ever, times the gear ratio"
+        "data sheet of the motor: continuous torque rating, times the gear ratio"
     ),
     "motor.thermal_time_constant_s": "data sheet of the motor: time constant of its winding",
     "encoder.resolution_rad": (

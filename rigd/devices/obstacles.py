@@ -183,7 +183,8 @@ def check_obstacles(
     Parameters
     ----------
     disturbances
-        Obstacles and knocks. beam
+        Obstacles and knocks.
+    beam
         The beam, on which they have to be.
     simulated
         Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: not simulated.
@@ -191,7 +192,7 @@ def check_obstacles(
     Raises
     ------
     ObstacleError
-        Saying why, and what to change.
+        If one cannot be simulated; the message states reason and remedy.
     """
     for disturbance in disturbances:
         if disturbance.x_m > beam.length_m:

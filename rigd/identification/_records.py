@@ -43,8 +43,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     SessionError
         If a file cannot be read.
     MotorEstimateError
-        If a file is of another excitation, its rate or delays are not those of the
-    first, or two
+        If a file is of another excitation, its rate or delays are not those of the first, or two
         files have samples in common.
     """
     windows: list[PassReadings] = []

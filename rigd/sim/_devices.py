@@ -169,7 +169,8 @@ class SimulatedRig:
         Parameters
         ----------
         disturbance
-            Its times count from the first enabling of the drive. wait
+            Its times count from the first enabling of the drive.
+        wait
             Whether it takes effect before the next period; the caller then waits a tenth of a
             second. Otherwise another process prepares it, and the rig continues meanwhile.
         """

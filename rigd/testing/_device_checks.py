@@ -80,7 +80,7 @@ def _sent_torque_is_reported(devices: Devices) -> None:
     devices.drive.disable()
     _must(
         abs(sent_nm - _TORQUE_NM) <= _ROUNDED * _TORQUE_NM,
-        f"the torque sent is said to be {sent_nm:g} N·m instead of {_TORQUE_NM:g} N·m",
+        f"the torque sent is reported as {sent_nm:g} N·m instead of {_TORQUE_NM:g} N·m",
     )
     _must(reported_nm(20) == 0.0, "a torque is reported as sent after it was disabled")
 

@@ -411,7 +411,7 @@ class AtiSerialSensor:
         while not self._lock_step and self.stream.records - first < len(self._weights):
             if time.monotonic_ns() > end_ns:
                 raise DeviceError(
-                    f"{self._name}: it was told to stream, but of the "
+                    f"{self._name}: it was commanded to stream, but of the "
                     f"{self._arrived - before} bytes that came in {_FIRST_RECORDS_TIMEOUT_S} s "
                     f"only {self.stream.records - first} were sound records. Check cable, "
                     "ati_serial.baud and ati_serial.stream_hz."

@@ -258,13 +258,13 @@ class SerialSetup:
             if self._line.drain(_QUIET_S, _DRAIN_LIMIT_S):
                 return
         raise DeviceError(
-            f"{self._name}: it goes on sending although it was told to stop; switch it off and on, "
-            "and check that no other device is on this line."
+            f"{self._name}: it continues to send although it was commanded to stop; switch it off "
+            "and on, and check that no other device is on this line."
         )
 
     def read_status(self) -> int:
         """Return the status word."""
-        return self._read(modbus.STATUS_WORD, 1, "tell its status")[0]
+        return self._read(modbus.STATUS_WORD, 1, "report its status")[0]
 
     def read_block(self) -> CalibrationBlock:
         """Return the calibration that the profile selects; verify the serial number."""
@@ -295,7 +295,7 @@ class SerialSetup:
         finally:
             self._ask(modbus.LOCK, "lock its memory")
         written = tuple(chain(block.gains, block.offsets))
-        active = self._read(modbus.ACTIVE_GAINS, len(written), "tell its gains and offsets")
+        active = self._read(modbus.ACTIVE_GAINS, len(written), "report its gains and offsets")
         if active != written:
             raise DeviceError(
                 f"{self._name}: gains and offsets read back as {active}, where {written} were "

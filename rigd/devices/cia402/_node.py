@@ -169,7 +169,7 @@ class ReceivedFrames:
                 words = NMT_STATES.get(state, f"state {state}")
                 what = (
                     f"it has left operational for {words}, as it does when it misses heartbeats, "
-                    "or when another master on the bus tells it to"
+                    "or when another master on the bus commands it to"
                 )
             self.alarm = f"{self.name}: {what}."
 

@@ -166,7 +166,7 @@ class SdoAccess:
             return
         except DeviceError as error:
             others = sorted(set(self._network.scanner.nodes) - {self._node.id})
-            received = f"; heard of node {', '.join(map(str, others))}" if others else ""
+            received = f"; frames came from node {', '.join(map(str, others))}" if others else ""
             raise DeviceError(
                 f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
             ) from None

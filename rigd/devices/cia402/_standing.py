@@ -176,7 +176,7 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
         if state_of(statusword) in OFF:
             return
     raise DeviceError(
-        f"{name}: it was told to switch off and has not done so within {_OFF_S:g} s: it is in "
+        f"{name}: it was commanded to switch off and has not done so within {_OFF_S:g} s: it is in "
         f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}); {_PRESS_STO}. Its watch '
         "over the heartbeat (object 1016) was left as it was."
     )
@@ -224,14 +224,14 @@ def _see_ready(
         )
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: {done}; when it was told to get ready it went to fault: {_fault(sdo)}. "
+            f"{name}: {done}; when it was commanded to get ready it went to fault: {_fault(sdo)}. "
             f"Remove the cause, then: {command}"
         )
     supplied = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {done}, and it is disabled, but it does not get ready: told to, it stays in "
-        f'"{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). STO '
-        f"is open or the motor supply is off; release or switch it on, then: {command}"
+        f"{name}: {done}, and it is disabled, but it does not get ready: on that command it stays "
+        f'in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). '
+        f"STO is open or the motor supply is off; release or switch it on, then: {command}"
     )
 
 

@@ -36,7 +36,7 @@ class Grade(Enum):
     SUBSTITUTED = "something else does its work"
     ASK = "the drive will be asked"
     ACCEPTED = "the profile accepts that it is missing"
-    DOUBT = "a session can be run; somebody should look"
+    DOUBT = "a session can be run; somebody should check it"
     REFUSED = "no session with this drive"
 
 
@@ -127,7 +127,7 @@ class _SuitabilityCheck:
         ):
             what = key.replace("_", " ")
             wanted = getattr(self._settings, key) if self._settings else 0
-            shown = f"0x{stated:08X}" if stated else "not told"
+            shown = f"0x{stated:08X}" if stated else "not stated"
             found = f"{shown} ({name})" if name else shown
             if not (stated and wanted and stated != wanted):
                 yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
@@ -141,7 +141,7 @@ class _SuitabilityCheck:
     def _bit_rates(self) -> Iterator[Finding]:
         rates = self._eds.bit_rates_bit_s
         found = ", ".join(f"{rate // 1000}" for rate in rates)
-        found = f"{found} kbit/s" if rates else "not told"
+        found = f"{found} kbit/s" if rates else "not stated"
         if self._rig is None or self._rig.can is None:
             yield Finding("bit rates", found, "", Grade.FITS)
             return
@@ -174,7 +174,9 @@ class _SuitabilityCheck:
                 "or its firmware cannot be used."
             )
             return Finding(what, shown, wanted, Grade.REFUSED, sentence)
-        return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
+        return Finding(
+            what, "the file does not state it; the drive will be asked", wanted, Grade.ASK
+        )
 
     def _watchdog(self) -> Finding:
         """Check which watchdog removes the torque when this computer falls silent."""

@@ -173,7 +173,8 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
     Raises
     ------
     StopRequestedError
-        If `stop` returned True. The drive may be enabled then. DeviceError
+        If `stop` returned True. The drive may be enabled then.
+    DeviceError
         If a step takes longer than ``cia402.enable_timeout_s``, the drive then ignores the torque,
         or is in another mode. It may be enabled then.
     """

@@ -373,7 +373,7 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "0x080 + node id, the default of CiA 301",
-        "Its emergency messages would not be heard.",
+        "Its emergency messages would not be received.",
     ),
     # Torque and speed.
     Requirement(
@@ -635,7 +635,7 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
     from rigd.devices.contracts import DeviceError
 
     raise DeviceError(
-        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
+        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be set in a CANopen drive (object 60C2: "
         "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."
     )
 

@@ -175,7 +175,7 @@ def parse_fault(spec: str) -> Fault:
         if key not in keys:
             raise FaultError(_complaint(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}"))
         if key in values:
-            raise FaultError(_complaint(spec, f"'{key}' stands twice"))
+            raise FaultError(_complaint(spec, f"'{key}' is given twice"))
         try:
             values[key] = keys[key].read(text)
         except ValueError:

@@ -301,8 +301,8 @@ def is_virtual(channel: str) -> bool:
         return True
     raise DeviceError(
         f"CAN bus {channel}: this is not a virtual bus here, and a simulated drive must not answer "
-        "beside real ones; simulate with a copy of the profile that has another name and another "
-        "can.channel."
+        "together with real ones; simulate with a copy of the profile that has another name and "
+        "another can.channel."
     )
 
 

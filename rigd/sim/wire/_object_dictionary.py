@@ -137,7 +137,8 @@ class Entry:
         Parameters
         ----------
         described
-            Entry of the file, a number as this one is. default
+            Entry of the file, a number as this one is.
+        default
             Value at power-on from now on; None leaves it as it is.
         """
         if self.live is not None and described.kind != self.kind:

@@ -223,7 +223,7 @@ def test_a_channel_that_is_not_there_is_no_virtual_bus():
 
 
 def test_an_interface_that_is_not_a_virtual_bus_is_refused():
-    with pytest.raises(DeviceError, match="must not answer beside real ones"):
+    with pytest.raises(DeviceError, match="must not answer together with real ones"):
         links.is_virtual("lo")
     assert links.interface_kind("lo") == ""
 
