@@ -187,7 +187,8 @@ def check_obstacles(
     beam
         The beam, on which they have to be.
     simulated
-        Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: not simulated.
+        Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: none
+        of that kind.
 
     Raises
     ------
