@@ -1,7 +1,8 @@
 """Results of one record, as computing hands them to all that shows them: text, page, files.
 
-`record_result` goes from a session file to a `RecordResult`; a campaign keeps of each one what it
-needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.CampaignResult` of them.
+`record_result` makes a `RecordResult` from a session file. A campaign retains the parts of each
+that it needs (`analysis.campaigns.SessionAnalysis`) and combines them in an
+`analysis.campaigns.CampaignResult`.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@
      |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run
      |    +-- EdsError, UnusableDriveError    the EDS file of a drive is invalid or insufficient
-     |    +-- EstimateError         the sessions do not determine the motor's data
+     |    +-- MotorEstimateError    the sessions do not determine the motor's data
      |    +-- LoopError, CyclictestError      rigd bench could not measure
      +-- CommandError, RefusedByDaemonError   of either kind, as reported by the daemon
 

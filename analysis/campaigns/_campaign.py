@@ -1,4 +1,4 @@
-"""A campaign: all sessions analysed in parallel, then what they say together."""
+"""A campaign: all sessions analysed in parallel, then their combined results."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 from analysis.campaigns._experiment import (
     CampaignError,
+    distinct_names,
     labelled,
     most_common,
     stated_specimens,
-    told_apart,
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
 from analysis.campaigns._orders import freest_estimate
 from analysis.campaigns._session import (
+    SessionAnalysis,
     SessionFailure,
-    SessionResult,
     SessionTask,
     analyse_session,
 )
@@ -77,10 +77,10 @@ class CampaignResult:
         Structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
     modal : PooledModal or None
-        Modal model of all sessions, and what it says of a nearly uniform beam; None unless two
+        Modal model of all sessions, and the nearly uniform beam estimated from it; None unless two
         sessions show a common mode.
     verdict : CampaignVerdict or None
-        Which of them the data support, and what else they say; None without any.
+        Structure that the data support, and further findings; None without any.
     validation : tuple of LeftOutError
         Session by session; empty with fewer than three sessions.
     lost_trials : tuple of LostTrial
@@ -90,7 +90,7 @@ class CampaignResult:
 
     settings: WelchSettings
     record_band_hz: tuple[float, float]
-    sessions: tuple[SessionResult, ...]
+    sessions: tuple[SessionAnalysis, ...]
     failures: tuple[SessionFailure, ...]
     statistics: tuple[ParameterStatistics, ...]
     nominal: tuple[NominalModel, ...]
@@ -105,7 +105,7 @@ class CampaignResult:
 
     @property
     def headline(self) -> PooledEstimate | None:
-        """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
+        """Pooled estimate whose numbers are reported, None without any: see `freest_estimate`."""
         return freest_estimate(self.pooled)
 
     @property
@@ -117,7 +117,7 @@ class CampaignResult:
 
     @property
     def validity(self) -> Validity:
-        """How exact the linear model is for the sessions: that of the worst."""
+        """Validity of the linear model for the sessions: that of the worst."""
         return worst(each.validity for each in self.sessions)
 
     @property
@@ -163,10 +163,10 @@ def campaign(
         Address of a Dask scheduler whose workers are used instead; they find the files under the
         same absolute paths.
     uniformity : float, optional
-        Relative standard deviation of each mode's frequency from that of a uniform beam, in place
-        of what the files state.
+        Relative standard deviation of each mode's frequency from that of a uniform beam, instead of
+        that stated in the files.
     workers : Workers, optional
-        Workers that are ready already, in place of `jobs` and `dask`; they are left open.
+        Existing workers, used instead of `jobs` and `dask`; they are left open.
     on_progress : callable, optional
         Called with the steps done, their number and a file's name.
 
@@ -226,12 +226,12 @@ def campaign(
 
 
 def campaign_result(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     failures: Sequence[SessionFailure] = (),
     validation: Sequence[LeftOutError] = (),
     lost: Sequence[LostTrial] = (),
 ) -> CampaignResult:
-    """Say what sessions of one experiment tell together.
+    """Return the combined result of sessions of one experiment.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def campaign_result(
     lost : sequence of LostTrial, optional
         Sessions that were to be predicted and were not.
     """
-    names = told_apart([*(each.path for each in sessions), *(each.path for each in failures)])
+    names = distinct_names([*(each.path for each in sessions), *(each.path for each in failures)])
     sessions = [replace(each, name=name) for each, name in zip(sessions, names, strict=False)]
     failures = [
         replace(each, name=name)
@@ -276,23 +276,23 @@ def campaign_result(
 
 
 def _of_one_experiment(
-    results: Sequence[SessionResult | SessionFailure],
-) -> tuple[list[SessionResult], list[SessionFailure]]:
-    """Set aside what failed, and what is not the experiment that most of the sessions are."""
-    usable = [result for result in results if isinstance(result, SessionResult)]
+    results: Sequence[SessionAnalysis | SessionFailure],
+) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
+    """Set aside failures, and sessions that differ from the most common experiment."""
+    usable = [result for result in results if isinstance(result, SessionAnalysis)]
     if not usable:
         return [], [result for result in results if isinstance(result, SessionFailure)]
     results = _labelled(results)
-    usable = [result for result in results if isinstance(result, SessionResult)]
+    usable = [result for result in results if isinstance(result, SessionAnalysis)]
     common = usable[most_common([session.experiment for session in usable])]
     stated = [result.experiment for result in results if result.experiment]
     alike = sum(common.experiment.difference(each) is None for each in stated)
     as_in = ", as in most" if 2 * alike > len(stated) else ""
-    sessions: list[SessionResult] = []
+    sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
     for result in results:
         reason = _reason_against(result, common, as_in, sessions)
-        if reason is None and isinstance(result, SessionResult):
+        if reason is None and isinstance(result, SessionAnalysis):
             sessions.append(result)
         elif reason is None and isinstance(result, SessionFailure):
             failures.append(result)
@@ -304,11 +304,11 @@ def _of_one_experiment(
 
 
 def _alike_by_welch(
-    sessions: list[SessionResult], failures: list[SessionFailure]
-) -> tuple[list[SessionResult], list[SessionFailure]]:
-    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without.
+    sessions: list[SessionAnalysis], failures: list[SessionFailure]
+) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
+    """Use Welch's fits for all sessions or for none: set aside exceptions, or omit the fits.
 
-    A search is never set aside: its record tells as much as any.
+    A search is never set aside: its record is as informative as any.
     """
     without = [each for each in sessions if not each.frequency_hz.size]
     if not without:
@@ -328,22 +328,22 @@ def _alike_by_welch(
 
 
 def _labelled(
-    results: Sequence[SessionResult | SessionFailure],
-) -> list[SessionResult | SessionFailure]:
-    """Take the specimens' labels for what they say: see `labelled`."""
+    results: Sequence[SessionAnalysis | SessionFailure],
+) -> list[SessionAnalysis | SessionFailure]:
+    """Use the specimens' labels: see `labelled`."""
     stated = iter(labelled([each.experiment for each in results if each.experiment]))
     return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
 
 
 def _reason_against(
-    result: SessionResult | SessionFailure,
-    common: SessionResult,
+    result: SessionAnalysis | SessionFailure,
+    common: SessionAnalysis,
     as_in: str,
-    before: Sequence[SessionResult],
+    before: Sequence[SessionAnalysis],
 ) -> str | None:
-    """Say why a session does not belong to those it came with, None if nothing speaks against.
+    """Return why a session does not belong to the others, None if it does.
 
-    `as_in` says of the common one whether it stands for most.
+    `as_in` states whether the common one represents most of them.
     """
     experiment = result.experiment
     difference = experiment and common.experiment.difference(experiment)

@@ -1,4 +1,4 @@
-"""Estimates of one session that a campaign keeps: Welch fits and whole-record fits."""
+"""Estimates of one session that a campaign retains: Welch fits and whole-record fits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class WelchFit:
     cost : float
         Eq. (26) at the minimum, in (N·m/rad)².
     at_bounds : tuple of str
-        Free parameters that rest on the edge of the range searched.
+        Free parameters at the bounds of the range searched.
     std : dict or None
         See `analysis.paper._fit.FrfFit`.
     indices : Indices or None
@@ -48,7 +48,7 @@ class WelchFit:
 
     @classmethod
     def of(cls, model: FittedModel) -> WelchFit:
-        """Keep of a fit what a campaign needs."""
+        """Return the part of a fit that a campaign needs."""
         fit = model.fit
         return cls(
             structure=fit.structure.name,
@@ -81,7 +81,7 @@ class RecordEstimate:
     cost : float
     degrees_of_freedom : int
     deviance : float
-        ``-2 ln`` likelihood, but for a constant that all estimates of the session share.
+        ``-2 ln`` likelihood, up to a constant common to all estimates of the session.
     bic : float
         Criterion of the session by itself.
     values : int
@@ -108,7 +108,7 @@ class RecordEstimate:
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Name in tables."""
         return self.structure
 
     @property
@@ -118,7 +118,7 @@ class RecordEstimate:
 
     @classmethod
     def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
-        """Keep of a fit what a campaign needs: all but the residual.
+        """Return the part of a fit that a campaign needs: all but the residual.
 
         Parameters
         ----------

@@ -23,8 +23,8 @@ class CampaignError(ValueError):
     """A campaign that cannot be analysed; the message says why and what to do."""
 
 
-class LoneSessionError(CampaignError):
-    """A campaign of whose files one alone can be used.
+class SingleSessionError(CampaignError):
+    """Only one file of a campaign can be used.
 
     Parameters
     ----------
@@ -72,7 +72,8 @@ _SEARCH: Final = "until"
 """Excitation that was planned while it ran: each is another one."""
 
 _WHOLE: Final = 0.99
-"""Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
+"""Fraction of the planned sweep from which it counts as complete: ticks may be missing at its
+end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,7 @@ class Experiment:
         return self.facts.get("excitation") == _SEARCH
 
     def unfinished(self, outcome: str) -> str:
-        """Say that the sweep ended early, as the end of a sentence; empty if it did not."""
+        """Describe, as the end of a sentence, that the sweep ended early; empty if it did not."""
         planned_s = self.facts.get("duration_s")
         if not isinstance(planned_s, float):
             return ""
@@ -155,7 +156,7 @@ class Experiment:
         )
 
     def difference(self, other: Experiment) -> str | None:
-        """Name the first fact in which another one differs, None if it is the same experiment."""
+        """Describe the first difference from another experiment, None if there is none."""
         planned = self.searched or other.searched
         stated = dict(other.facts)
         if {self.rising, other.rising} == {True, False}:
@@ -164,7 +165,7 @@ class Experiment:
         for key, mine in self.facts.items():
             theirs = mine if planned and key in _STATED else stated.get(key, mine)
             if not _same(theirs, mine):
-                return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
+                return f"{key} is {fact_text(key, theirs)}, but {fact_text(key, mine)}"
         return None
 
     @property
@@ -185,8 +186,8 @@ class Experiment:
         )
 
 
-def told_apart(paths: Sequence[Path]) -> list[str]:
-    """Name files by as much of the end of each path as no other has.
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Return the shortest end of each path that no other one has.
 
     Parameters
     ----------
@@ -250,10 +251,10 @@ def stated_specimens(
 
 
 def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Tell the unlabelled from the labelled where there are several labels.
+    """Distinguish unlabelled from labelled sessions if there are several labels.
 
-    With one label alone, a session without it is taken for the same specimen. With several nobody
-    knows which of them it is.
+    With one label alone, a session without it is taken for the same specimen. With several labels
+    its specimen is unknown.
     """
     if len({each.label for each in experiments if each.label}) < 2:
         return list(experiments)
@@ -261,7 +262,7 @@ def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
 
 
 def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
-    """Keys in which specimens differ."""
+    """Return the keys in which specimens differ."""
     first = specimens[0].facts
     return tuple(
         key
@@ -271,13 +272,13 @@ def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
 
 
 def most_common(experiments: Sequence[Experiment]) -> int:
-    """Return the place of the one with which most others agree, the first of several.
+    """Return the index of the experiment with which most others agree, the first of several.
 
-    A search agrees with any excitation, so it says of none that it is the common one.
+    A search agrees with any excitation, so it does not count as a candidate.
     """
-    places = [i for i, each in enumerate(experiments) if not each.searched]
+    indices = [i for i, each in enumerate(experiments) if not each.searched]
     return max(
-        places or range(len(experiments)),
+        indices or range(len(experiments)),
         key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
     )
 
@@ -288,7 +289,7 @@ def _same(one: str | float, two: str | float) -> bool:
     return math.isclose(one, two, rel_tol=1e-9)
 
 
-def told(key: str, value: str | float) -> str:
+def fact_text(key: str, value: str | float) -> str:
     """Write a fact with its unit.
 
     Parameters

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._modal import ModeInSweeps, OppositeSweeps, PooledModal
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify import TolerantEstimate
 
@@ -32,32 +32,32 @@ def chance(p_value: float) -> str:
 
 
 def tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
-    """Say what parameters are estimated from, and which tolerance of the geometry they have."""
+    """Describe the basis of the parameters, and their tolerance of the geometry."""
     stated = modal.stated[-1]
     given = f"{100 * stated:g} % as the files state it"
     if len(modal.stated) > 1:
         every = listed([f"{100 * each:g}" for each in modal.stated])
         given = f"{100 * stated:g} %, the largest of the {every} % that the files state"
-    said = (
+    sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
         f"{modal.sessions} sessions"
     )
     if estimate.basis != "geometry":
         return (
-            f"{said}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
+            f"{sentence}, by {_BASES[estimate.basis]}: the frequencies are not those of a uniform "
             f"beam to {given}, nor with a wider tolerance."
         )
     used = given
     if estimate.uniformity > stated:
         used = f"{100 * estimate.uniformity:g} % ({given} does not suffice)"
     return (
-        f"{said}; each mode lies where that of a uniform beam does, to {used}. An unevenness of "
-        "the specimen is common to all sessions and does not average out."
+        f"{sentence}; each mode lies where that of a uniform beam does, to {used}. An unevenness "
+        "of the specimen is common to all sessions and does not average out."
     )
 
 
 def slope(found: PooledOrder, modal: PooledModal) -> str:
-    """Say what is known of an order as the slope of a loss over the modes in sight.
+    """Describe an order as the slope of a loss over the visible modes.
 
     Parameters
     ----------
@@ -75,22 +75,22 @@ def slope(found: PooledOrder, modal: PooledModal) -> str:
             f"{found.reason}. {alone}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
-    said = slope_of_loss(
+    sentence = slope_of_loss(
         found.order, found.value, found.interval, shown_hz, estimate, found.status, found.reason
     )
-    return f"{said} {alone}"
+    return f"{sentence} {alone}"
 
 
 def if_exact(
     freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
 ) -> list[str]:
-    """Say what the orders are on condition that the beam is exactly uniform.
+    """Describe the orders on condition that the beam is exactly uniform.
 
-    Nothing where a uniform beam does not predict the modes.
+    Empty if a uniform beam does not predict the modes.
     """
     if modal is None or modal.uniform_beam.status == "refused":
         return []
-    said = []
+    orders_shown = []
     for each in orders:
         exact = each.exact
         if exact is None or exact.reason or exact.value is None or exact.interval is None:
@@ -102,9 +102,11 @@ def if_exact(
             "fractional": "which would exclude 1",
             "open": "1 would be doubtful",
         }
-        said.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
+        orders_shown.append(f"{each.order} {value} (95 %: {low} to {high}; {end[exact.status]})")
     return (
-        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(said)}."] if said else []
+        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(orders_shown)}."]
+        if orders_shown
+        else []
     )
 
 
@@ -112,7 +114,7 @@ def if_exact(
 
 
 def sweeps(found: OppositeSweeps | None) -> list[str]:
-    """Say whether rising and falling sweeps show the same modes."""
+    """Describe whether rising and falling sweeps show the same modes."""
     if found is None:
         return []
     which = f"{found.rising} rising and {found.falling} falling sweeps"
@@ -142,9 +144,9 @@ def _difference(each: ModeInSweeps) -> str:
 
 
 def experiments(
-    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionResult]
+    found: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
 ) -> list[str]:
-    """Say which sweeps would decide whether something changes along the records."""
+    """Recommend sweeps that decide whether the specimen changes during the records."""
     if found is not None and found.changed:
         modes = listed([str(each.mode) for each in found.changed])
         return [

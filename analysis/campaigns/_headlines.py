@@ -89,24 +89,26 @@ def campaign_numbers(campaign: CampaignResult) -> Numbers | None:
     )
     if modal is None:
         return exact
-    told = with_modal_model(
+    numbers = with_modal_model(
         exact, modal, modal.uniform_beam, modal.tolerant, every, every, half_width=modal.half_width
     )
-    return _flagged(told, campaign, orders)
+    return _flagged(numbers, campaign, orders)
 
 
-def _flagged(told: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder, ...]) -> Numbers:
-    """Flag what sessions differ in, what orders share their reasons, and modes that do not show."""
+def _flagged(
+    numbers: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
+) -> Numbers:
+    """Flag quantities that differ between sessions, doubtful orders, and hidden modes."""
     flags, mixed = _flags(orders), campaign.homogeneity.is_mixed
 
     def of_mixture(quantity: str) -> str | None:
         return _MIXTURE if mixed(quantity) else None
 
     return replace(
-        told,
+        numbers,
         parameters={
             name: each.flagged(of_mixture(name) or flags.get(name))
-            for name, each in told.parameters.items()
+            for name, each in numbers.parameters.items()
         },
         modes=tuple(
             replace(
@@ -118,13 +120,13 @@ def _flagged(told: Numbers, campaign: CampaignResult, orders: tuple[PooledOrder,
                     of_mixture(f"damping_ratio_{each.number}") if each.shown else _NOT_SHOWN
                 ),
             )
-            for each in told.modes
+            for each in numbers.modes
         ),
     )
 
 
 def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:
-    """Take what the lowest BIC gives, on condition that its orders are true."""
+    """Return the estimate of the lowest BIC, on condition that its orders are true."""
     conditional = campaign.pooled[0]
     if conditional is pooled:
         return None
@@ -164,7 +166,7 @@ def _parameters(
 
 
 def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
-    """Reasons against an order, which its coefficient shares."""
+    """Return the reasons against each order, also for its coefficient."""
     return {
         name: each.reason
         for each in orders
@@ -183,15 +185,15 @@ def _sizes(
 def _modes(campaign: CampaignResult, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
     t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
-    def told(value: float, std: float, quantity: str) -> Quantity:
+    def quantity_of(value: float, std: float, quantity: str) -> Quantity:
         flag = every or (_MIXTURE if mixed(quantity) else None)
         return Quantity(value, std, (value - t * std, value + t * std), flag)
 
     return tuple(
         Mode(
             mode.number,
-            told(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
-            told(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
+            quantity_of(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
+            quantity_of(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
             shown=True,
         )
         for mode in pooled.modes

@@ -1,7 +1,7 @@
 """Homogeneity of a campaign: whether its sessions are of one specimen, by files and by estimates.
 
-Cochran's Q and I², the share of the variance between sessions that their own uncertainties do not
-explain [1]_, of each mode and of each parameter by itself.
+Cochran's Q and I², the fraction of the variance between sessions that their own uncertainties do
+not explain [1]_, of each mode and of each parameter by itself.
 
 References
 ----------
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._experiment import StatedSpecimen
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
 Values = tuple[tuple[str, float, float], ...]
@@ -39,10 +39,10 @@ SIGNIFICANT: Final = 0.01
 """Level of all quantities together: one alarm in a hundred campaigns that repeat is false."""
 
 _LARGE: Final = 0.9
-"""I² from which sessions are said to differ in kind: a scatter of three own standard deviations."""
+"""I² from which sessions count as a mixture: a scatter of three own standard deviations."""
 
 _CLEAR: Final = 5.0
-"""Gap between groups from which they are told apart, in standard deviations within groups."""
+"""Gap from which groups are distinguished, in standard deviations within groups."""
 
 _FEWEST: Final = 2
 _OF_MODES: Final = {"frequency_hz": "frequency_std_hz", "damping_ratio": "damping_ratio_std"}
@@ -70,7 +70,7 @@ class Heterogeneity:
     mixed : bool
         Whether sessions differ so much that the mean is that of a mixture.
     groups : tuple of tuple of str
-        Files that lie together, the groups from the least value on; empty without clear gaps.
+        Files of each group, the lowest first; empty without clear gaps.
     """
 
     quantity: str
@@ -94,7 +94,7 @@ class Heterogeneity:
 
     @property
     def i_squared(self) -> float:
-        """Share of the variance between sessions that is not their own uncertainty."""
+        """Fraction of the variance between sessions that their own uncertainty does not explain."""
         return self.own_stds**2 / (1 + self.own_stds**2)
 
     @property
@@ -105,7 +105,7 @@ class Heterogeneity:
 
 @dataclass(frozen=True, slots=True)
 class Homogeneity:
-    """What speaks for one specimen, and what against.
+    """Evidence for and against one specimen.
 
     Attributes
     ----------
@@ -123,19 +123,19 @@ class Homogeneity:
 
     @property
     def leading(self) -> Heterogeneity | None:
-        """What of the specimen sessions differ in most, a mode's before a parameter; or None."""
+        """Quantity in which sessions differ most, modes before parameters; None if they do not."""
         found = [each for each in self.quantities if each.mixed and not each.of_rig]
         of_modes = [each for each in found if each.quantity.startswith(tuple(_OF_MODES))]
         return max(of_modes or found, key=lambda each: each.own_stds, default=None)
 
     @property
     def mixed(self) -> bool:
-        """Whether what is pooled is the mean of a mixture."""
+        """Whether the pooled values are means of a mixture."""
         return self.leading is not None
 
     @property
     def one_specimen(self) -> bool:
-        """Whether neither what files state nor what sessions show speaks against it."""
+        """Whether neither the files nor the estimates contradict one specimen."""
         return len(self.specimens) < _FEWEST and not self.mixed
 
     def of(self, quantity: str) -> Heterogeneity | None:
@@ -149,11 +149,11 @@ class Homogeneity:
 
 
 def homogeneity(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
-    """Judge whether sessions are of one specimen, all by one structure (`common_structure`).
+    """Test whether sessions are of one specimen, all by one structure (`common_structure`).
 
     Parameters
     ----------
@@ -186,16 +186,16 @@ def _of_modes(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple
     """Yield frequencies and damping ratios of the modes that all sessions have."""
     count = min((len(each.modes) for _, each in estimates), default=0)
     for quantity, std in _OF_MODES.items():
-        for place in range(count):
+        for index in range(count):
             values = (
-                (file, getattr(each.modes[place], quantity), getattr(each.modes[place], std))
+                (file, getattr(each.modes[index], quantity), getattr(each.modes[index], std))
                 for file, each in estimates
             )
-            yield f"{quantity}_{place + 1}", _known(values)
+            yield f"{quantity}_{index + 1}", _known(values)
 
 
 def _of_parameters(
-    sessions: Sequence[SessionResult], shared: PooledEstimate
+    sessions: Sequence[SessionAnalysis], shared: PooledEstimate
 ) -> Iterator[tuple[str, Values]]:
     for parameter in shared.parameters:
         name = parameter.name
@@ -231,12 +231,12 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
         cochran_q=q,
         chance=chance,
         mixed=significant and (bool(apart) or q * (1 - _LARGE) >= len(values) - 1),
-        groups=tuple(tuple(values[place][0] for place in sorted(part)) for part in apart),
+        groups=tuple(tuple(values[index][0] for index in sorted(part)) for part in apart),
     )
 
 
 def groups(estimate: NDArray[np.float64], std: NDArray[np.float64]) -> tuple[tuple[int, ...], ...]:
-    """Part estimates at clear gaps; places from the least value on, nothing without such gaps.
+    """Split estimates at clear gaps into groups of indices, lowest first; empty without gaps.
 
     No more groups than half the sessions, so that one at least has two members, and gaps of
     `_CLEAR` standard deviations within the groups, or of single sessions where these are larger.

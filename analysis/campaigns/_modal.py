@@ -3,7 +3,7 @@
 Each session's noise averages out, an unevenness of the specimen does not: it is common to all. So
 the tolerance of the geometry is added to the covariance of the pooled constants, whatever the
 number of sessions. Rising and falling sweeps pass each mode at different times, so their constants
-differ where something changes along the records.
+differ if the specimen changes during the records.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
 _FEWEST: Final = 2
 _NEARLY_ALL: Final = 0.9
-"""Share of the sessions that must show a mode."""
+"""Fraction of the sessions that must show a mode."""
 
 _SIGNIFICANT: Final = 0.01
 """Level of all modes together at which rising and falling sweeps differ."""
@@ -79,7 +79,7 @@ class PooledModal(ModalEstimate):
 
     @property
     def leads(self) -> bool:
-        """Whether modes are its own, and not those of an exactly uniform beam."""
+        """Whether the reported modes are its own, and not those of an exactly uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property
@@ -106,7 +106,7 @@ class PooledModal(ModalEstimate):
         return tuple(found)
 
 
-def pooled_modal(sessions: Sequence[SessionResult]) -> PooledModal | None:
+def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     """Pool the modal constants of sessions; None unless two of them show a common mode.
 
     Parameters
@@ -231,7 +231,7 @@ class OppositeSweeps:
         return tuple(each for each in self.modes if each.changed)
 
 
-def opposite_sweeps(sessions: Sequence[SessionResult]) -> OppositeSweeps | None:
+def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | None:
     """Compare the modes of rising with those of falling sweeps; None without both.
 
     Parameters
@@ -251,8 +251,8 @@ def opposite_sweeps(sessions: Sequence[SessionResult]) -> OppositeSweeps | None:
     phases = difference[_PHASE : len(modes) * len(CONSTANTS) : len(CONSTANTS)]  # a view
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
     found = []
-    for place, mode in enumerate(modes):
-        rows = slice(len(CONSTANTS) * place, len(CONSTANTS) * (place + 1))
+    for index, mode in enumerate(modes):
+        rows = slice(len(CONSTANTS) * index, len(CONSTANTS) * (index + 1))
         off, spread = difference[rows], covariance[rows, rows]
         chance = float(chi_square_p_value(off @ np.linalg.solve(spread, off), len(CONSTANTS)))
         std = np.sqrt(np.diag(spread))

@@ -1,4 +1,4 @@
-"""Common structure of all sessions, and what they say together about the orders of the damping.
+"""Common structure of all sessions, and their joint result on the orders of the damping.
 
 The structure by which all sessions are compared and pooled is the freest that they support. What a
 session selects by itself depends on its noise. Sessions compared by what each of them selected
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
     from analysis.identify import Order, TolerantEstimate, Verdict
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Common structure
 
 _NEARLY_ALL: Final = 0.9
-"""Share of the sessions that determine the selected structure that must determine a freer one."""
+"""Fraction of the sessions determining the selected structure that must determine a freer one."""
 
 
 def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
@@ -53,7 +53,7 @@ def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
     )
 
 
-def common_structure(sessions: Sequence[SessionResult]) -> str | None:
+def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     """Name the structure by which the modes of all sessions are compared.
 
     Parameters
@@ -81,7 +81,7 @@ PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _ADEQUATE: Final = 0.9
-"""Share of the sessions that must leave nothing but noise before an order is reported."""
+"""Fraction of the sessions whose residual must be noise before an order is reported."""
 
 _SURE: Final = 0.999
 """Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
@@ -110,7 +110,7 @@ class PooledOrder:
     reason : str or None
         Why the number is not a property of the specimen; None if it is.
     alone : mapping of str to int
-        How many sessions say what by themselves.
+        Number of sessions with each status by themselves.
     mixture : bool
         Whether the reason is that sessions differ in it in kind, or are of different specimens and
         do not all determine it.
@@ -127,7 +127,7 @@ class PooledOrder:
     exact: PooledOrder | None = None
 
     def doubted(self, reason: str) -> PooledOrder:
-        """Give it a reason for doubt, unless it has one."""
+        """Return the order with a reason for doubt, unless it has one."""
         if self.reason is not None:
             return self
         return replace(self, status="open" if self.interval else self.status, reason=reason)
@@ -139,7 +139,7 @@ def pooled_order(
     verdicts: Sequence[Verdict],
     alike: Homogeneity,
 ) -> PooledOrder:
-    """Judge one order by what all sessions share, as one record is judged by what it shows.
+    """Assess one order by all sessions, by the same rules as for one record.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def tolerant_pooled_order(
     *,
     refused: bool,
 ) -> PooledOrder:
-    """Judge one order with a tolerance of the geometry.
+    """Assess one order with a tolerance of the geometry.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def tolerant_pooled_order(
 
 
 def _adequate(verdicts: Sequence[Verdict]) -> bool:
-    """Whether nearly all sessions leave nothing but noise."""
+    """Return whether the residuals of nearly all sessions are noise."""
     return sum(each.adequate for each in verdicts) >= _ADEQUATE * len(verdicts)
 
 
@@ -237,7 +237,7 @@ def _judged(
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)
     if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":
-        # None of those fitted has it free: the sessions' own verdicts are all that there is.
+        # No fitted structure has it free: only the sessions' own verdicts are available.
         return "compatible", None
     if free is None or _wide(free.interval) > WIDEST_SHARE:
         return "not identifiable", "the sessions do not determine the order"
@@ -262,5 +262,5 @@ def _excludes_one(order: PooledParameter, sessions: int) -> bool:
 
 
 def _wide(interval: tuple[float, float]) -> float:
-    """Share of the range of orders that an interval spans."""
+    """Return the fraction of the range of orders that an interval spans."""
     return (interval[1] - interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

@@ -1,4 +1,4 @@
-"""Analysis of one session of a campaign by a worker, and the little that it sends back."""
+"""Analysis of one session of a campaign by a worker, and its compact result."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _MISREAD: Final = ("sign", "unit")
-"""Findings beside which no number is the specimen's."""
+"""Findings that invalidate all numbers of the specimen."""
 
 _NO_RESPONSE: Final = FrequencyResponse(
     np.zeros(0), np.zeros(0, dtype=np.complex128), coherence=None, segments=0, estimator="h1"
@@ -40,7 +40,7 @@ _NOT_COMPARED: Final = Indices(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True, slots=True)
 class SessionFailure:
-    """A session of which nothing is used, why, and what experiment it is as far as is known."""
+    """A session that is not used, the reason, and its experiment if known."""
 
     path: Path
     """The file."""
@@ -49,14 +49,14 @@ class SessionFailure:
     experiment: Experiment | None = None
     """Specimen and rig, None if nothing is known of them."""
     name: str = ""
-    """What tables call it: see `told_apart`; by itself the name of its file."""
+    """Name in tables: see `distinct_names`; for a single session that of its file."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
 
 
 @dataclass(frozen=True, slots=True)
-class SessionResult:
+class SessionAnalysis:
     """One session of a campaign: some 200 kB for the paper's settings.
 
     Attributes
@@ -76,13 +76,12 @@ class SessionResult:
     welch_fits : tuple of WelchFit
         By type, then by weighting; none if Welch's method does not suit the session.
     record_estimates : tuple of RecordEstimate
-        By type; empty if none was asked for, or the record could
-        not be used.
+        By type; empty if none was requested, or the record could not be used.
     verdict : Verdict or None
-        What the whole record says by itself, None without estimates.
+        Verdict on the whole record by itself, None without estimates.
     warnings : tuple of str
     headline : mapping or None
-        What the session says first, as of a single file's document; None without a verdict.
+        Headline of the session, as in a single file's document; None without a verdict.
     settings : WelchSettings
         As used, the segments in samples.
     segments : int
@@ -90,11 +89,11 @@ class SessionResult:
     record_band_hz : tuple of float
         Band of the whole-record fits.
     name : str
-        What tables and sentences call it: see `told_apart`; by itself the name of its file.
+        Name in tables and sentences: see `distinct_names`; for a single session that of its file.
     digests : frozenset of bytes
         Digests of its samples: see `rigd.session.sample_digests`.
     validity : Validity
-        How exact the linear model is for the session.
+        Validity of the linear model for the session.
     modal : ModalEstimate or None
         Modes that the whole record shows; None without any.
     nominal : Plant or None
@@ -129,8 +128,8 @@ class SessionResult:
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.path.name)
 
-    def without_welch(self) -> SessionResult:
-        """Leave out what is there by Welch's method."""
+    def without_welch(self) -> SessionAnalysis:
+        """Return the session without results of Welch's method."""
         return replace(
             self,
             frequency_hz=_NO_RESPONSE.frequency_hz,
@@ -150,13 +149,13 @@ class SessionResult:
 
 @dataclass(frozen=True, slots=True)
 class SessionTask:
-    """What is to be done with every session.
+    """Settings of the analysis of every session.
 
     Attributes
     ----------
     settings : WelchSettings
     structures : tuple of str
-        Names of those that are kept of the whole-record fits; without any there are none.
+        Names of the whole-record fits to retain; empty for no such fits.
     fixed : tuple of str
         Settings that stay at the file's values in those fits.
     band_hz : tuple of float or None
@@ -173,17 +172,17 @@ class SessionTask:
     uniformity: float | None = None
 
 
-def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
+def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionFailure:
     """Read a session, analyse it by both routes, or by the whole record where that suits alone.
 
-    A session that cannot be analysed is told, not raised: it is one of many.
+    An error of one session is returned, not raised, because the others are still usable.
 
     Parameters
     ----------
     path : Path
         Session file.
     task : SessionTask
-        What is fitted, and how.
+        Settings of the analysis.
     """
     from analysis.record import load_record
     from analysis.suited import remarks, welch_analysis
@@ -224,8 +223,8 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
 
 def _session_result(
     result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
-) -> SessionResult:
-    """Keep of a record's result what a campaign needs."""
+) -> SessionAnalysis:
+    """Return the part of a record's result that a campaign needs."""
     from analysis.suited import record_band_hz, welch_settings
 
     record, whole, welch = result.record, result.whole, result.welch
@@ -235,7 +234,7 @@ def _session_result(
     modal = None if whole is None else whole.headline.modal
     if welch is not None:
         settings = replace(settings, **asdict(welch.segmentation))
-    return SessionResult(
+    return SessionAnalysis(
         path=record.path,
         experiment=experiment,
         beam=record.beam,
@@ -265,15 +264,15 @@ def _session_result(
 def _estimates(
     whole: WholeRecord, structures: Collection[str], measured: FrequencyResponse, delay_s: float
 ) -> tuple[RecordEstimate, ...]:
-    """Keep of all fits to a whole record the selected one and those asked for."""
+    """Return the estimates of the selected fit to a whole record and of the requested ones."""
     from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
 
     omega = 2 * np.pi * measured.frequency_hz
     grid = ResponseGrid(1j * omega)
 
-    def kept(candidate: Candidate) -> RecordEstimate:
-        # The measured response is free of the delay that the file states.
+    def estimate_of(candidate: Candidate) -> RecordEstimate:
+        # The delay stated in the file is removed from the measured response.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
@@ -282,9 +281,9 @@ def _estimates(
         return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
 
     order = list(STRUCTURES)
-    asked = [
-        kept(each)
+    requested = [
+        estimate_of(each)
         for each in whole.selection.candidates
         if each.fit.structure.name in structures or each.fit is whole.fit
     ]
-    return tuple(sorted(asked, key=lambda each: order.index(each.structure)))
+    return tuple(sorted(requested, key=lambda each: order.index(each.structure)))

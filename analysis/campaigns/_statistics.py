@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.campaigns._estimates import WelchFit
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.models import Parameter
     from analysis.paper import Indices, Peak
@@ -44,7 +44,7 @@ class ParameterStatistics:
     mean, median, std, min, max : float
         std with K − 1 in the denominator, NaN of a single session.
     at_bounds : int
-        Sessions in which it rests on the edge of the range searched.
+        Sessions in which it is at a bound of the range searched.
     """
 
     structure: str
@@ -59,14 +59,14 @@ class ParameterStatistics:
 
 
 def fits_by_model(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
     """All sessions' fits by type and weighting, session by session."""
     rows = zip(*(session.welch_fits for session in sessions), strict=True)
     return {(row[0].structure, row[0].weighting): row for row in rows}
 
 
-def parameter_statistics(sessions: Sequence[SessionResult]) -> tuple[ParameterStatistics, ...]:
+def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
     """Statistics of the free parameters of every type and weighting (Table 3)."""
     found = []
     for (structure, weighting), fits in fits_by_model(sessions).items():
@@ -154,7 +154,7 @@ def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
     return STRUCTURES[structure].damping(_means(fits))
 
 
-def nominal_models(sessions: Sequence[SessionResult]) -> tuple[NominalModel, ...]:
+def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
     """Nominal model of every type and weighting, compared with every session."""
     first = sessions[0]
     if not first.frequency_hz.size:
@@ -168,7 +168,7 @@ def nominal_models(sessions: Sequence[SessionResult]) -> tuple[NominalModel, ...
 
 
 def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
-    """Those of Table 5 and Figure 8: the paper's two, or without them the two of least WMSE."""
+    """Return the models of Table 5 and Figure 8: the paper's two, else the two of least WMSE."""
     named = tuple(m for m in models if (m.structure, m.weighting) in BEST)
     return named if len(named) == len(BEST) else tuple(sorted(models, key=_wmse)[:2])
 
@@ -207,7 +207,7 @@ def _nominal(
     structure: str,
     weighting: str,
     fits: Sequence[WelchFit],
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     model: FrequencyResponseModel,
     frequency_hz: NDArray[np.float64],
     beam: Beam,
@@ -248,7 +248,7 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RankedStructure:
-    """How one structure stands with all sessions.
+    """Rank of one structure over all sessions.
 
     Attributes
     ----------
@@ -278,12 +278,12 @@ class RankedStructure:
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Name in tables."""
         return self.structure
 
 
 def ranked_structures(
-    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
+    sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
 ) -> tuple[RankedStructure, ...]:
     """Rank every structure fitted: those pooled, by BIC, then the others.
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
 FEWEST: Final = 3
@@ -26,7 +26,7 @@ FEWEST: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class LeftOutError:
-    """Error of one model in one session, of which it has seen nothing.
+    """Error of one model in a session that was not used for it.
 
     Attributes
     ----------
@@ -66,8 +66,8 @@ class LostTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
-    """What others say of a session: a model's name and its plant, the session's own beside it."""
+class PlantPrediction:
+    """Plant predicted for a session by the other sessions, with the session's own estimate."""
 
     method: str
     name: str
@@ -76,32 +76,32 @@ class Forecast:
     own: Plant | None
 
 
-def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecast, ...]:
-    """Models of all sessions but one, to be tried on that one."""
+def forecasts(sessions: Sequence[SessionAnalysis], left_out: int) -> tuple[PlantPrediction, ...]:
+    """Return the models of all sessions but one, for the prediction of that one."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
     own = {each.name: each.plant for each in session.record_estimates}
     found = [
-        Forecast("record", each.name, None, each.plant, own[each.name])
+        PlantPrediction("record", each.name, None, each.plant, own[each.name])
         for each in pooled_estimates(others)
         if each.name in own
     ]
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
-        found.append(Forecast("welch", fit.structure, fit.weighting, plant, None))
+        found.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
     return tuple(found)
 
 
 def validate(
     workers: Workers,
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
-    """Try every session once, and account for each trial: done, or lost and why.
+    """Predict every session from the others; return the errors, and the lost trials with reasons.
 
-    What was found of the sessions is kept though all workers may go.
+    Results so far are retained even if all workers are lost.
     """
     trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
     try:
@@ -121,11 +121,11 @@ def validate(
 
 
 def left_out_errors(
-    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float] | None
+    path: Path, tried: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
 ) -> tuple[LeftOutError, ...] | LostTrial:
     """Read a session and compare its torque with what each model predicts from its angle.
 
-    A session that the whole-record estimator cannot use is told, not raised: it is one of many.
+    An error of one session is returned, not raised, because the others are still usable.
     """
     from analysis.identify import Comparison
     from analysis.record import load_record

@@ -1,4 +1,4 @@
-"""Verdict on a campaign: one structure for the specimen, and what is known of its damping."""
+"""Verdict on a campaign: one structure for the specimen, and its damping."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._modal import PooledModal
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.campaigns._welch_bias import WelchBias
     from analysis.campaigns.pooling import PooledEstimate
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # Findings in common
 
 _FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-"""A number, but not that of a mode: it tells what is meant and not how much."""
+"""A number, but not that of a mode, which identifies what is meant."""
 
 _SHOWN: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
                  "kg·m²": (1e6, "10⁻⁶ kg·m²")}  # fmt: skip
@@ -45,7 +45,7 @@ _SHOWN: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
 
 @dataclass(frozen=True, slots=True)
 class CommonFinding:
-    """One thing besides the beam that one or more sessions show.
+    """Effect other than the beam that one or more sessions show.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class CommonFinding:
     files : tuple of str
         Names of the sessions that have it.
     sessions : int
-        Number of sessions looked at.
+        Number of sessions examined.
     span : tuple of float or None
         Least and largest size, in the finding's unit.
     """
@@ -66,7 +66,7 @@ class CommonFinding:
 
     @property
     def sentence(self) -> str:
-        """In how many sessions, in the words of the one in the middle, and from what to what."""
+        """The finding in words, with the number of sessions and the range of its size."""
         count = len(self.files)
         which = f" ({', '.join(self.files)})" if count < min(self.sessions, 3) else ""
         words = f"In {count} of {self.sessions} sessions{which}: {self.example.sentence}"
@@ -77,7 +77,7 @@ class CommonFinding:
         return f"{words} (Median session; range over all sessions: {span} {unit}.)"
 
 
-def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, ...]:
+def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding, ...]:
     """Count the findings of all sessions, the most common first.
 
     Two findings are of the same thing if their sentences are the same but for the figures in them.
@@ -126,7 +126,7 @@ class Dissent:
 
 @dataclass(frozen=True, slots=True)
 class CampaignVerdict:
-    """What can be said of a specimen from all its sessions.
+    """Verdict on a specimen from all its sessions.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class CampaignVerdict:
     structure : str
         Structure of the lowest BIC: "I" to "VII".
     rivals : tuple of str
-        Structures, as tables call them, that all data together cannot tell from it.
+        Structures, by their names in tables, that all data together do not distinguish from it.
     sessions : int
         Those with their own verdict, on which this one rests.
     alone : mapping of str to int
@@ -151,7 +151,7 @@ class CampaignVerdict:
     sentences : tuple of str
         The verdict in words, the most important first.
     experiments : tuple of str
-        What would tell more.
+        Recommended further experiments.
     """
 
     headline: str
@@ -175,7 +175,7 @@ class CampaignVerdict:
 
 
 def campaign_verdict(
-    sessions: Sequence[SessionResult],
+    sessions: Sequence[SessionAnalysis],
     pooled: Sequence[PooledEstimate],
     alike: Homogeneity,
     validation: Sequence[LeftOutError],
@@ -183,7 +183,7 @@ def campaign_verdict(
     biases: Sequence[WelchBias] = (),
     modal: PooledModal | None = None,
 ) -> CampaignVerdict | None:
-    """Judge a campaign; None if fewer than two sessions determine any structure's damping.
+    """Return the verdict; None if fewer than two sessions determine any structure's damping.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def campaign_verdict(
 def _order(
     exact: PooledOrder, verdicts: Sequence[Verdict], modal: PooledModal | None
 ) -> PooledOrder:
-    """Judge an order by the modal constants, where these say more than an exact beam."""
+    """Return the order by the modal constants if these determine more than an exact beam."""
     if modal is None:
         return exact
     if modal.tolerant is not None:
@@ -271,7 +271,7 @@ def _numbers(
     adequate: int,
     sessions: int,
 ) -> tuple[str, ...]:
-    """Say what the numbers are of, whether they explain the records, and how large the losses."""
+    """Describe the model of the numbers, whether it explains the records, and the losses."""
     gate = uniformity(modal.uniform_beam if modal else None)
     if modal is None or modal.tolerant is None:
         left = sentences.left_over(freest, adequate, sessions)
@@ -301,7 +301,7 @@ def _withheld(*orders: PooledOrder) -> frozenset[str]:
     return frozenset(each.order for each in orders if (each.exact or each).reason is not None)
 
 
-def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:
+def _dissent(sessions: Sequence[SessionAnalysis], best: PooledEstimate) -> tuple[Dissent, ...]:
     found = []
     for session in sessions:
         by_name = {each.name: each for each in session.record_estimates}

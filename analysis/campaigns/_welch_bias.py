@@ -19,7 +19,7 @@ from analysis.statistics import student_t_quantile
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
 
 LARGEST_MISFIT: Final = 1.5
@@ -89,7 +89,7 @@ class WelchBias:
 
 
 def welch_biases(
-    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
+    sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
 ) -> tuple[WelchBias, ...]:
     """Compare the Welch fits with the pooled estimates that describe the records.
 

@@ -2,7 +2,7 @@
 
 ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
 scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
-matrix in place of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
+matrix instead of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
 likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
 scatter in each of eight parameters.
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.campaigns._estimates import RecordEstimate
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._session import SessionAnalysis
     from analysis.identify import Damping, Order
 
 
@@ -273,7 +273,7 @@ class PooledEstimate:
         return {each.name: each for each in self.parameters}
 
 
-def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate, ...]:
+def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimate, ...]:
     """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
     by_name = by_structure(sessions)
     tried = max(map(len, by_name.values()), default=0)
@@ -281,7 +281,7 @@ def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate,
     return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
 
 
-def by_structure(sessions: Sequence[SessionResult]) -> dict[str, list[RecordEstimate]]:
+def by_structure(sessions: Sequence[SessionAnalysis]) -> dict[str, list[RecordEstimate]]:
     """Whole-record estimates of all sessions by the name of the structure."""
     found: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
@@ -298,8 +298,8 @@ def determines_damping(estimate: RecordEstimate) -> bool:
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     """Pool one structure; None if fewer than two sessions determine its damping.
 
-    A setting of rig or specimen (the tool inertia, mostly) that rests on its bound in some
-    session has no place in the common covariance; the plant gets its plain mean.
+    A setting of rig or specimen (mostly the tool inertia) that is at a bound in some session is not
+    in the common covariance; the plant gets its plain mean.
     """
     used = list(filter(determines_damping, estimates))
     if len(used) < _FEWEST:
@@ -334,11 +334,11 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
 
     Damping and offsets of the modes belong to the specimen: one value for all sessions, and a
     scatter between them if they differ by more than their uncertainties; each costs the logarithm
-    of the number of all data. What the sessions lose by sharing a value follows from their own
+    of the number of all data. The likelihood lost by a common value follows from the sessions'
     estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
     beam are each session's own, with every structure alike, and so cost nothing here. A parameter
-    that some session leaves undetermined cannot be shared: it counts in every session. One session
-    shares with none, and loses nothing.
+    that some session leaves undetermined cannot be common: it counts in every session. A single
+    session loses nothing.
     """
     of_specimen = STRUCTURES[estimates[0].structure].free
     shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
@@ -385,8 +385,8 @@ def _coordinate(name: str, value: float) -> float:
 
 
 def _block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
-    places = [estimate.determined.index(name) for name in names]
-    return estimate.covariance[np.ix_(places, places)]
+    indices = [estimate.determined.index(name) for name in names]
+    return estimate.covariance[np.ix_(indices, indices)]
 
 
 def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:

@@ -1,4 +1,4 @@
-"""Sentences of a campaign's verdict: whether it is of one specimen, and what its damping is."""
+"""Sentences of a campaign's verdict: whether there is one specimen, and its damping."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import in_dispute, told
+from analysis.campaigns._experiment import fact_text, in_dispute
 from analysis.campaigns._statistics import BEST
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
 from analysis.identify import LOSSES
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 # Names and numbers
 
 _NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool inertia"}
-"""Names of what a letter alone would not call to mind."""
+"""Names of quantities whose symbol alone is not clear."""
 _FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
-"""Units smaller than a single record's: of the scatter between sessions more digits are told."""
+"""Units smaller than a single record's, because scatter between sessions needs more digits."""
 _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _LEAST: Final = 1e-99
@@ -70,7 +70,7 @@ def with_unit(parameter: str) -> str:
 
 
 def probability(chance: float) -> str:
-    """Write a probability that may be too small for a number, but is not 0.
+    """Format a probability that may be too small for a number, but is not 0.
 
     Examples
     --------
@@ -81,8 +81,8 @@ def probability(chance: float) -> str:
     return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
 
 
-def percent(share: float) -> str:
-    """Write a share that may be next to 1, but is not 1.
+def percent(fraction: float) -> str:
+    """Format a fraction that may be close to 1, but is not 1.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def percent(share: float) -> str:
     >>> percent(0.4321), percent(0.99999)
     ('43.2 %', '> 99.9 %')
     """
-    return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
+    return "> 99.9 %" if fraction > 0.999 else f"{100 * fraction:.3g} %"
 
 
 # One specimen or several
@@ -107,14 +107,14 @@ _SLIGHT: Final = 2e-3
 
 
 def specimens(found: Homogeneity) -> list[str]:
-    """Say first that sessions are not of one specimen; nothing if they are."""
-    said = _stated(found.specimens) if len(found.specimens) > 1 else []
+    """Describe that sessions are not of one specimen; empty if they are."""
+    stated = _stated(found.specimens) if len(found.specimens) > 1 else []
     leading = found.leading
-    return said if leading is None else [*said, *_differing(found, leading)]
+    return stated if leading is None else [*stated, *_differing(found, leading)]
 
 
 def title(text: str, found: Homogeneity) -> str:
-    """Say in a title that what is under it is pooled over a mixture.
+    """Add to a title that its values are pooled over a mixture.
 
     Parameters
     ----------
@@ -129,11 +129,11 @@ def title(text: str, found: Homogeneity) -> str:
 def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
     keys = in_dispute(found)
     each = "; ".join(
-        f"{', '.join(f'{key} {told(key, one.facts[key])}' for key in keys if key in one.facts)} "
-        f"in {_files(one.files)}"
+        ", ".join(f"{key} {fact_text(key, one.facts[key])}" for key in keys if key in one.facts)
+        + f" in {_files(one.files)}"
         for one in found
     )
-    first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)
+    first = ", ".join(f"{key} {fact_text(key, found[0].facts[key])}" for key in keys)
     return [
         f"The files state {len(found)} different specimens: {each}. Specimens are never "
         f"pooled: all results below are for {first}. Analyse the files of the others separately, "
@@ -157,7 +157,7 @@ def _differing(found: Homogeneity, leading: Heterogeneity) -> list[str]:
 
 
 def _slight(found: Homogeneity) -> str:
-    """Say where a scatter is many standard deviations only because these are so small."""
+    """Describe a scatter of many standard deviations only because these are small."""
     frequencies = [each for each in found.quantities if each.quantity.startswith("frequency_hz")]
     mixed = [each for each in frequencies if each.mixed]
     if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
@@ -169,32 +169,32 @@ def _slight(found: Homogeneity) -> str:
 
 
 def _scatter(each: Heterogeneity) -> str:
-    """Say by how much one quantity scatters, of its own uncertainty and of its size."""
+    """Describe the scatter of a quantity, relative to its uncertainty and to its size."""
     percents = percent(each.i_squared)
     equals = "" if percents.startswith(">") else "= "
-    size = _told([each.between_std], each)
-    share = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
+    size = _rounded([each.between_std], each)
+    scatter = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
     return (
         f"{label(each.quantity)[0]} varies between sessions by {each.own_stds:.3g} of its own "
-        f"standard deviations ({share}Cochran's Q = {each.cochran_q:.3g} where "
+        f"standard deviations ({scatter}Cochran's Q = {each.cochran_q:.3g} where "
         f"{each.degrees_of_freedom} is expected, I² {equals}{percents})"
     )
 
 
 def _where(each: Heterogeneity) -> str:
-    """Say which sessions lie together, or where the outermost are."""
+    """Describe the groups of sessions, or the outermost ones."""
     name, _, _ = label(each.quantity)
     values = {file: (value, std) for file, value, std in each.values}
     if each.groups:
         parts = "; ".join(
-            f"{_told([values[file][0] for file in part], each)} in {_files(part)}"
+            f"{_rounded([values[file][0] for file in part], each)} in {_files(part)}"
             for part in each.groups
         )
         return f"By the {name} they are {len(each.groups)} groups: {parts}."
     low, high = _ends(each.values)
     return (
-        f"There are no clear groups: the {name} goes from {_told([low[1]], each)} in {low[0]} to "
-        f"{_told([high[1]], each)} in {high[0]}."
+        f"There are no clear groups: the {name} goes from {_rounded([low[1]], each)} in {low[0]} "
+        f"to {_rounded([high[1]], each)} in {high[0]}."
     )
 
 
@@ -203,8 +203,8 @@ def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, f
     return ordered[0], ordered[-1]
 
 
-def _told(values: Sequence[float], each: Heterogeneity) -> str:
-    """Write a mean with the digits that tell it from the others."""
+def _rounded(values: Sequence[float], each: Heterogeneity) -> str:
+    """Format means with enough digits to distinguish them."""
     _, factor, unit = label(each.quantity)
     digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
     times = "·" if unit.startswith("10") else " "
@@ -238,7 +238,7 @@ def answer(
     lambda_: PooledOrder,
     validation: Sequence[LeftOutError],
 ) -> str:
-    """Say of which orders the dampings are, and how well the classical and the freest type predict.
+    """Describe the orders of the dampings, and the predictions of the classical and freest types.
 
     Parameters
     ----------
@@ -248,23 +248,23 @@ def answer(
     """
     joint = " and " if alpha.exact is None else "; "
     dampings = f"{_answered(alpha)}{joint}{_answered(lambda_)}"
-    said = f"{dampings[0].upper()}{dampings[1:]}."
+    sentence = f"{dampings[0].upper()}{dampings[1:]}."
     errors: dict[str, list[str]] = {}
     for name in dict.fromkeys((_CLASSICAL, freest.name)):
         its = [e.error for e in validation if e.method == "record" and e.name == name]
         if its:
             errors.setdefault(f"{100 * float(np.mean(its)):.2g} %", []).append(name)
     if not errors:
-        return said
+        return sentence
     each = ", ".join(
         f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error}"
         for error, names in errors.items()
     )
-    return f"{said} Error of the torque predicted for an unseen session: {each}."
+    return f"{sentence} Error of the torque predicted for an unseen session: {each}."
 
 
 def _answered(found: PooledOrder) -> str:
-    """Say in a few words of which order a damping is."""
+    """Describe the order of a damping in a few words."""
     if found.exact is not None:
         return _effective(found)
     of = _OF[found.order]
@@ -287,22 +287,22 @@ def _answered(found: PooledOrder) -> str:
 
 
 def _effective(found: PooledOrder) -> str:
-    """Say in a few words how a loss grows over the modes in sight."""
+    """Describe the growth of a loss over the visible modes in a few words."""
     loss = LOSSES[found.order]
     if found.value is None or found.interval is None or found.reason is not None:
         return f"{loss} with a slope that is not established"
     half = (found.interval[1] - found.interval[0]) / 2
     number = " ± ".join(to_uncertainty((found.value, half), found.std or half))
-    said = {
+    conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss} growing as f^({number}), {said[found.status]}"
+    return f"{loss} growing as f^({number}), {conclusion[found.status]}"
 
 
 def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
-    """Say of which structure the numbers are, and which simpler one would do.
+    """Describe the structure of the numbers, and a simpler sufficient one.
 
     Parameters
     ----------
@@ -317,31 +317,31 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
         if given
         else ", so its intervals hold for any simpler one, too."
     )
-    said = (
+    sentence = (
         f"The numbers are those of type {freest.name}: {_damping(freest.structure)}. "
         f"It is the freest structure that the sessions determine{so}"
     )
     if best.name != freest.name:
-        said += (
+        sentence += (
             f" Type {best.name} has the lowest BIC ({_damping(best.structure)}); "
             "its intervals are narrower, and valid only if it is true."
         )
-    return said
+    return sentence
 
 
 def sizes(found: Sequence[Size]) -> list[str]:
-    """Say how large each damping is where it depends least on its order."""
-    said = []
+    """Describe each damping at its pivot frequency, where it depends least on its order."""
+    factors = []
     for each in found:
         if each.omega_rad_s is None or not (each.size.std and each.size.interval_95):
             continue
         value, low, high = to_uncertainty((each.size.value, *each.size.interval_95), each.size.std)
         flag = f", {each.size.flag}" if each.size.flag else ""
-        said.append(
+        factors.append(
             f"{each.damping} {value} (95 %: {low} to {high}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz{flag}"
         )
-    return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
+    return [f"Loss factors at the pivot frequencies: {'; '.join(factors)}."] if factors else []
 
 
 def selected(
@@ -350,7 +350,7 @@ def selected(
     alone: Mapping[str, int],
     sessions: int,
 ) -> str:
-    """Name the structure that all sessions together select, its equals, and who agrees.
+    """Describe the structure that all sessions select together, its equals, and the agreement.
 
     Parameters
     ----------
@@ -364,22 +364,22 @@ def selected(
         Number of sessions.
     """
     best = ranked[0]
-    said = f"Lowest BIC: type {best.name}."
+    sentence = f"Lowest BIC: type {best.name}."
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
-        said += (
+        sentence += (
             f" All sessions together do not distinguish it from {names} (ΔBIC "
             f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
-        said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
+        sentence += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
     selections = {f"type {name}": count for name, count in alone.items()}
-    return f"{said} {in_single_sessions(selections, sessions)}"
+    return f"{sentence} {in_single_sessions(selections, sessions)}"
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
-    """Say whether the residual of a structure is noise.
+    """Describe whether the residual of a structure is noise.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
 
 
 def noise_alone(adequate: int, sessions: int) -> str:
-    """Say in how many sessions the residual is noise.
+    """State in how many sessions the residual is noise.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def noise_alone(adequate: int, sessions: int) -> str:
 
 
 def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[str]:
-    """Say how the modes are damped.
+    """Describe the damping of the modes.
 
     Parameters
     ----------
@@ -431,13 +431,13 @@ def modes(found: Sequence[PooledMode], sessions: int, *, mixed: bool) -> list[st
     if not found:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    said = "; ".join(_mode(each, t) for each in found)
+    modes = "; ".join(_mode(each, t) for each in found)
     of = "the sessions, a mixture" if mixed else "the sessions"
-    return [f"Modes: {said} (± 95 % of the mean over {of})."]
+    return [f"Modes: {modes} (± 95 % of the mean over {of})."]
 
 
 def order(found: PooledOrder) -> str:
-    """Say what is known of one order."""
+    """Describe the estimate of one order."""
     name, of = found.order, _OF[found.order]
     counts = {f"“{status}”": count for status, count in found.alone.items()}
     alone = f" {in_single_sessions(counts, sum(counts.values()))}"
@@ -456,12 +456,12 @@ def order(found: PooledOrder) -> str:
     if found.reason is not None:
         would = is_.replace(" is ", " would be ", 1)
         return f"{would}, but {found.reason}; do not interpret it.{alone}"
-    said = {
+    conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{is_}: {said[found.status]}.{alone}"
+    return f"{is_}: {conclusion[found.status]}.{alone}"
 
 
 def welch_bias(
@@ -471,7 +471,7 @@ def welch_bias(
     *,
     comparable: bool,
 ) -> list[str]:
-    """Say by how much the Welch fits of the type that the numbers are of are biased.
+    """Describe the bias of the Welch fits of the reported type.
 
     Parameters
     ----------
@@ -488,27 +488,27 @@ def welch_bias(
     of_type = [each for each in biases if each.structure == freest.name]
     best = [each for each in of_type if (each.structure, each.weighting) in BEST]
     left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
-    said = []
+    sentences = []
     for each in best or of_type[:1]:
         found = [one for one in each.significant if one.parameter not in left_out]
         if not found:
             continue
-        said.append(
+        sentences.append(
             f"Welch's {'; '.join(map(_biased, found))} (type {each.structure}, weights "
             f"{each.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
         if each.wmse < each.record_wmse:
-            said.append(
+            sentences.append(
                 f"The lower WMSE of the Welch fits ({each.wmse:.3g} against "
                 f"{each.record_wmse:.3g} (N·m/rad)²) is no evidence for them: it is the distance "
                 "from Welch's response, which has the same bias."
             )
-    return said
+    return sentences
 
 
 def _biased(each: ParameterBias) -> str:
-    """Say what a Welch fit's parameter is, and by how much that is above or below."""
+    """Describe a parameter of a Welch fit and its bias."""
     symbol, factor, unit = label(each.parameter)
     value, scatter = to_uncertainty((each.welch, each.welch_std), each.welch_std, factor)
     (record,) = to_uncertainty((each.record,), each.record_std, factor)
@@ -543,7 +543,7 @@ def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str
 
 
 def scatter(best: PooledEstimate) -> str:
-    """Say whether the sessions repeat: one alarm in a hundred campaigns that do is false."""
+    """Describe whether the sessions repeat, with one false alarm in a hundred campaigns."""
     level = _SIGNIFICANT / max(len(best.parameters), 1)
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
@@ -565,7 +565,7 @@ def scatter(best: PooledEstimate) -> str:
 
 
 def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
-    """Say how well the sessions predict one that they have not seen.
+    """Describe how well the sessions predict an unseen one.
 
     Parameters
     ----------
@@ -593,30 +593,30 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
     ]
 
 
-def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
-    """Account for the sessions that were to be predicted and were not.
+def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
+    """Describe the sessions that were to be predicted and were not.
 
     Parameters
     ----------
     lost : sequence of LostTrial
         Sessions that were not predicted.
-    asked : int
-        How many were to be.
+    requested : int
+        Number of sessions to be predicted.
     """
     if not lost:
         return []
     each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
     more = f"; and {len(lost) - _MANY} more" if len(lost) > _MANY else ""
     return [
-        f"Of {asked} sessions to be predicted from the others, {asked - len(lost)} "
-        f"{'was' if asked - len(lost) == 1 else 'were'} and {len(lost)} "
+        f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
+        f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
         f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Prediction errors are averaged "
         "over those predicted."
     ]
 
 
 def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
-    """Say what single sessions find, and how many of them.
+    """Describe the findings of single sessions with their numbers.
 
     Parameters
     ----------
@@ -631,7 +631,7 @@ def in_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
 
 
 def _damping(structure: str) -> str:
-    """Say which kinds of damping a structure has, and of which orders."""
+    """Describe the kinds of damping of a structure, and their orders."""
     shape = STRUCTURES[structure]
     kinds = [
         f"{what} damping ({order} {'free' if order in shape.free else '= 1'})"

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-_LOOK_S: Final = 2.0
-"""How often is looked whether there are workers at all."""
+_POLL_S: Final = 2.0
+"""Interval of checks for the presence of workers."""
 
 _HOPELESS: Final = 2
 """Tasks that end their processes, none being done, from which it is not the tasks' doing."""
@@ -43,12 +43,12 @@ _HOPELESS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Stands in for the result of a task whose worker ended each time it was tried.
+    """Result of a task whose worker ended each time it was tried.
 
     Attributes
     ----------
     reason : str
-        What became of the worker.
+        End of the worker.
     """
 
     reason: str
@@ -63,7 +63,7 @@ def available_cores() -> int:
 
 
 def _unheard(_number: int) -> None:
-    """Do without progress."""
+    """Ignore progress."""
 
 
 class Workers:
@@ -80,13 +80,13 @@ class Workers:
     """
 
     _died: type[Exception] = BrokenExecutor
-    """By which the executor tells that a task's process ended."""
+    """Exceptions by which the executor reports that a task's process ended."""
     _limit: int | None = None
     """Tasks under way at once: the fewer, the fewer are tried again."""
     _lost: str
-    """What to say of a task whose process ended twice."""
+    """Reason for a task whose process ended twice."""
     _hopeless: str | None = None
-    """What to say if that is so of all tasks; None: no more than of each."""
+    """Message if that is so for all tasks; None: that for each."""
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
@@ -105,7 +105,7 @@ class Workers:
             Importable, as are its arguments and what it returns.
         arguments : sequence of tuple
         on_done : callable, optional
-            Called with the place of each that is done, as they come.
+            Called with the index of each finished task, in order of completion.
 
         Returns
         -------
@@ -128,7 +128,7 @@ class Workers:
 
         waiting = deque(range(len(arguments)))
         while waiting:
-            with self._telling():
+            with self._explaining():
                 suspects = self._try(waiting, submit, done)
                 for number in suspects:
                     self._renew(alone=True)
@@ -160,7 +160,7 @@ class Workers:
                         self._renew()
                     break
                 waiting.popleft()
-            for future in wait(under_way, _LOOK_S, FIRST_COMPLETED).done:
+            for future in wait(under_way, _POLL_S, FIRST_COMPLETED).done:
                 number = under_way.pop(future)
                 try:
                     result = future.result()
@@ -172,14 +172,14 @@ class Workers:
         return suspects
 
     def _renew(self, *, alone: bool = False) -> None:
-        """Start processes in the place of those that ended, or one for one task."""
+        """Start processes instead of those that ended, or one for one task."""
 
-    def _telling(self) -> AbstractContextManager[None]:
-        """Tell as a `CampaignError` what else says that there are no workers any more."""
+    def _explaining(self) -> AbstractContextManager[None]:
+        """Convert other errors from a loss of all workers to `CampaignError`."""
         return nullcontext()
 
     def _still_there(self, seen: float) -> float:
-        """Return when workers were last seen; raise if they are gone for good."""
+        """Return when workers were last seen; raise if they have been lost for too long."""
         return seen
 
 
@@ -227,7 +227,7 @@ class _LocalWorkers(Workers):
         self._executor = _pool(1 if alone else self._limit)
 
     def close(self, *, wait: bool = True) -> None:
-        """Begin nothing else, and end the processes when they have done what is under way."""
+        """Start no more tasks, and end the processes after the present ones."""
         self._executor.shutdown(wait, cancel_futures=True)
 
 
@@ -238,7 +238,7 @@ def _pool(jobs: int | None) -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """Make a worker deaf to Ctrl-C, and mortal with its parent."""
+    """Make a worker ignore Ctrl-C, and end with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
@@ -297,7 +297,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep from Dask what is told here in a sentence: what goes wrong, and versions that differ."""
+    """Suppress messages of Dask that are reported here: failures, and different versions."""
     log = logging.getLogger("distributed.client")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -335,7 +335,7 @@ class _DaskWorkers(Workers):
         self._died = _distributed().KilledWorker
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _explaining(self) -> Iterator[None]:
         try:
             yield
         except CampaignError:

@@ -36,7 +36,7 @@ from rigd.runtime import raise_on, use_one_thread
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns import LoneSessionError
+    from analysis.campaigns import SingleSessionError
     from analysis.identify import Setting
     from analysis.results import FigureFormat
 
@@ -47,8 +47,8 @@ DEFAULT: Final = "default"
 class DefaultCommandGroup(TyperGroup):
     """A group in which a first argument that names no subcommand goes to the default command.
 
-    The default command stands in the group's place from the parsing on, so its usage, help and
-    errors are those of a command without subcommands.
+    The default command replaces the group from the parsing on, so its usage, help and errors are
+    those of a command without subcommands.
     """
 
     # Typer's click is its own in some versions and the package of that name in others, so there is
@@ -72,7 +72,7 @@ class DefaultCommandGroup(TyperGroup):
             return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
-class CommandBesideOthers(TyperCommand):
+class CommandWithOthers(TyperCommand):
     """The default command: its help names the others, which the group itself never shows."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -82,21 +82,23 @@ class CommandBesideOthers(TyperCommand):
             formatter.write_dl([*_COMMANDS.items()])
 
 
-def _tell(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"analyze {rigd.__version__}")
         raise typer.Exit
 
 
 Version = Annotated[
     bool,
-    typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
+    typer.Option(
+        "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+    ),
 ]
 
 
 _EXIT_INTERRUPTED: Final = 130
 _GARBAGE: Final = 20_000
-"""Objects more than before from which garbage is looked for."""
+"""Number of new objects that triggers a garbage collection."""
 
 _COMMANDS: Final = {
     "touch": "Estimate where, when and how hard the antenna met something.",
@@ -110,9 +112,9 @@ _COMMANDS: Final = {
 _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
-Figures, tables and JSON go to session.report/ beside the file (session.report-2/ if that exists).
+Figures, tables and JSON go to session.report/ next to the file (session.report-2/ if that exists).
 Several files are a campaign: statistics, nominal models, pooled estimate and validation go to
-campaign.report/ beside the first. Sessions that do not suit Welch's method (steps, multisines,
+campaign.report/ next to the first. Sessions that do not suit Welch's method (steps, multisines,
 narrow sweeps, short or stopped ones) get only the whole-record analysis, and a line that says why.
 
 Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by Ctrl-C."""
@@ -143,8 +145,8 @@ def main() -> None:
     """Entry point of the command."""
     raise_on(signal.SIGINT)
     use_one_thread()
-    # Figures are made of many objects that live until they are drawn: to look among them for
-    # garbage every 700 takes a twentieth of all time.
+    # Figures consist of many objects that live until they are drawn: a garbage collection every 700
+    # takes a twentieth of all time.
     gc.set_threshold(_GARBAGE)
     _quieten_libraries()
     with standard_streams():
@@ -155,10 +157,10 @@ def main() -> None:
 
 
 def _quieten_libraries() -> None:
-    """Keep warnings that libraries address to programmers off the operator's terminal.
+    """Suppress warnings of libraries, which are meant for programmers.
 
-    A record that suits no model drives searches where numbers overflow; what becomes of it is said
-    in the verdict. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
+    A record that suits no model drives searches where numbers overflow; the verdict reports the
+    result. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
     """
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
@@ -166,7 +168,7 @@ def _quieten_libraries() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT, epilog=_EPILOG, cls=CommandBesideOthers)
+@app.command(DEFAULT, epilog=_EPILOG, cls=CommandWithOthers)
 def analyze(
     context: typer.Context,
     files: Annotated[
@@ -265,7 +267,7 @@ def analyze(
         str | None,
         typer.Option(metavar="ADDRESS", help="Campaign: run on this Dask scheduler."),
     ] = None,
-    version: Version = False,  # noqa: ARG001 - its callback has told it
+    version: Version = False,  # noqa: ARG001 - its callback has printed it
 ) -> None:
     """Identify the damping of a slewing beam from recorded sessions.
 
@@ -320,7 +322,7 @@ def analyze(
         if not is_campaign:
             code = session_command(files, routes, outputs, rerun)
         else:
-            from analysis.campaigns import CampaignError, LoneSessionError
+            from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
 
@@ -331,8 +333,8 @@ def analyze(
                     fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
                     uniformity=routes.uniformity, with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
-            except LoneSessionError as lone:
-                code = _lone_session(lone, routes, outputs)
+            except SingleSessionError as single:
+                code = _report_single_session(single, routes, outputs)
             except CampaignError as error:
                 complain(str(error))
                 code = 1
@@ -378,13 +380,13 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
         )
 
 
-def _lone_session(lone: LoneSessionError, routes: Routes, outputs: Outputs) -> int:
-    """Tell what is wrong with the other files of a campaign, and report the one that is left."""
-    for failure in lone.failures:
+def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
+    """Print the errors of the other files of a campaign, and report the remaining one."""
+    for failure in single.failures:
         complain(failure.message)
-    typer.echo(f"A campaign needs two sessions: {lone.path} is reported alone.", err=True)
-    others = {str(failure.path): failure.message for failure in lone.failures}
-    return max(1, session_command([lone.path], routes, outputs, others=others))
+    typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)
+    others = {str(failure.path): failure.message for failure in single.failures}
+    return max(1, session_command([single.path], routes, outputs, others=others))
 
 
 def _fixed(text: str) -> tuple[Setting, ...]:

@@ -45,7 +45,7 @@ def campaign_command(
     settings : WelchSettings
         Settings of the Welch fits.
     outputs : Outputs
-        Its folder is by default ``campaign.report`` beside the first file, or if that exists
+        Its folder is by default ``campaign.report`` next to the first file, or if that exists
         ``campaign.report-2`` and so on.
     structures : sequence of str
         Types fitted to the whole records.
@@ -58,10 +58,10 @@ def campaign_command(
     dask : str, optional
         Address of a Dask scheduler to use instead.
     uniformity : float, optional
-        Relative standard deviation of each mode's frequency from that of a uniform beam, in place
-        of what the files state.
+        Relative standard deviation of each mode's frequency from that of a uniform beam, instead of
+        that stated in the files.
     with_paper : bool
-        Whether the paper's numbers stand beside these.
+        Whether the paper's numbers are included.
     formats : sequence of str
         Formats of the figures.
 
@@ -74,8 +74,8 @@ def campaign_command(
     ------
     CampaignError
         None of the files could be used, or the workers could not be had.
-    LoneSessionError
-        One of the files alone could be used, which makes no campaign: nothing was written.
+    SingleSessionError
+        Only one of the files could be used, which makes no campaign: nothing was written.
     OutputExistsError, OutputError
         Something cannot be written.
     """
@@ -93,7 +93,7 @@ def campaign_command(
     found = _analysed(run, len(files), folder, outputs, with_paper=with_paper, formats=formats)
     lines = [f"Report of the campaign: {folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before anything is said: the streams may take nothing.
+        # Before any output: the streams may be closed.
         text = document_text(campaign_document(found, with_paper=with_paper))
         write_new(outputs.json, text, overwrite=outputs.overwrite)
         lines.insert(0, f"All results as JSON: {outputs.json}")
@@ -102,7 +102,7 @@ def campaign_command(
     console.print("\n".join(lines), markup=False, soft_wrap=True)
     if outputs.json_to_stdout:
         content = campaign_document(found, with_paper=with_paper)
-        print(document_text(content, ascii_only=True), end="")  # noqa: T201 - what was asked for
+        print(document_text(content, ascii_only=True), end="")  # noqa: T201 - the requested output
     return 1 if found.failures or found.lost_trials else 0
 
 
@@ -115,8 +115,8 @@ def _analysed(
     with_paper: bool,
     formats: Sequence[FigureFormat],
 ) -> CampaignResult:
-    """Analyse and write, with progress on a terminal; tell what failed."""
-    from analysis.campaigns import LoneSessionError
+    """Analyse and write, with progress on a terminal; print the errors."""
+    from analysis.campaigns import SingleSessionError
     from analysis.report.campaign_report import write_campaign
     from analysis.report.folder import new_folder
     from rigd.printable import progress_bar
@@ -130,14 +130,14 @@ def _analysed(
         with new_folder(folder, overwrite=outputs.overwrite) as part:
             found = run(on_progress=on_progress)
             if len(found.sessions) == 1:
-                raise LoneSessionError(found.sessions[0].path, found.failures)
+                raise SingleSessionError(found.sessions[0].path, found.failures)
             write_campaign(
                 found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
-    tell = partial(print_readable, progress.console)
+    report_error = partial(print_readable, progress.console)
     for failure in found.failures:
-        tell(f"Error: {failure.message}")
+        report_error(f"Error: {failure.message}")
     for lost in found.lost_trials:
-        tell(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
+        report_error(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
     return found

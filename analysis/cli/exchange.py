@@ -247,10 +247,10 @@ def export_frf_command(
     from analysis.exchange import export_frf
 
     settings = welch_settings("I", "const", frf, segment, overlap, nfft)
-    asked_hz = band_hz(band)
+    requested_hz = band_hz(band)
 
     def run() -> None:
-        table = export_frf(session, target, settings, asked_hz, binary=binary)
+        table = export_frf(session, target, settings, requested_hz, binary=binary)
         typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
 
     raise typer.Exit(_explained(run))
@@ -395,7 +395,7 @@ _RATES_HZ: Final = (1.0, 1e6)
 
 
 def _explained(run: Callable[[], None]) -> int:
-    """Run a command and return its exit code; what went wrong is said in a sentence or two."""
+    """Run a command and return its exit code; print errors in a sentence or two."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError

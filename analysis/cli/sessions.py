@@ -35,7 +35,7 @@ class Outputs:
     Attributes
     ----------
     report : Path or None
-        Folder of the report, new or empty; by default beside the first file.
+        Folder of the report, new or empty; by default next to the first file.
     json : Path or None
         New file for all results; ``-`` for standard output, which then holds nothing else.
     overwrite : bool
@@ -65,7 +65,7 @@ class Outputs:
 
 
 def session_files(paths: Sequence[Path]) -> list[Path]:
-    """Put in the place of each folder the sessions in it, by name; incomplete ones are left out.
+    """Replace each folder by the sessions in it, by name; incomplete ones are left out.
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ def session_command(
     rerun : Path, optional
         New file with session and fits for Rerun's viewer, of one session.
     others : mapping of str to str, optional
-        Files that were left out before, with the reason that was told: errors of the results, too.
+        Files that were left out before, with the reported reasons, which become errors of the
+        results.
 
     Returns
     -------
@@ -133,7 +134,7 @@ def session_command(
         return code
     results = document(found, {**(others or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
-        # Before anything is said: the streams may take nothing.
+        # Before any output: the streams may be closed.
         write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
     console = outputs.console()
     _print_tables(console, found, single=len(files) == 1, verbose=outputs.verbose)
@@ -153,7 +154,7 @@ def session_command(
 def _print_tables(
     console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
-    """Print what matters most of a single file, or all tables; of several a summary."""
+    """Print the main tables of a single file, or all of them; for several files a summary."""
     from analysis.report import result_text, summary_table
 
     by_welch = [each for each in results if each.welch is not None]
@@ -186,7 +187,7 @@ def _analyse_all(
     errors: dict[str, str] = {}
     code = 0
     with progress_bar() as progress:
-        tell = partial(print_readable, progress.console)
+        print_message = partial(print_readable, progress.console)
         steps = _steps(routes, rerun)
         task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
@@ -198,7 +199,13 @@ def _analyse_all(
             try:
                 found.append(
                     _analyse_file(
-                        file, folder, routes, rerun, on_step, tell, overwrite=outputs.overwrite
+                        file,
+                        folder,
+                        routes,
+                        rerun,
+                        on_step,
+                        print_message,
+                        overwrite=outputs.overwrite,
                     )
                 )
             except (
@@ -206,13 +213,13 @@ def _analyse_all(
                 MemoryError, LinAlgError,
             ) as error:  # fmt: skip
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
-                errors[str(file)] = message = _told(file, error)
+                errors[str(file)] = message = _error_message(file, error)
                 progress.update(task, completed=number * steps)
-                tell(f"Error: {message}")
+                print_message(f"Error: {message}")
     return found, errors, code
 
 
-def _told(file: Path, error: Exception) -> str:
+def _error_message(file: Path, error: Exception) -> str:
     from numpy.linalg import LinAlgError
 
     if isinstance(error, MemoryError):
@@ -238,7 +245,7 @@ def _analyse_file(
     routes: Routes,
     rerun: Path | None,
     on_step: Callable[[str], None],
-    tell: Callable[[str], None],
+    print_message: Callable[[str], None],
     *,
     overwrite: bool,
 ) -> RecordResult:
@@ -248,7 +255,7 @@ def _analyse_file(
 
     result = record_result(
         file, routes, on_step=on_step,
-        warn=lambda text: tell(f"Warning: {text}"),
+        warn=lambda text: print_message(f"Warning: {text}"),
     )  # fmt: skip
     with new_folder(folder, overwrite=overwrite) as part:
         write_report(result, part, on_step, formats=routes.figures)

@@ -48,8 +48,8 @@ def touch_command(
 ) -> None:
     """Estimate where, when and how hard the antenna met something.
 
-    Takes the touches that were detected during a session; in a session without any it looks for
-    them in the record.
+    Uses the touches that were detected during a session; without any it searches the record for
+    them.
     """
     from analysis.report.folder import (
         OutputError,

@@ -1,4 +1,4 @@
-"""Channels of a foreign file: which becomes which field of a session, in which unit, and when."""
+"""Channels of a third-party file: their fields in a session, units, and time base."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def factor(quantity: str, unit: str) -> float:
     ----------
     quantity : {"angle", "torque", "force", "time"}
     unit : str
-        In any spelling that `canonical_unit` knows, with a number before it or not: ``0.02 N.m``
-        is what one volt of a sensor's signal stands for.
+        In any spelling that `canonical_unit` knows, with a number before it or not: ``0.02 N.m`` is
+        the value of one volt of a sensor's signal.
 
     Raises
     ------
@@ -238,26 +238,26 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
 MAX_JITTER: Final = 0.1
 """Largest distance of a time stamp from its tick, in periods.
 
-Held against the tick nearest to it, a stamp that is off by more makes the sample's place doubtful.
+A stamp farther from the nearest tick makes the sample's position doubtful.
 """
 
 MAX_SPAN: Final = 10
 """Most ticks for each sample, as for the analysis: beyond that there is more gap than record."""
 
 MAX_GAPS: Final = 0.05
-"""Largest share of steps from sample to sample that are longer than a tick. Where it is more, the
-times are written too coarsely to tell the rate: milliseconds of a record at 700 Hz, say."""
+"""Largest fraction of steps from sample to sample that are longer than a tick. If there are more,
+the times are too coarse to determine the rate: milliseconds of a record at 700 Hz, say."""
 
 RATES_HZ: Final = (0.1, 1e6)
 """Rates that a session may have."""
 
 _RATE_DIGITS: Final = 9
-"""Digits to which time stamps tell a rate: 1000 is meant where 1000.0000000002 is met."""
+"""Digits to which time stamps determine a rate: 1000.0000000002 is read as 1000."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timebase:
-    """Places of the samples.
+    """Ticks of the samples.
 
     Attributes
     ----------
@@ -280,7 +280,7 @@ class Timebase:
 
 
 def uniform(path: Path, samples: int, rate_hz: float) -> Timebase:
-    """Place samples without a gap, at the rate that the user states."""
+    """Return the time base of samples without gaps, at the rate that the user states."""
     _check_rate(path, rate_hz)
     return Timebase(np.arange(samples), rate_hz, 0.0)
 
@@ -306,8 +306,8 @@ def from_time_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> T
     if stray.size:
         raise ExchangeError(
             f"{path}: the time '{channel}' of sample {stray[0] + 1} is {time_s[stray[0]]}, so its "
-            "place is unknown; repair the times, or give --rate-hz instead of --time if no sample "
-            "is missing."
+            "position is unknown; repair the times, or give --rate-hz instead of --time if no "
+            "sample is missing."
         )
     steps_s = np.diff(time_s)
     backward = np.flatnonzero(steps_s <= 0.0)
@@ -318,8 +318,8 @@ def from_time_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> T
             f"({time_s[first]:.9g} s) to sample {first + 2} ({time_s[first + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
-    # The median tells a step of one tick from a gap; the mean over all such steps is not at the
-    # mercy of how finely the file writes its times, as the median itself is.
+    # The median distinguishes a step of one tick from a gap; the mean over all such steps is not at
+    # the mercy of how finely the file writes its times, as the median itself is.
     single = steps_s < 1.5 * np.median(steps_s)
     steps = np.round(steps_s / steps_s[single].mean())
     gaps = np.count_nonzero(steps > 1) / len(steps)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-    from analysis.exchange._table import Column, Table
+    from analysis.exchange._table import ExportColumn, ExportTable
 
 
 # Reading
@@ -60,7 +60,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 _BLOCK: Final = 20_000
 
 
-def write_csv(table: Table, stream: BinaryIO) -> None:
+def write_csv(table: ExportTable, stream: BinaryIO) -> None:
     """Write commas, decimal points and UTF-8; a complex column becomes two, real and imaginary."""
     columns = [part for column in (table.axis, *table.columns) for part in _real_parts(column)]
     stream.write((",".join(column.name for column in columns) + "\n").encode("utf-8"))
@@ -70,7 +70,7 @@ def write_csv(table: Table, stream: BinaryIO) -> None:
         stream.write((lines + "\n").encode("ascii"))
 
 
-def _real_parts(column: Column) -> Iterator[Column]:
+def _real_parts(column: ExportColumn) -> Iterator[ExportColumn]:
     if not np.iscomplexobj(column.values):
         yield column
         return

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-    from analysis.exchange._table import Table
+    from analysis.exchange._table import ExportTable
     from analysis.linear_model import LinearModel, ModelOptions
     from analysis.models import WelchSettings
 
@@ -26,7 +26,7 @@ SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL)
 """Endings of the files that can be written."""
 
 
-def export_record(session: Path, target: Path, *, binary: bool = False) -> Table:
+def export_record(session: Path, target: Path, *, binary: bool = False) -> ExportTable:
     """Write the samples of a session as they were recorded.
 
     Parameters
@@ -39,7 +39,7 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Table
 
     Returns
     -------
-    Table
+    ExportTable
         What was written.
 
     Raises
@@ -74,7 +74,7 @@ def export_frf(
     band_hz: tuple[float, float] | None = None,
     *,
     binary: bool = False,
-) -> Table:
+) -> ExportTable:
     """Write the frequency response that an analysis with these settings and band would fit.
 
     Otherwise as `export_record`; the analysis' own errors come on top.
@@ -162,7 +162,7 @@ def _check_ending(target: Path, endings: Collection[str]) -> None:
         )
 
 
-def _write(table: Table, target: Path, *, binary: bool) -> None:
+def _write(table: ExportTable, target: Path, *, binary: bool) -> None:
     with _new_file(target) as stream:
         match target.suffix.lower():
             case ".csv":

@@ -1,4 +1,4 @@
-"""What a file states of itself (units, rate, times, starts, scales) against what the user states.
+"""Comparison of a file's statements (units, rate, times, starts, scales) with the user's.
 
 A contradiction is refused, with both statements. `ImportPlan.ignore_file_metadata` lets the user's
 count; then it is a warning, and the session's metadata have it.
@@ -51,8 +51,8 @@ _JITTER_SHOWN: Final = 0.01
 """Shift between channels, in periods, below which it is not worth a warning."""
 
 
-def place_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
-    """Place the samples in time, by the channel of times or by the rate stated."""
+def time_samples(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
+    """Return the time base, by the channel of times or by the rate stated."""
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
         return from_time_stamps(path, plan.time.channel, time_s)
@@ -80,7 +80,7 @@ class FileStatements:
     ignored: list[str] = field(default_factory=list)
 
     def contradict(self, statement: str, remedy: str) -> None:
-        """Refuse a file that contradicts the plan, or note that the plan overrides it."""
+        """Raise if a file contradicts the plan, or note that the plan overrides it."""
         if not self.plan.ignore_file_metadata:
             raise ExchangeError(
                 f"{self.path}: {statement}; {remedy}, or let your options count with "
@@ -95,31 +95,31 @@ class FileStatements:
         Raises
         ------
         ExchangeError
-            If the file clearly says another unit.
+            If the file clearly states another unit.
         """
         for choice in self.plan.choices:
             label = channels[choice.channel].unit_label.strip()
-            said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
-            if said is not None and said != choice.unit:
+            stated_unit = canonical_unit(label) if label else unit_in_brackets(choice.channel)
+            if stated_unit is not None and stated_unit != choice.unit:
                 self.contradict(
-                    f"the file says that '{choice.channel}' is in {said}, and {choice.unit} was "
-                    "stated",
-                    f"state '{choice.channel}:{said}', or correct the file",
+                    f"the file says that '{choice.channel}' is in {stated_unit}, and {choice.unit} "
+                    "was stated",
+                    f"state '{choice.channel}:{stated_unit}', or correct the file",
                 )
-            if said is None and label not in _NO_UNIT:
+            if stated_unit is None and label not in _NO_UNIT:
                 self.warnings.append(
                     f"The file states '{printable(label, 20)}' for '{choice.channel}'; "
                     f"{choice.unit} was used as stated."
                 )
             suffix = unit_in_suffix(choice.channel)
-            if said is None and suffix not in (None, choice.unit):
+            if stated_unit is None and suffix not in (None, choice.unit):
                 self.warnings.append(
                     f"The name '{choice.channel}' suggests {suffix}; {choice.unit} was used as "
                     "stated."
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:
-        """Refuse values to which a scale of the file could not be applied."""
+        """Raise if a scale of the file could not be applied to the values."""
         for name, channel in channels.items():
             if channel.unapplied_scale:
                 self.contradict(
@@ -129,7 +129,7 @@ class FileStatements:
                 )
 
     def timebase(self, channels: Mapping[str, SourceChannel]) -> Timebase:
-        """Place the samples in time, and compare that with the rate and the times of the file.
+        """Return the time base; compare it with the rate and the times of the file.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class FileStatements:
             If the times are not a time base, or the file has another rate than was stated.
         """
         time = self.plan.time
-        found = place_samples(self.path, self.plan, channels)
+        found = time_samples(self.path, self.plan, channels)
         for name, channel in channels.items():
             own_hz = channel.rate_hz
             if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
@@ -149,7 +149,7 @@ class FileStatements:
         return found
 
     def _another_rate(self, name: str, own_hz: float, rate_hz: float) -> None:
-        """Judge a rate of the file that is not the one used."""
+        """Handle a rate of the file that is not the one used."""
         time = self.plan.time
         statement = f"the file says that '{name}' was sampled at {own_hz:.6g} Hz"
         is_default = own_hz == _DEFAULT_RATE_HZ
@@ -182,10 +182,10 @@ class FileStatements:
         if len(values) < 2:
             return
         if len(values) < len(times.values):
-            place = int(np.argmin(np.isfinite(times.values))) + 1
+            row_number = int(np.argmin(np.isfinite(times.values))) + 1
             self.contradict(
-                f"the times '{printable(times.name, 60)}' are missing from sample {place} on, in "
-                f"{len(times.values) - len(values)} samples, so that these may be none",
+                f"the times '{printable(times.name, 60)}' are missing from sample {row_number} on, "
+                f"in {len(times.values) - len(values)} samples, so that these may be none",
                 "repair or remove their lines",
             )
             return
@@ -193,11 +193,12 @@ class FileStatements:
         steps = np.diff(values)
         name = f"'{printable(times.name, 60)}'"
         if (steps < 0.0).any():
-            place = int(np.argmax(steps < 0.0)) + 2
+            row_number = int(np.argmax(steps < 0.0)) + 2
             if (steps < 0.0).all():
                 return  # it runs backwards, as an index or a countdown may
             self.contradict(
-                f"the times {name} go back at sample {place}, so that another record begins there",
+                f"the times {name} go back at sample {row_number}, so that another record begins "
+                "there",
                 "cut one record out of the file",
             )
             return
@@ -208,7 +209,7 @@ class FileStatements:
             self.contradict(
                 f"the time {name} of sample {int(np.argmax(steps == 0.0)) + 2} is that of the one "
                 "before it",
-                "remove what stands twice",
+                "remove what is stated twice",
             )
             return
         step = float(values[-1] - values[0]) / (len(values) - 1)
@@ -240,20 +241,20 @@ class FileStatements:
     def align(
         self, channels: Mapping[str, SourceChannel], base: Timebase
     ) -> tuple[Mapping[str, SourceChannel], Mapping[str, float]]:
-        """Cut channels that begin at different times to the samples that they share.
+        """Trim channels that begin at different times to their common interval.
 
         Returns
         -------
         channels : mapping of str to SourceChannel
             Channels of one length.
         delays_s : mapping of str to float
-            Channel → how much older its values are than those of the angle in the same place: what
-            whole samples leave.
+            Channel → age of its values relative to those of the angle at the same index: the
+            remainder after whole samples.
 
         Raises
         ------
         ExchangeError
-            If the channels share no time, or have different lengths without a reason.
+            If the channels have no common time, or different lengths without a reason.
         """
         time, plan = self.plan.time, self.plan
         starts = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}

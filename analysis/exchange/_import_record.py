@@ -2,8 +2,8 @@
 
 Nothing is guessed: channels, units and circumstances are the user's to state (`ImportPlan`). Stated
 units are compared with those of the file, the time stamps with a uniform rate, and the torque with
-what the undamped beam would ask for. Values that are not finite are held and flagged, as in the
-session format.
+that of the undamped beam. Values that are not finite are held and flagged, as in the session
+format.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.exchange._file_statements import FileStatements, place_samples
+from analysis.exchange._file_statements import FileStatements, time_samples
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from analysis.exchange._channels import ChannelChoice, Timebase
     from analysis.exchange._source import SourceChannel
-    from analysis.exchange._specimen import Specimen
+    from analysis.exchange._specimen import SpecimenFile
 
 
 # Import
@@ -49,7 +49,7 @@ class ImportPlan:
     channels : mapping of str to ChannelChoice
         Field of a sample (`analysis.exchange._channels.QUANTITIES`) → channel and unit; those of
         `REQUIRED` must be among them.
-    specimen : Specimen
+    specimen : SpecimenFile
     time : ChannelChoice, optional
         Channel with the time of each sample.
     rate_hz : float, optional
@@ -67,7 +67,7 @@ class ImportPlan:
     """
 
     channels: Mapping[str, ChannelChoice]
-    specimen: Specimen
+    specimen: SpecimenFile
     time: ChannelChoice | None = None
     rate_hz: float | None = None
     segments_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class ImportPlan:
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecord:
-    """What became of a file.
+    """Result of an import.
 
     Attributes
     ----------
@@ -114,8 +114,8 @@ class ImportedRecord:
     warnings: tuple[str, ...]
 
 
-_JITTER_TOLD: Final = 0.01
-"""Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
+_JITTER_REPORTED: Final = 0.01
+"""Distance of a time stamp from its tick, in periods, from which it is reported."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
@@ -147,7 +147,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     statements.check_units(channels)
     base = statements.timebase(channels)
     channels, delays_s = statements.align(channels, base)
-    base = place_samples(source, plan, channels)
+    base = time_samples(source, plan, channels)
     warnings = statements.warnings
     warnings += _check_rate(source, plan, base)
     segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
@@ -157,11 +157,11 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     columns, status, first = hold(source, titles, columns)
     ticks = base.ticks[first:]
     after_gap = np.diff(ticks, prepend=-1) > 1
-    if base.jitter > _JITTER_TOLD:
+    if base.jitter > _JITTER_REPORTED:
         warnings.append(
             f"The time stamps lie up to {base.jitter:.2g} periods from equidistant ones."
         )
-    warnings += _told(titles, status, first, ticks)
+    warnings += _missing_sentences(titles, status, first, ticks)
     odd = unlikely_torque(
         _on_grid(ticks, columns["angle_rad"]),
         _on_grid(ticks, columns["coupling_torque_nm"]),
@@ -202,12 +202,12 @@ def _start_utc_ns(source: Path, duration_s: float) -> tuple[int, str]:
     year = 1970 + changed_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
         f"By its time stamp the file was changed about the year {year:.0f}, which a session cannot "
-        "state; the time of this import stands as the session's start."
+        "state; the time of this import is used as the session's start."
     )
 
 
 def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
-    """Refuse a rate at which no record shows the beam; warn of a time next to none."""
+    """Raise if no record at this rate shows the beam; warn of a very short time."""
     beam, times = plan.specimen.beam, plan.time
     first_hz, duration_s = first_mode_hz(beam), (int(base.ticks[-1]) + 1) / base.rate_hz
     remedy = (
@@ -233,7 +233,7 @@ def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
 def _columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Fields of the samples in their units; what becomes infinite is for others to judge."""
+    """Return the fields of the samples in SI units; infinite values are handled later."""
     columns = {}
     with np.errstate(over="ignore"):
         for name, choice in plan.channels.items():
@@ -260,10 +260,10 @@ def _segments(
     return found
 
 
-def _told(
+def _missing_sentences(
     titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
 ) -> list[str]:
-    """Sentences on what of the record is missing."""
+    """Return sentences on missing parts of the record."""
     found = []
     if first:
         found.append(
@@ -295,7 +295,7 @@ def _on_grid(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[n
 def _metadata(
     source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
 ) -> dict[str, str]:
-    """Everything that the session is to say of itself and of where it came from."""
+    """Return the metadata of the session and of its source."""
     beam = plan.specimen.beam
     numbers = {
         "rate_hz": rate_hz,
@@ -411,12 +411,12 @@ the first antiresonance (at 4.4) for damping not to matter, and above the freque
 paper's external damping outweighs the inertia."""
 
 _CERTAIN: Final = 6.0
-"""Standard deviations from zero that the factor between torque and model must have to judge at
-all: a motion that does not reach these frequencies tells nothing."""
+"""Distance from zero, in standard deviations, that the factor between torque and model must have
+for a decision: a motion that does not reach these frequencies gives none."""
 
 _TAPER: Final = 0.05
-"""Share of the record at either end over which it is faded: a record may begin and end in motion,
-and the paper's chirp passes these frequencies early."""
+"""Fraction of the record at either end over which it is faded: a record may begin and end in
+motion, and the paper's chirp passes these frequencies early."""
 
 _FACTOR: Final = 3.0
 """Largest factor between torque and model that damping and a wrong mass may account for. The units
@@ -427,21 +427,21 @@ def unlikely_torque(
     angle_rad: NDArray[np.float64],
     torque_nm: NDArray[np.float64],
     rate_hz: float,
-    specimen: Specimen,
+    specimen: SpecimenFile,
 ) -> str | None:
-    """Compare the torque with what the undamped beam would ask for, beside its first resonance.
+    """Compare the torque with that of the undamped beam on either side of its first resonance.
 
     Parameters
     ----------
     angle_rad, torque_nm : ndarray of float, shape (n,)
         The whole record, finite.
     rate_hz : float
-    specimen : Specimen
+    specimen : SpecimenFile
 
     Returns
     -------
     str or None
-        What is odd and what to check; None if nothing is, or the motion does not tell.
+        Anomaly and remedy; None if there is none, or the motion does not decide it.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
@@ -449,8 +449,8 @@ def unlikely_torque(
     for low, high in _BANDS:
         band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
     s = 2j * np.pi * frequency_hz[band]
-    place = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
-    window = np.sin(np.pi / 2 * np.minimum((1 - place) / (2 * _TAPER), 1)) ** 2
+    from_middle = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
+    window = np.sin(np.pi / 2 * np.minimum((1 - from_middle) / (2 * _TAPER), 1)) ** 2
     with np.errstate(over="ignore", invalid="ignore"):
         angle, torque = (
             np.fft.rfft(window * (values - values.mean()))[band]

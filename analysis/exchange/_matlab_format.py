@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.exchange._table import Table
+    from analysis.exchange._table import ExportTable
 
 
 # Reading
@@ -71,15 +71,17 @@ def _vectors(
     listed: Sequence[tuple[str, tuple[int, ...], str]],
     load: Callable[..., Mapping[str, Any]],
 ) -> dict[str, SourceChannel]:
-    """Load the variables that are asked for, once their sizes as listed have been looked at."""
+    """Load the requested variables after a check of their listed sizes."""
     shapes = {name: shape for name, shape, _ in listed}
     variables = {name: _element(_split(name, shapes)[0])[0] for name in names}
     for name, variable in variables.items():
         if variable not in shapes:
             raise no_such_channel(path, name, shapes)
         check_samples(path, f"The variable '{variable}'", max(shapes[variable], default=0))
-    beside = {n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES}
-    contents = load(path, variable_names=sorted(beside | set(variables.values())))
+    time_variables = {
+        n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES
+    }
+    contents = load(path, variable_names=sorted(time_variables | set(variables.values())))
     known = {name: contents[name] for name in shapes if name in contents}
 
     def fields(parent: str) -> Sequence[str]:
@@ -119,7 +121,7 @@ def _label(path: Path, name: str, contents: Mapping[str, Any]) -> str:
 
 
 def _split(name: str, variables: Container[str]) -> tuple[str, list[str], int | None]:
-    """Take ``log.angle#2`` apart into variable, fields and column (from 0)."""
+    """Split ``log.angle#2`` into variable, fields and column (from 0)."""
     column = None
     if name not in variables:
         whole, mark, number = name.rpartition("#")
@@ -133,7 +135,7 @@ _INDEXED: Final = re.compile(r"(.+)\((\d+)\)")
 
 
 def _element(text: str) -> tuple[str, int | None]:
-    """Take ``log(2)`` apart into the name and the element's place from 0 on, None without one."""
+    """Split ``log(2)`` into the name and the element's index from 0 on, None without one."""
     found = _INDEXED.fullmatch(text)
     return (found[1], int(found[2]) - 1) if found else (text, None)
 
@@ -148,7 +150,7 @@ def _value_of(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noq
     value: Any = None
     shown = ""
     for depth, part in enumerate((first, *fields)):
-        key, place = _element(part)
+        key, element = _element(part)
         if depth:
             found = getattr(value, "dtype", None)
             if found is None or found.names is None:
@@ -170,13 +172,13 @@ def _value_of(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noq
         else:
             value = contents[key]
         shown = f"{shown}.{part}" if depth else part
-        if place is not None:
+        if element is not None:
             count = getattr(value, "size", 0)
-            if not 0 <= place < count:
+            if not 0 <= element < count:
                 raise ExchangeError(
                     f"{path}: '{shown}' is not there; '{key}' has {count} elements."
                 )
-            value = value.reshape(-1, order="F")[place : place + 1]
+            value = value.reshape(-1, order="F")[element : element + 1]
     return value
 
 
@@ -298,7 +300,7 @@ def _hdf5_link(group: Any, name: str, h5py: Any) -> object:  # noqa: ANN401
 
 
 def _stored_elsewhere(path: Path, name: str) -> ExchangeError:
-    """Make the error for a channel whose samples are in another place or file, unlike MATLAB's."""
+    """Return the error for a channel whose samples are stored elsewhere, unlike MATLAB's."""
     return ExchangeError(
         f"{path}: '{name}' is a link or refers to samples stored elsewhere, which are not read; "
         "save the channel itself with save('-v7', …)."
@@ -308,7 +310,7 @@ def _stored_elsewhere(path: Path, name: str) -> ExchangeError:
 # Writing
 
 
-def write_mat(table: Table, stream: BinaryIO) -> None:
+def write_mat(table: ExportTable, stream: BinaryIO) -> None:
     """Write each column as a variable of its name, n×1, and ``information``, a struct.
 
     Its fields are numbers where the information is one, rows where it is several with commas
@@ -336,7 +338,7 @@ _LARGEST_EXACT: Final = 2**53
 
 
 def _value(key: str, text: str) -> str | float | NDArray[Any]:
-    """Return what a text of the session's metadata stands for."""
+    """Return the value of a text of the session's metadata."""
     parts = [part.strip() for part in text.split(",")]
     words = key in _WORDS or (key.startswith(META_PREFIX) and not unit_of(key))
     if words or not all(map(_NUMBER.fullmatch, parts)):

@@ -40,7 +40,7 @@ def stated_times(
     name : str
         The channel.
     names : sequence of str
-        Channels that are asked for.
+        Requested channels.
     length : int
         Samples of the channel.
     siblings : callable

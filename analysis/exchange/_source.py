@@ -40,7 +40,7 @@ class FileTimes:
     name : str
         Name of the channel that has them.
     values : ndarray of float, shape (n,)
-        As they stand in the file.
+        Unchanged from the file.
     unit_s : float or None
         Size of their unit in seconds, None if the file does not state it.
     """
@@ -52,21 +52,21 @@ class FileTimes:
 
 @dataclass(frozen=True, slots=True)
 class SourceChannel:
-    """One channel as it stands in the file.
+    """One channel of the file, unchanged.
 
     Attributes
     ----------
     values : ndarray of float, shape (n,)
         In the unit that the user states; NaN and infinities as they are.
     unit_label : str
-        What the file itself says of the unit, "" if nothing.
+        Unit stated in the file, "" if none.
     rate_hz : float or None
-        Samples per second by the file's own word, None if it says nothing.
+        Samples per second by the file, None if it states none.
     remark : str
         What the user should know of the file, "" if nothing.
     start_ns : int or None
-        Time of the first sample by the file's own word, ns from any instant that all channels of
-        the file have in common, None if it says nothing.
+        Time of the first sample by the file, ns from any instant that all channels of the file have
+        in common, None if it says nothing.
     times : FileTimes or None
         Times that the file has of these samples besides.
     unapplied_scale : str
@@ -190,7 +190,7 @@ MAX_MEMORY: Final = 800_000_000
 
 @contextmanager
 def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
-    """Let the process grow by so much and no further: what asks for more gets a MemoryError.
+    """Limit the growth of the process: larger requests raise a MemoryError.
 
     Formats such as MATLAB's are compressed and nested, and their readers believe what a file says
     of its sizes; a kilobyte can ask for all the memory there is. The kernel's own limit holds for
@@ -226,7 +226,7 @@ def check_samples(path: Path, what: str, samples: int) -> None:
         )
 
 
-# What the readers of formats share
+# Common functions of the readers
 
 _NAMES_SHOWN: Final = 12
 """Channel names that a message lists."""
@@ -246,10 +246,10 @@ def no_such_channel(path: Path, name: str, available: Iterable[str]) -> Exchange
     )
 
 
-def place_of(
+def channel_index(
     path: Path, name: str, titles: Sequence[str], several: str, *, numbered: bool = False
 ) -> int:
-    """Find a channel by its title, or by its number as in ``#3``; return its place from 0 on.
+    """Return the index of a channel, found by its title, or by its number as in ``#3``.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def place_of(
     number = name.removeprefix("#")
     if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
         return int(number) - 1
-    listed = [f"#{place} {each}" for place, each in enumerate(titles, 1)] if numbered else titles
+    listed = [f"#{number} {each}" for number, each in enumerate(titles, 1)] if numbered else titles
     raise no_such_channel(path, name, listed)
 
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Specimen:
-    """What is moved.
+class SpecimenFile:
+    """Specimen and clamp of an imported record.
 
     Attributes
     ----------
@@ -51,11 +51,11 @@ class Specimen:
     axis_tilt_deg: float | None = None
 
 
-def read_specimen(path: Path) -> Specimen:
+def read_specimen(path: Path) -> SpecimenFile:
     """Read ``[beam]`` and, as far as they are stated, tool inertia, tilt and ``[uncertainty]``.
 
-    A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
-    Nothing else of a profile is used: delays, rate and limits are those of the rig's own recorder.
+    A number is plain or, as in a profile, ``{ value = 0.98, source = "measured" }``. Nothing else
+    of a profile is used: delays, rate and limits are those of the rig's own recorder.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def read_specimen(path: Path) -> Specimen:
                 f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
                 "inertia cannot be negative."
             )
-    return Specimen(
+    return SpecimenFile(
         Beam(
             length_m=_positive(path, beam, "length_m"),
             density_kg_per_m=_positive(path, beam, "density_kg_per_m"),

@@ -1,4 +1,4 @@
-"""What is exported: named columns with units over one axis, the same for every format."""
+"""Table for export: named columns with units over one axis, the same for every format."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class ExportColumn:
     """One quantity.
 
     Attributes
@@ -34,7 +34,7 @@ class Column:
     name : str
         With the unit as its suffix.
     title : str
-        What it is, in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
+        Title in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
     unit : str
         "" without a unit.
     values : ndarray, shape (n,)
@@ -48,23 +48,22 @@ class Column:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ExportTable:
     """Columns over a common axis.
 
     Attributes
     ----------
     source : str
         Name of the session file.
-    axis : Column
+    axis : ExportColumn
         Time or frequency, increasing.
-    columns : tuple of Column
-    information : mapping of str to str
-        How it came about, for formats that have room for it.
+    columns : tuple of ExportColumn information : mapping of str to str
+        Its origin, for formats that can store it.
     """
 
     source: str
-    axis: Column
-    columns: tuple[Column, ...]
+    axis: ExportColumn
+    columns: tuple[ExportColumn, ...]
     information: Mapping[str, str]
 
 
@@ -80,8 +79,8 @@ _TITLES: Final = {
 }
 
 
-def record_table(path: Path) -> Table:
-    """Read the samples of a session as recorded: gaps stay, and flags stand beside the values.
+def record_table(path: Path) -> ExportTable:
+    """Return the samples of a session as recorded: gaps remain, and flags are a column.
 
     Raises
     ------
@@ -98,11 +97,11 @@ def record_table(path: Path) -> Table:
             "nothing to export."
         )
     samples = session.samples
-    return Table(
+    return ExportTable(
         path.name,
-        Column("time_s", "Time", "s", samples["tick"] / rate_hz),
+        ExportColumn("time_s", "Time", "s", samples["tick"] / rate_hz),
         tuple(
-            Column(name, _TITLES[name], _unit(name), np.ascontiguousarray(samples[name]))
+            ExportColumn(name, _TITLES[name], _unit(name), np.ascontiguousarray(samples[name]))
             for name in SAMPLE_FIELDS
             if name in _TITLES
         ),
@@ -112,7 +111,7 @@ def record_table(path: Path) -> Table:
 
 def frf_table(
     path: Path, settings: WelchSettings, band_hz: tuple[float, float] | None = None
-) -> Table:
+) -> ExportTable:
     """Estimate the response from angle to coupling torque, as the analysis does that fits it.
 
     The channels' delays are taken out of it; the tool inertia is not. Without a band it is what
@@ -127,15 +126,15 @@ def frf_table(
     settings = welch_settings(record, settings, band_hz)
     response, _ = estimate(record, settings)
     columns = [
-        Column("response_nm_per_rad", "Coupling torque / Angle", "N.m/rad", response.response)
+        ExportColumn("response_nm_per_rad", "Coupling torque / Angle", "N.m/rad", response.response)
     ]
     if response.coherence is not None:
-        columns.append(Column("coherence", "Coherence", "", response.coherence))
+        columns.append(ExportColumn("coherence", "Coherence", "", response.coherence))
     segmentation = settings.segmentation(record.rate_hz)
     used = {} if settings.estimator == "fft" else asdict(segmentation)
-    return Table(
+    return ExportTable(
         path.name,
-        Column("frequency_hz", "Frequency", "Hz", response.frequency_hz),
+        ExportColumn("frequency_hz", "Frequency", "Hz", response.frequency_hz),
         tuple(columns),
         {
             "estimator": response.estimator,

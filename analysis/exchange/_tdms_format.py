@@ -31,7 +31,7 @@ _MOST_ENTRIES: Final = 5_000_000
 """Most channels, counted again in each segment: npTDMS takes that many steps before it reads."""
 
 _EARLIEST: Final = np.datetime64("1980-01-01")
-"""LabVIEW's own zero, in 1904, stands where no start was given."""
+"""LabVIEW's own zero, in 1904, means that no start was given."""
 _EARLIEST_NS: Final = int(_EARLIEST.astype("datetime64[ns]").astype(np.int64))
 
 _LEAD_IN: Final = 28
@@ -42,15 +42,15 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read channels ``Group/Channel``, as `analysis.exchange._source.read_source` asks for.
 
     Scalings of the file are applied; one that npTDMS does not know is reported with the channel,
-    whose values are then raw. The file is opened by itself, without the index that may lie
-    beside it and may belong to another.
+    whose values are then raw. The file is opened by itself, without an index file in the same
+    folder, which may belong to another.
     """
     try:
         from nptdms import TdmsFile
         from nptdms.log import log_manager
     except ImportError as error:
         raise missing_library(path, "npTDMS") from error
-    log_manager.set_level(logging.ERROR)  # what it warns of is told below
+    log_manager.set_level(logging.ERROR)  # its warnings are reported below
     try:
         with path.open("rb") as stream:
             _check_entries(path, stream)
@@ -80,9 +80,9 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 def _check_entries(path: Path, stream: BinaryIO) -> None:
     """Refuse a file whose table of contents alone would take minutes or gigabytes to read."""
     size = path.stat().st_size
-    place = channels = entries = 0
-    while place + _LEAD_IN <= size and entries <= _MOST_ENTRIES:
-        stream.seek(place)
+    offset = channels = entries = 0
+    while offset + _LEAD_IN <= size and entries <= _MOST_ENTRIES:
+        stream.seek(offset)
         head = stream.read(_LEAD_IN + 4)
         contents = int.from_bytes(head[4:8], "little")
         order = ">" if contents & _BIG_ENDIAN else "<"
@@ -92,7 +92,7 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
             channels = listed if contents & _NEW_LIST else channels + listed
             entries += channels
         entries += 1
-        place += _LEAD_IN + length
+        offset += _LEAD_IN + length
     stream.seek(0)
     if entries > _MOST_ENTRIES:
         raise ExchangeError(
@@ -186,7 +186,7 @@ def _unapplied_scale(levels: Sequence[Mapping[str, Any]]) -> str:
 def _times(
     path: Path, name: str, names: Sequence[str], channels: Mapping[str, Any]
 ) -> FileTimes | None:
-    """Return the times in a channel of the same group, if it has one that nobody asked for."""
+    """Return the times in a channel of the same group that was not requested, if there is one."""
     channel = channels[name]
     for other, candidate in channels.items():
         if (

@@ -18,10 +18,10 @@ from analysis.exchange._source import (
     SourceChannel,
     as_column,
     bounded_memory,
+    channel_index,
     check_samples,
     missing_library,
     not_in_time,
-    place_of,
 )
 from rigd.printable import printable
 from rigd.text_table.titles import stated_unit_of, time_unit_s
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.exchange._table import Column, Table
+    from analysis.exchange._table import ExportColumn, ExportTable
 
 
 # Reading
@@ -53,7 +53,7 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read functions of time, as `analysis.exchange._source.read_source` asks for.
 
     A channel is ``#2``, the second data set of type 58, or the text of its first identification
-    line if no other has the same; ``abscissa`` is the times of the first that is asked for.
+    line if no other has the same; ``abscissa`` is the times of the first requested one.
     """
     try:
         import pyuff
@@ -75,18 +75,18 @@ def _functions(
 ) -> dict[str, SourceChannel]:
     _check_marks(path)
     file = open_file(str(path))
-    places = [place for place, kind in enumerate(file.get_set_types()) if kind == 58]
-    titles = [file.read_sets(place, header_only=True)["id1"] for place in places]
+    set_numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
+    titles = [file.read_sets(number, header_only=True)["id1"] for number in set_numbers]
     numbers = {
-        name: place_of(path, name, titles, "data sets have the title", numbered=True)
+        name: channel_index(path, name, titles, "data sets have the title", numbered=True)
         for name in names
         if name != ABSCISSA
     }
     if not numbers:
-        raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was asked for.")
+        raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was requested.")
     channels, times, units = {}, [], []
     for name, number in numbers.items():
-        function = file.read_sets(places[number])
+        function = file.read_sets(set_numbers[number])
         stamps = np.asarray(function["x"], dtype=np.float64)
         channels[name] = _channel(path, name, function, stamps, timed=ABSCISSA in names)
         times.append(stamps)
@@ -221,7 +221,8 @@ _EVEN_IN_TEXT, _EVEN_IN_BINARY = 1e-2, 1e-6
 format has six digits for either. In binary the abscissae themselves are the better choice."""
 
 _SAME_INCREMENT: Final = 1e-10
-"""Relative error of the increment at which, in binary, a short record tells its rate as well."""
+"""Relative error of the increment at which, in binary, a short record determines its rate as
+well."""
 
 _GENERAL_FUNCTION, _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 0, 1, 4, 6
 _TIME_AXIS, _FREQUENCY_AXIS, _GENERAL, _UNKNOWN = 17, 18, 1, 0
@@ -240,7 +241,7 @@ _SI_UNITS: Final = (
 )
 
 
-def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
+def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     """Write the units (data set 164: SI) and a function for each column.
 
     Times and frequencies are given by first value and increment, or, where six digits of these are
@@ -248,8 +249,8 @@ def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
 
     Parameters
     ----------
-    table : Table
-        Integer columns (ticks, flags) are left out: the format has no place for them.
+    table : ExportTable
+        Integer columns (ticks, flags) are left out: the format cannot store them.
     stream : file, open for writing bytes
     binary : bool
         Whether numbers are written as 8-byte floats (58b) or with 13 digits.
@@ -324,7 +325,11 @@ def _body(
 
 
 def _header(
-    table: Table, axis: NDArray[np.float64], column: Column, even: bool, size: int | None
+    table: ExportTable,
+    axis: NDArray[np.float64],
+    column: ExportColumn,
+    even: bool,
+    size: int | None,
 ) -> str:
     """Eleven lines, after the mark and the type; `size` is that of a binary body in bytes."""
     is_complex = column.values.dtype.kind == "c"
@@ -355,7 +360,7 @@ def _header(
     return "\n".join(lines) + "\n"
 
 
-def _identification(table: Table, column: Column) -> tuple[str, ...]:
+def _identification(table: ExportTable, column: ExportColumn) -> tuple[str, ...]:
     """Five lines of text: name, source, how, date (unknown), exporter."""
     how = ", ".join(
         f"{key} {table.information[key]}"

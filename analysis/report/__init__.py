@@ -1,8 +1,8 @@
-"""What people and programs are shown of an analysis: tables, figures, a JSON document.
+"""Output of an analysis for people and programs: tables, figures, a JSON document.
 
 Each table is described once, as a `Table` (in the modules ``_…_tables``), and rendered for the
 terminal, for a page, as CSV and as JSON. Pages are the files in ``templates``, which `_page` fills;
-nothing else of this room needs them.
+no other module of this package uses them.
 """
 
 import lazy_loader as lazy

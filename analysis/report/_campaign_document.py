@@ -1,4 +1,4 @@
-"""A campaign as one JSON document, without NaN: what is not known is null."""
+"""A campaign as one JSON document, without NaN: unknown values are null."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from analysis.results import finite
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from analysis.campaigns import CampaignResult, RecordEstimate, SessionResult, WelchFit
+    from analysis.campaigns import CampaignResult, RecordEstimate, SessionAnalysis, WelchFit
     from analysis.identify import ModeEstimate
 
 
@@ -27,17 +27,17 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     campaign : Campaign
         Results of all sessions.
     with_paper : bool
-        Whether the paper's numbers stand beside these.
+        Whether the paper's numbers are included.
 
     Returns
     -------
     dict
         ``headlines`` of each session and, with ``file`` null, of all together; ``validity`` of the
-        linear model for the worst of the sessions; ``verdict`` on all
-        sessions (null without whole-record estimates), ``files`` with each one's own, ``errors``
-        (files left out, and why), ``one_specimen`` and the ``groups`` in which sessions lie if they
-        are not, ``trials`` of the validation asked, done and lost, ``fits`` and ``modes`` as of
-        single sessions, and the tables by the names of their CSV files. Finite numbers only.
+        linear model for the worst of the sessions; ``verdict`` on all sessions (null without
+        whole-record estimates), ``files`` with each one's own, ``errors`` (files left out, and
+        why), ``one_specimen`` and the ``groups`` in which sessions lie if they are not, ``trials``
+        of the validation requested, done and lost, ``fits`` and ``modes`` as of single sessions,
+        and the tables by the names of their CSV files. Finite numbers only.
     """
     leading = campaign.homogeneity.leading
     content: dict[str, Any] = finite(
@@ -93,13 +93,13 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
     return content
 
 
-def _name(session: SessionResult, estimator: str, structure: str) -> dict[str, Any]:
+def _name(session: SessionAnalysis, estimator: str, structure: str) -> dict[str, Any]:
     return {
         "file": str(session.path), "estimator": estimator, "type": structure, "weighting": None,
     }  # fmt: skip
 
 
-def _welch_fit(session: SessionResult, fit: WelchFit) -> dict[str, Any]:
+def _welch_fit(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
     return {
         **_name(session, "welch", fit.structure),
         "weighting": fit.weighting,
@@ -111,7 +111,7 @@ def _welch_fit(session: SessionResult, fit: WelchFit) -> dict[str, Any]:
     }
 
 
-def _record_fit(session: SessionResult, fit: RecordEstimate) -> dict[str, Any]:
+def _record_fit(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
     return {
         **_name(session, "record", fit.structure),
         "candidate": fit.name,
@@ -124,10 +124,10 @@ def _record_fit(session: SessionResult, fit: RecordEstimate) -> dict[str, Any]:
 
 
 def _of_free(std: Mapping[str, float | None], free: Collection[str]) -> dict[str, float | None]:
-    """Put None for what a structure fixes: that is not known exactly, it was not asked for."""
+    """Replace the standard deviations of fixed parameters, which were not estimated, by None."""
     return {name: value if name in free else None for name, value in std.items()}
 
 
-def _mode(session: SessionResult, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+def _mode(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
     values = asdict(mode)
     return _name(session, "record", fit.structure) | {"mode": values.pop("number"), **values}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns import CampaignResult, NominalModel, SessionResult
+    from analysis.campaigns import CampaignResult, NominalModel, SessionAnalysis
     from analysis.campaigns.pooling import PooledParameter
 
 _PANELS: Final = (
@@ -43,7 +43,7 @@ def index_figure(campaign: CampaignResult) -> Figure:
 
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
-    colors = {name: look["color"] for name, look in line_styles(tuple(weightings)).items()}
+    colors = {name: line["color"] for name, line in line_styles(tuple(weightings)).items()}
     width_in, height_in = 13.0, 4.9
     figure = style.new_figure(
         width_in, height_in,
@@ -58,11 +58,11 @@ def index_figure(campaign: CampaignResult) -> Figure:
         axes = figure.add_subplot(grid[column])
         for model in campaign.nominal:
             offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
-            place = types.index(model.structure) + offset * width
+            position = types.index(model.structure) + offset * width
             values = np.array([getattr(each, index) for each in model.indices])
             color = colors[model.weighting]
             axes.boxplot(
-                [values], positions=[place], widths=0.8 * width, patch_artist=True,
+                [values], positions=[position], widths=0.8 * width, patch_artist=True,
                 showmeans=True, manage_ticks=False,
                 boxprops={"facecolor": "white", "edgecolor": color},
                 whiskerprops={"color": color}, capprops={"color": color},
@@ -145,12 +145,12 @@ def _panel(
     campaign: CampaignResult, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
 ) -> None:
     symbol, factor, _ = label(parameter.name)
-    places, values, spreads = [], [], []
+    positions, values, spreads = [], [], []
     for number, session in enumerate(campaign.sessions, start=1):
         for each in session.record_estimates:
             std = each.std.get(parameter.name)
             if each.name == name and std is not None:
-                places.append(number)
+                positions.append(number)
                 values.append(factor * each.parameters[parameter.name])
                 spreads.append(1.96 * factor * std)
     axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
@@ -161,7 +161,9 @@ def _panel(
     )
     ink, line = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
     axes.axhline(factor * parameter.value, color=line)
-    axes.errorbar(places, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8)
+    axes.errorbar(
+        positions, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8
+    )
     mark = "" if reported else MARK
     mark += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     chance = f"p = {probability(parameter.chance)}".replace("= <", "<")
@@ -175,7 +177,7 @@ def _panel(
 _MOST_POINTS: Final = 500
 _WIDE_COLUMNS: Final = 1500
 _MOST_LINES: Final = 40
-"""Most sessions drawn: more would not be told apart."""
+"""Most sessions drawn: more would not be distinguishable."""
 SESSION: Final = "#A8A8A8"
 """Colour of a single session's response."""
 _PAIR: Final[tuple[dict[str, Any], ...]] = (
@@ -202,8 +204,8 @@ def nominal_figure(campaign: CampaignResult) -> Figure:
     )
     for name, magnitude, phase in panels:
         models = [model for model in campaign.nominal if model.structure == name]
-        looks = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
-        handles |= _response_panel(campaign, magnitude, phase, models, looks, _MOST_POINTS)
+        styles = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
+        handles |= _response_panel(campaign, magnitude, phase, models, styles, _MOST_POINTS)
     for phase in figure.axes[1::2][-columns:]:
         phase.set_xlabel("Frequency (Hz)", labelpad=1)
     _legend(figure, handles)
@@ -221,11 +223,11 @@ def best_figure(campaign: CampaignResult) -> Figure:
         bottom=0.55 / height_in, height_ratios=(2.2, 1.0), hspace=0.07,
     )  # fmt: skip
     magnitude, phase = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
-    looks = [
-        (f"nominal type {m.structure}, weights {m.weighting}", look)
-        for m, look in zip(models, _PAIR, strict=False)
+    styles = [
+        (f"nominal type {m.structure}, weights {m.weighting}", line_style)
+        for m, line_style in zip(models, _PAIR, strict=False)
     ]
-    handles = _response_panel(campaign, magnitude, phase, models, looks, _WIDE_COLUMNS)
+    handles = _response_panel(campaign, magnitude, phase, models, styles, _WIDE_COLUMNS)
     magnitude.set_ylim(_db_limits(campaign, models))
     style.response_axes(magnitude, phase)
     style.frequency_axis(magnitude, campaign.settings.band_hz, labels=False)
@@ -250,7 +252,7 @@ def _response_panel(
     magnitude: Axes,
     phase: Axes,
     models: Sequence[NominalModel],
-    looks: Sequence[tuple[str, dict[str, Any]]],
+    styles: Sequence[tuple[str, dict[str, Any]]],
     columns: int,
 ) -> dict[str, Line2D]:
     handles: dict[str, Line2D] = {}
@@ -259,16 +261,18 @@ def _response_panel(
         handles["measured, every session"] = draw_session(
             magnitude, phase, frequency_hz, session.response, columns, 2 * columns, alpha=0.7
         )
-    for model, (name, look) in zip(models, looks, strict=True):
+    for model, (name, line_style) in zip(models, styles, strict=True):
         (handles[name],) = magnitude.plot(
-            *_line(frequency_hz, magnitude_db(model.response), columns), **look, linewidth=1.3
+            *_line(frequency_hz, magnitude_db(model.response), columns), **line_style, linewidth=1.3
         )
-        phase.plot(*_line(frequency_hz, phase_deg(model.response), columns), **look, linewidth=1.3)
+        phase.plot(
+            *_line(frequency_hz, phase_deg(model.response), columns), **line_style, linewidth=1.3
+        )
     return handles
 
 
-def shown_sessions(campaign: CampaignResult) -> list[SessionResult]:
-    """Choose sessions to be drawn beside each other, spread over the campaign."""
+def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
+    """Choose sessions to be drawn together, spread over the campaign."""
     last = len(campaign.sessions) - 1
     chosen = np.unique(np.linspace(0, last, _MOST_LINES).round().astype(int))
     return [campaign.sessions[number] for number in chosen]
@@ -283,7 +287,7 @@ def draw_session(
     dots: int,
     alpha: float = 1.0,
 ) -> Line2D:
-    """Draw one session's response behind what is told of all; return the line of its magnitude."""
+    """Draw one session's response behind those of all; return the line of its magnitude."""
     (line,) = magnitude.plot(
         *_line(frequency_hz, magnitude_db(response), columns), color=SESSION, linewidth=0.5,
         alpha=alpha, rasterized=True,
@@ -322,7 +326,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
 
     models = by_model(campaign.validation)
     weightings = campaign.settings.weightings
-    colors = {w: look["color"] for w, look in line_styles(weightings).items()}
+    colors = {w: line["color"] for w, line in line_styles(weightings).items()}
     width_in, height_in = 9.0, _ROW_IN * len(models) + 1.75
     figure = style.new_figure(
         width_in, height_in, f"{_predicted(campaign)} sessions — leave-one-out validation",
@@ -332,7 +336,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     axes = figure.add_axes(
         (2.0 / width_in, 0.5 / height_in, 1 - 2.2 / width_in, _ROW_IN * len(models) / height_in)
     )
-    rng = np.random.default_rng(0)  # so that equal errors lie side by side
+    rng = np.random.default_rng(0)  # equal errors are then side by side
     for row, (_, _, weighting, errors) in enumerate(models):
         color = style.GREEN if weighting is None else colors[weighting]
         values = 100 * np.array([each.error for each in errors])

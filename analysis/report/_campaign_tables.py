@@ -28,11 +28,11 @@ from rigd.session.user_metadata import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
-    from analysis.campaigns import CampaignResult, SessionResult
+    from analysis.campaigns import CampaignResult, SessionAnalysis
 
 
 def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Tables of the whole records that terminal and page show, what matters most first."""
+    """Return the tables of the whole records for terminal and page, the most important first."""
     found = campaign.homogeneity
     estimates = likely_estimates(campaign)
     scatter = [homogeneity_table(campaign)] if found.quantities else []
@@ -50,7 +50,7 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
-    """Tables that the terminal shows unasked: pooled modes and parameters."""
+    """Return the tables that the terminal shows by default: pooled modes and parameters."""
     return headline_tables(campaign) if campaign.headline else ()
 
 
@@ -65,7 +65,7 @@ def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
-    """Every table of the files by its name, without those that are empty."""
+    """Return every table of the files by its name, without empty ones."""
     made = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
@@ -84,9 +84,9 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
-    """All files, those that were left out behind the others."""
+    """Return the table of all files, excluded ones last."""
 
-    def said(text: str) -> Cell:
+    def text_cell(text: str) -> Cell:
         return Cell(text, text or ABSENT)
 
     headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
@@ -107,10 +107,10 @@ def session_list_table(campaign: CampaignResult) -> Table:
         (
             (
                 Cell(str(each.path), each.name),
-                said(its.start_utc if its else ""),
-                said(its.label if its else ""),
-                said(its.operator if its else ""),
-                said(its.note if its else ""),
+                text_cell(its.start_utc if its else ""),
+                text_cell(its.label if its else ""),
+                text_cell(its.operator if its else ""),
+                text_cell(its.note if its else ""),
                 *(_added_cell(its.added.get(name) if its else None) for name in added),
                 used,
             )
@@ -144,9 +144,9 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
             **fit.parameters,
             "cost": fit.cost,
             "at_bounds": " ".join(fit.at_bounds),
-            **{f"nominal_{name}": value for name, value in asdict(model.indices[place]).items()},
+            **{f"nominal_{name}": value for name, value in asdict(model.indices[index]).items()},
         }
-        for place, session in enumerate(campaign.sessions)
+        for index, session in enumerate(campaign.sessions)
         for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
     return _for_programs("sessions_welch", rows)
@@ -175,7 +175,7 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
 
 
 def _std_key(parameter: str) -> str:
-    """Name the standard deviation of a parameter, whose unit stands last: ``delay_std_s``."""
+    """Return the name of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
     unit = suffix_of(parameter)
     return f"{parameter.removesuffix(unit)}_std{unit}"
 
@@ -186,7 +186,7 @@ def _for_programs(name: str, rows: list[dict[str, Any]]) -> Table:
 
 
 def validation_table(campaign: CampaignResult) -> Table:
-    """Errors of each session predicted from the others, then the trials that were lost."""
+    """Return the errors of each session predicted from the others, then the lost trials."""
     rows: list[dict[str, Any]] = [
         {
             "file": str(each.path),
@@ -242,10 +242,10 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Every session with its own verdict, then those left out."""
+    """Return the table of sessions with their own verdicts, then those left out."""
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()
-    group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
+    group_of = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
     tried = {
         each.path: each
@@ -253,7 +253,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         if (each.method, each.name) == ("record", name)
     }
 
-    def row(session: SessionResult) -> tuple[Entry, ...]:
+    def row(session: SessionAnalysis) -> tuple[Entry, ...]:
         verdict, trial = session.verdict, tried.get(session.path)
         own = trial.own_error if trial else None
         found = [each.kind for each in verdict.findings] if verdict else []

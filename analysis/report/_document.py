@@ -1,10 +1,10 @@
-"""The results as one JSON document, without NaN: what is not known is null.
+"""The results as one JSON document, without NaN: unknown values are null.
 
 The paper's indices, Eqs. (28) to (30), of any fit against either measured response.
 
 A fit on the whole record was never made to suit Welch's estimate, and the truth does not suit it
-either: that estimate is biased at the resonances. So each fit is held against the whole record's
-ratio of transforms too, which is noisy but not biased.
+either: that estimate is biased at the resonances. So each fit is also compared with the whole
+record's ratio of transforms, which is noisy but not biased.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     IndexValues = dict[str, float | None]
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
-"""Indices of a fit without a measured response beside it."""
+"""Indices of a fit without a measured response to compare with."""
 
 
 def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexValues, IndexValues]:
@@ -60,7 +60,7 @@ def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexVa
         bins of the paper's fits, and against the empirical transfer function estimate.
     """
     record = welch.record
-    # Of the responses the delay that the file states has been taken out.
+    # The delay stated in the file has been removed from the responses.
     stated_s = record.torque_delay_s - record.angle_delay_s
     plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_s)
 
@@ -372,7 +372,7 @@ def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str])
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
         "withheld": sorted(unreported(fit.structure, withheld)),
-        # What a structure fixes is not known exactly: it was not asked for.
+        # Fixed parameters have no standard deviation: they were not estimated.
         "std": None
         if fit.std is None
         else {name: std if name in fit.structure.free else None for name, std in fit.std.items()},
@@ -384,7 +384,7 @@ def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str])
 
 
 def _modes(analysis: WelchAnalysis, model: FittedModel) -> list[dict[str, Any]]:
-    """Modes from the poles, each beside the peak it makes and that peak's deviation."""
+    """Return the modes from the poles, each with its peak and that peak's deviation."""
     found = []
     for number, (peak, deviation) in enumerate(
         zip(model.peaks, model.deviations, strict=True), start=1

@@ -104,7 +104,7 @@ def _elastic(structure: Structure) -> Formula | None:
 
 def _inertial(structure: Structure) -> Formula:
     ratio = _over(_name("ρ", r"\rho"), _EI)
-    # As large as if it stood alone: it is in a fraction itself.
+    # In display size although it is inside a fraction.
     large = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
     inertia = Formula(large, ratio.tex.replace("frac", "dfrac")) + _power(_S, _TWO)
     if not structure.external:
@@ -194,7 +194,7 @@ _EXTRAS: Final = {
 
 
 def definitions(whole: WholeRecord) -> str:
-    """Say what the letters of the equations are that no table has."""
+    """Define the symbols of the equations that no table has."""
     parts = [
         "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
@@ -211,12 +211,12 @@ def definitions(whole: WholeRecord) -> str:
 
 
 def types_table(whole: WholeRecord) -> Table:
-    """Say what damping each type has: the terms, and how many parameters that is."""
+    """Return the table of damping types: terms, and number of parameters."""
     words = {False: "fractional", True: "integer"}
 
     def rows() -> Iterator[tuple[str, str, str, str]]:
         for structure in STRUCTURES.values():
-            told, terms = [], []
+            described, terms = [], []
             for present, what, coefficient, order, symbol in (
                 (structure.internal, "internal", "ζ", "alpha", "α"),
                 (structure.external, "external", "γ", "lambda", "λ"),
@@ -226,8 +226,8 @@ def types_table(whole: WholeRecord) -> Table:
                     f"{coefficient} s{'' if integer else '^' + symbol}" if present else ABSENT
                 )
                 if present:
-                    told.append(f"{what} of {words[integer]} order")
-            yield structure.name, terms[0], terms[1], ", ".join(told)
+                    described.append(f"{what} of {words[integer]} order")
+            yield structure.name, terms[0], terms[1], ", ".join(described)
 
     return Table.of(
         "types",

@@ -38,7 +38,7 @@ _ON_THE_EDGE: Final = "* at the limit of the search range: not determined by the
 
 
 def structures_table(whole: WholeRecord) -> Table:
-    """All fits beside each other; orders that the data do not support are marked in each."""
+    """Return the comparison of all fits; orders that the data do not support are marked."""
     lowest = min(fit.cost for fit in whole.fits.values())
     withheld = whole.unsupported
     delta_bic = whole.delta_bic
@@ -101,7 +101,7 @@ def _marked_row(whole: WholeRecord) -> str:
 
 
 def _left_out(cell: Cell) -> Cell:
-    """Keep a number for programs only."""
+    """Return a cell that shows a number to programs only."""
     return cell if cell.value is None else replace(cell, text=ABSENT, doubtful=True)
 
 
@@ -124,7 +124,7 @@ def _damping_cells(
     withheld: Collection[str] = (),
     at_bounds: Collection[str] = (),
 ) -> list[Cell]:
-    """Fill these columns: what is fixed has no standard deviation, what is absent has a dash."""
+    """Fill these columns: fixed values have no standard deviation, absent ones a dash."""
     doubtful = unreported(structure, withheld)
     shown: list[Cell] = []
     for name in _DAMPING:
@@ -249,7 +249,7 @@ def _names(model: FittedModel) -> tuple[str, str]:
 
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
-    """Measured resonant peaks, and by how much those of each model lie off them."""
+    """Return the measured resonant peaks, and the deviations of each model's peaks."""
     modes = range(1, len(analysis.peaks) + 1)
     measured = (
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
@@ -286,7 +286,7 @@ _LEFT: Final = "‡"
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     """Frequencies and damping ratios of the modes from each model's poles; None without any.
 
-    What is not the antenna's is marked, or left out.
+    Modes that are not the antenna's are marked, or left out.
     """
     models = analysis.models
     modes = max((len(model.modes) for model in models), default=0)

@@ -116,19 +116,21 @@ def _panel(
         )
         for model in models
     )  # fmt: skip
-    for label, frequency_hz, response, look in curves:
+    for label, frequency_hz, response, line_style in curves:
         known = np.isfinite(response) & (response != 0)
         at_hz, values = frequency_hz[known], response[known]
         (handles[label],) = magnitude.plot(
-            *style.envelope(at_hz, magnitude_db(values), _COLUMNS, logarithmic=True), **look
+            *style.envelope(at_hz, magnitude_db(values), _COLUMNS, logarithmic=True), **line_style
         )
         if label.startswith("measured"):
             # Dots: a line would run up and down wherever noise wraps the phase.
             few = style.spread(at_hz, 2 * _COLUMNS)
-            style.dots(phase, at_hz[few], phase_deg(values[few]), size_pt=1.8, color=look["color"])
+            style.dots(
+                phase, at_hz[few], phase_deg(values[few]), size_pt=1.8, color=line_style["color"]
+            )
         else:
             phase.plot(
-                *style.envelope(at_hz, phase_deg(values), _COLUMNS, logarithmic=True), **look
+                *style.envelope(at_hz, phase_deg(values), _COLUMNS, logarithmic=True), **line_style
             )
     for peak in analysis.peaks:
         if peak is not None:

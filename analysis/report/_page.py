@@ -35,7 +35,7 @@ def _environment() -> jinja2.Environment:
 
 
 def versions(made_at: datetime) -> Facts:
-    """When the report was made, and by what."""
+    """Return date and program versions of the report."""
     return (
         "Versions",
         [

@@ -86,7 +86,7 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 "parameter": Cell(
                     each.parameter, f"{symbol} *{each.at_bounds}" if each.at_bounds else symbol
                 ),
-                **_beside(shown, theirs, ".4g", factor),
+                **_with_papers(shown, theirs, ".4g", factor),
                 "at_bounds": each.at_bounds,
                 **_papers(theirs),
                 "mixture": campaign.homogeneity.mixed,
@@ -147,7 +147,7 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                 "quantity": Cell(quantity, _PEAKS[quantity].format(mode)),
                 "mode": mode,
                 "weighting": weighting,
-                **_beside(shown, theirs, ".3f"),
+                **_with_papers(shown, theirs, ".3f"),
                 **_papers(theirs),
                 "mixture": campaign.homogeneity.mixed,
             }
@@ -183,8 +183,8 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         (each.structure, each.weighting, each.parameter): each.std for each in campaign.statistics
     }
     for model in best_models(campaign.nominal):
-        told_wmse = papers_wmse().get((model.structure, model.weighting))
-        theirs = {"wmse": told_wmse} if with_paper else {}
+        paper_wmse = papers_wmse().get((model.structure, model.weighting))
+        theirs = {"wmse": paper_wmse} if with_paper else {}
         rows.append(
             {
                 "type": model.structure,
@@ -195,7 +195,7 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                     )[0]
                     for name, value in model.parameters.items()
                 },
-                **_beside({"wmse": number(model.mean_wmse)}, theirs, ".3f"),
+                **_with_papers({"wmse": number(model.mean_wmse)}, theirs, ".3f"),
                 **{
                     name: value
                     for each in model.deviations
@@ -306,13 +306,13 @@ def bias_table(campaign: CampaignResult) -> Table:
     )  # fmt: skip
 
 
-def _beside(
+def _with_papers(
     shown: Mapping[str, Cell], theirs: Mapping[str, float | None], form: str, factor: float = 1.0
 ) -> dict[str, Entry]:
     """Add the paper's numbers that there are, in parentheses."""
-    told = {name: number(value, form, factor) for name, value in theirs.items()}
+    papers = {name: number(value, form, factor) for name, value in theirs.items()}
     return {
-        name: replace(cell, text=f"{cell.text} ({told[name].text})")
+        name: replace(cell, text=f"{cell.text} ({papers[name].text})")
         if theirs.get(name) is not None
         else cell
         for name, cell in shown.items()

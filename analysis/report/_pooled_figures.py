@@ -33,7 +33,7 @@ _FREEST: Final = "VI"
 
 _POINTS: Final = 400
 _COLUMNS: Final = 1500
-_BESIDE: Final = 1.6
+_MARGIN: Final = 1.6
 """Ratio of the axis's ends to the outermost modes."""
 
 
@@ -116,7 +116,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
         _pooled_mode(axes, mode, sessions)
         _enlarged(figure.add_subplot(grid[1, column]), mode, own, sessions)
     figure.axes[1].set_ylabel("Damping ratio (%)")
-    style.frequency_axis(axes, (modes[0].frequency_hz / _BESIDE, modes[-1].frequency_hz * _BESIDE))
+    style.frequency_axis(axes, (modes[0].frequency_hz / _MARGIN, modes[-1].frequency_hz * _MARGIN))
     axes.set_ylim(bottom=0.0)
     axes.margins(y=0.1)
     axes.set_ylabel("Damping ratio (%)")

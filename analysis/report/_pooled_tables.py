@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import campaign_numbers, in_dispute, told
+from analysis.campaigns import campaign_numbers, fact_text, in_dispute
 from analysis.campaigns.sentences import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
@@ -353,7 +353,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
         ),
         tuple(
             {
-                **{key: Cell(value, told(key, value)) for key, value in each.facts.items()},
+                **{key: Cell(value, fact_text(key, value)) for key, value in each.facts.items()},
                 "files": len(each.files),
                 "here": each is specimens[0],
                 "names": Cell(" ".join(each.files), ", ".join(each.files)),

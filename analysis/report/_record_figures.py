@@ -2,13 +2,12 @@
 
 Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
 
-The parameters of a fractional damping are correlated and hard to compare; what they make together
-at one frequency is neither.
+The parameters of a fractional damping are correlated and hard to compare; their combined effect at
+one frequency is neither.
 
-What a fit leaves of the torque: its spectrum, whether it is white, and when it is large.
-
-A model that is right leaves noise. What is left at a resonance, or while the sweep passes one, is
-what the model lacks.
+Residual of the torque: its spectrum, whether it is white, and when it is large. A correct model
+leaves noise. A residual at a resonance, or while the sweep passes one, shows a deficiency of the
+model.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 _LABEL_IN: Final = 0.15
 """Height of a label with the space that it needs."""
 _LABELS_CLOSE: Final = 1 / math.log10(2.0)
-"""Labels for which a decade must have room if 1, 2 and 5 are to stand apart in it."""
+"""Labels for which a decade must have room to be labelled at 1, 2 and 5."""
 
 
 def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
@@ -160,22 +159,22 @@ def _magnitude(
 
 
 def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
-    """Choose what is shown of a mode: so much that a bin of a short record lies inside, too."""
+    """Return the range shown of a mode, at least one bin of a short record."""
     spacing_hz = float(np.diff(frequency_hz).max())
-    share = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
-    half_hz = max(share * mode.frequency_hz, spacing_hz)
+    relative_width = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
 
 
 _LOSS_POINTS: Final = 400
-_LOOKS: Final = {
+_CURVE_STYLES: Final = {
     "internal (material)": (style.VERMILION, (0, (4, 2))),
     "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
     "total": (style.BLUE, "-"),
 }
 _SPAN: Final = 300.0
-"""Largest ratio of the axis's ends: what is smaller yet does not matter beside the total."""
+"""Largest ratio of the axis's ends: still smaller values do not matter for the total."""
 
 
 def loss_figure(
@@ -251,14 +250,16 @@ def _curves(
     if first_hz >= last_hz:
         return []
     factors = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
-    curves = dict(zip(_LOOKS, (factors.internal, factors.external, factors.total), strict=True))
+    curves = dict(
+        zip(_CURVE_STYLES, (factors.internal, factors.external, factors.total), strict=True)
+    )
     both = None not in curves.values()
     drawn = []
     for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
-        # Parts of which one is not known are not told apart; alone, a part is the total.
+        # If one part is unknown, the parts are not distinguished; alone, a part is the total.
         if factor is None or (order is not None and (not both or withheld)):
             continue
-        color, dash = _LOOKS[label]
+        color, dash = _CURVE_STYLES[label]
         axes.fill_between(
             factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
         )
@@ -343,12 +344,12 @@ def _spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def _cumulative(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     counted = analysis.compared
     power = np.abs(model.residual[counted]) ** 2
-    share = np.cumsum(power) / power.sum()
+    cumulative = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[counted]
     half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
     axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
-    difference = 100 * (share - uniform)
+    difference = 100 * (cumulative - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
@@ -381,15 +382,15 @@ def _in_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
 def residual_power(
     analysis: RecordAnalysis, residual: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power of the whitened residual in stretches of the record, 1 if chance is all that remains.
+    """Return the power of the whitened residual in intervals of the record, 1 for pure noise.
 
     The residual's spectrum in the band, transformed back, is the complex envelope of the whitened
     residual; K bins give K independent values over the record.
 
     Returns
     -------
-    times_s, power : ndarray, shape (stretches,)
-        Middles of the stretches from the first sample compared on, and mean power in them.
+    times_s, power : ndarray, shape (intervals,)
+        Middles of the intervals from the first sample compared on, and mean power in them.
     """
     spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bins = residual.size
@@ -405,7 +406,7 @@ def residual_power(
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """A figure, the name of its files, and what is seen in it."""
+    """A figure, the name of its files, and its description."""
 
     name: str
     figure: Figure
@@ -420,8 +421,8 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     """Draw the figures one after the other; within `style.styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    highest_hz, told = whole.band_hz[1], whole.headline
-    model = ShownModel.of(told, whole.record)
+    highest_hz, headline = whole.band_hz[1], whole.headline
+    model = ShownModel.of(headline, whole.record)
     analysis = model.compared(whole.analysis)
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss, residual, signals = FIGURES
@@ -435,11 +436,11 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
         f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
         "the line where it is not seen.",
     )
-    test = told.uniform_beam
+    test = headline.uniform_beam
     if test is not None and test.p_value is not None:
         yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
     beam = loss_estimate(whole)
-    doubtful = [mode.number for mode in told.modes if mode.damping_ratio.flag is not None]
+    doubtful = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss,
         loss_figure(
@@ -504,10 +505,10 @@ def _curve(whole: WholeRecord) -> str:
     return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
 
 
-def _reasons(told: Headline) -> str:
-    """Say why points are hollow."""
+def _reasons(headline: Headline) -> str:
+    """Describe why points are hollow."""
     reasons = dict.fromkeys(
-        mode.damping_ratio.flag for mode in told.modes if mode.shown and mode.damping_ratio.flag
+        mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
     return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
 

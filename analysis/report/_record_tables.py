@@ -40,10 +40,10 @@ _MARKED: Final = (
 
 def modes_table(whole: WholeRecord) -> Table:
     """Frequencies, damping ratios and effective inertias; those that are doubtful are marked."""
-    told = whole.headline
-    known = any(mode.participation is not None for mode in told.modes)
+    headline = whole.headline
+    known = any(mode.participation is not None for mode in headline.modes)
     rows: list[tuple[Entry, ...]] = []
-    for mode in told.modes:
+    for mode in headline.modes:
         cells = *_mode_cells(mode), *_inertia(mode.participation)
         if mode.damping_ratio.flag is None:
             rows.append((mode.number, *cells, mode.source))
@@ -51,7 +51,7 @@ def modes_table(whole: WholeRecord) -> Table:
             rows.append((marked(count(mode.number)), *map(greyed, cells), mode.source))
     return Table.of(
         "modes",
-        f"Modes with locked hub (clamped–free): {_modes_source(told)}",
+        f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
         (
             *_MODE,
             Column("Inertia (kg·mm²)" if known else "", "participation_kg_m2"),
@@ -63,15 +63,15 @@ def modes_table(whole: WholeRecord) -> Table:
             "Intervals are statistical only; no torque scale, length or density acts on "
             "frequencies and damping ratios.",
             *_modal_notes(whole),
-            *_reasons(mode.damping_ratio for mode in told.modes),
+            *_reasons(mode.damping_ratio for mode in headline.modes),
         ),
     )
 
 
 def exact_modes_table(whole: WholeRecord) -> Table | None:
     """Modes of a uniform beam that predicts the modal constants; None without one."""
-    told = whole.headline
-    test, exact = told.uniform_beam, told.exact
+    headline = whole.headline
+    test, exact = headline.uniform_beam, headline.exact
     if test is None or exact is None or test.status != "passed":
         return None
     modes = [mode for mode in exact.modes if mode.shown and mode.damping_ratio.flag is None]
@@ -99,26 +99,30 @@ _MODE: Final = (
 
 def _mode_cells(mode: Mode) -> tuple[Cell, ...]:
     """Fill the columns of `_MODE` but for the number."""
-    return *_told(mode.frequency_hz)[:2], *_told(mode.damping_ratio, 100.0)
+    return *_quantity_cells(mode.frequency_hz)[:2], *_quantity_cells(mode.damping_ratio, 100.0)
 
 
 _SQUARE_MM: Final = 1e6
 
 
-def _modes_source(told: Headline) -> str:
+def _modes_source(headline: Headline) -> str:
     """Name the model that the modes of a headline are of."""
-    return "modal model" if any(m.source == "modal" for m in told.modes) else f"type {told.name}"
+    return (
+        "modal model"
+        if any(m.source == "modal" for m in headline.modes)
+        else f"type {headline.name}"
+    )
 
 
 def _inertia(participation: Quantity | None) -> tuple[Cell, Cell]:
     if participation is None:
         return number(None), number(None)
-    value, std, *_ = _told(participation, _SQUARE_MM)
+    value, std, *_ = _quantity_cells(participation, _SQUARE_MM)
     return value, std
 
 
 def _modal_notes(whole: WholeRecord) -> Iterator[str]:
-    """Say how well the modal model fits, and which of its resonances are not the beam's."""
+    """Describe the fit of the modal model, and its resonances that are not the beam's."""
     modal = whole.headline.modal
     if modal is None:
         return
@@ -143,10 +147,10 @@ def _modal_notes(whole: WholeRecord) -> Iterator[str]:
 def parameters_table(whole: WholeRecord) -> Table:
     """All parameters with their uncertainty; those with a flag are marked, with the reason.
 
-    Where the file states how well the scales are known, the intervals that include them stand
-    beside the statistical ones.
+    Where the file states how well the scales are known, the intervals that include them are shown
+    with the statistical ones.
     """
-    told = whole.headline
+    headline = whole.headline
     combined = whole.combined
     including_scales = (
         Column("", "combined_std"),
@@ -154,17 +158,17 @@ def parameters_table(whole: WholeRecord) -> Table:
         Column("to", "combined_high_95"),
     )
     fit = ""
-    if told.tolerant is None:
-        fit = f" Fit {whole.analysis.fit_percent(told.fit):.2f} % (NRMSE)."
+    if headline.tolerant is None:
+        fit = f" Fit {whole.analysis.fit_percent(headline.fit):.2f} % (NRMSE)."
     return Table.of(
         "parameters",
-        f"Parameters{_condition(told)}",
+        f"Parameters{_condition(headline)}",
         (*_PARAMETER, *(including_scales if combined else ()), _REMARK),
         (
-            _parameter_row(name, told.parameters[name], combined, fixed=_fixed(told, name))
-            for name in parameter_names(told)
+            _parameter_row(name, headline.parameters[name], combined, fixed=_fixed(headline, name))
+            for name in parameter_names(headline)
         ),
-        (f"{_STD}{fit}", *scale_notes(whole), *((_MARKED,) if told.flags else ())),
+        (f"{_STD}{fit}", *scale_notes(whole), *((_MARKED,) if headline.flags else ())),
     )
 
 
@@ -184,19 +188,19 @@ _STD: Final = (
 )
 
 
-def parameter_names(told: Headline) -> tuple[str, ...]:
+def parameter_names(headline: Headline) -> tuple[str, ...]:
     """Return the names of a headline's parameters: damping, beam, rig."""
-    first = () if told.exact is None else told.exact.parameters
-    return tuple(dict.fromkeys((*(name for name in first if name in told.parameters),
-                                *told.parameters)))  # fmt: skip
+    first = () if headline.exact is None else headline.exact.parameters
+    return tuple(dict.fromkeys((*(name for name in first if name in headline.parameters),
+                                *headline.parameters)))  # fmt: skip
 
 
-def _condition(told: Headline) -> str:
-    """Say on which condition parameters are what a table has."""
-    found = told.tolerant
+def _condition(headline: Headline) -> str:
+    """Describe the condition under which the parameters of a table hold."""
+    found = headline.tolerant
     if found is None:
-        exact = "" if told.modal is None else f", {EXACT_CONDITION}"
-        return f", type {told.name}{exact}"
+        exact = "" if headline.modal is None else f", {EXACT_CONDITION}"
+        return f", type {headline.name}{exact}"
     if found.basis == "geometry":
         percent = 100 * found.uniformity
         return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
@@ -227,16 +231,16 @@ def exact_geometry_table(whole: WholeRecord) -> Table | None:
     )
 
 
-def _fixed(told: Headline, name: str, *, exact: bool = False) -> bool:
+def _fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
     """Whether a parameter was held at a value in the fit that it is of."""
-    if told.tolerant is not None and not exact and name in told.tolerant.values:
+    if headline.tolerant is not None and not exact and name in headline.tolerant.values:
         return False
-    return name not in told.fit.interval and name != "drag"
+    return name not in headline.fit.interval and name != "drag"
 
 
 def sizes_table(whole: WholeRecord) -> Table:
     """Loss factors of either damping where they are uncorrelated with its order."""
-    told = whole.headline
+    headline = whole.headline
     return Table.of(
         "damping_sizes",
         "Loss factor of either damping at its pivot frequency",
@@ -250,26 +254,26 @@ def sizes_table(whole: WholeRecord) -> Table:
             Column("95 % from", "low_95"),
             Column("to", "high_95"),
         ),
-        (_size_row(told, each) for each in told.sizes),
+        (_size_row(headline, each) for each in headline.sizes),
         (
             "Coefficient and order are strongly correlated; a loss factor is known far better than "
             "either.",
-            *_reasons(each.size for each in told.sizes),
+            *_reasons(each.size for each in headline.sizes),
         ),
     )
 
 
 def condition_table(whole: WholeRecord) -> Table | None:
-    """Set what a simpler structure would give beside what is told; None if none would do."""
-    told: Numbers = whole.headline.exact or whole.headline
-    simpler = told.simpler
+    """Compare the reported values with those of a simpler structure; None if none suffices."""
+    headline: Numbers = whole.headline.exact or whole.headline
+    simpler = headline.simpler
     if simpler is None:
         return None
     taken = " and ".join(f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items())
     rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
-        free = told.parameters.get(name)
+        free = headline.parameters.get(name)
         rows.append(
             (
                 Cell(name, symbol),
@@ -353,15 +357,15 @@ def _unit_cell(shown: str) -> Cell:
     return Cell(_SI.get(shown, unit if power.startswith("1e") else shown), shown)
 
 
-def _size_row(told: Headline, each: Size) -> tuple[Entry, ...]:
+def _size_row(headline: Headline, each: Size) -> tuple[Entry, ...]:
     size, internal = each.size, each.damping == "internal"
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
     if each.omega_rad_s is None:
         # Without its frequency a size is the coefficient for an order that was only assumed.
-        flag = flag or told.parameters["zeta" if internal else "gamma"].flag
+        flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
-    value, std, low, high = _told(size)
+    value, std, low, high = _quantity_cells(size)
     relative = number(None if size.std is None else size.std / size.value, "#.2g", 100.0)
     others: tuple[Cell, ...] = (std, relative, low, high)
     if flag is not None:
@@ -369,8 +373,8 @@ def _size_row(told: Headline, each: Size) -> tuple[Entry, ...]:
     return (each.damping, symbol, each.omega_rad_s, value, *others)
 
 
-def _told(each: Quantity, factor: float = 1.0) -> tuple[Cell, ...]:
-    """Show a quantity, its standard deviation and the ends of its interval."""
+def _quantity_cells(each: Quantity, factor: float = 1.0) -> tuple[Cell, ...]:
+    """Return the cells of a quantity, its standard deviation and the ends of its interval."""
     return estimate((each.value, each.std, *_ends(each)), each.std, factor)
 
 
@@ -379,7 +383,7 @@ def _ends(quantity: Quantity) -> tuple[float | None, float | None]:
 
 
 def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
-    """Say once what each mark means."""
+    """List the meaning of each mark once."""
     reasons = dict.fromkeys(each.flag for each in quantities if each.flag is not None)
     return tuple(f"{MARK} {reason}." for reason in reasons)
 
@@ -403,7 +407,7 @@ def _correlation(own: bool, value: float) -> Cell:
 
 
 def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
-    """Damping ratios of free vibration by amplitude, if the record tells; else no table."""
+    """Return the damping ratios of free vibration by amplitude; no table without them."""
     found = whole.verdict.damping_with_amplitude
     if not found:
         return ()

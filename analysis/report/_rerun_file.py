@@ -77,24 +77,24 @@ _MOST_IN_WORDS: Final = 2
 _SCALARS: Final = "Scalars:scalars"
 """Rerun's name of the values of a plot."""
 _GROUPS: Final = 400
-"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
+"""Groups of points along the axis, two drawn per group: enough for the pixels of a view."""
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class ChartCurve:
     """A curve of a chart.
 
     Attributes
     ----------
     name
-        Where Rerun keeps it, under the chart.
+        Its entity in Rerun, under the chart.
     key
-        How it looks.
+        Its style.
     values
         Shape (n,), at the frequencies that were fitted.
     dotted
-        Whether the values stand for themselves: a line would run up and down wherever noise takes
-        a phase from one end of its axis to the other.
+        Whether the values are drawn as points: a line would run up and down wherever noise takes a
+        phase from one end of its axis to the other.
     """
 
     name: str
@@ -109,11 +109,11 @@ class Graph:
 
     title: str
     chart: Chart
-    curves: tuple[Curve, ...]
+    curves: tuple[ChartCurve, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class ChartPage:
     """Charts that are seen together: a wide one over two narrow ones.
 
     Attributes
@@ -137,22 +137,26 @@ class Page:
 # Welch fits
 
 
-def pages(analysis: WelchAnalysis) -> tuple[Page, ...]:
+def pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
     """Return the measured response with its coherence, and each model type with its residuals."""
     magnitude = _magnitude_axis(analysis)
-    looks = line_keys(analysis.settings.weightings)
+    keys_by_weighting = line_keys(analysis.settings.weightings)
     return (
         _measured_page(analysis, magnitude),
-        *(_type_page(analysis, name, magnitude, looks) for name in analysis.settings.types),
+        *(
+            _type_page(analysis, name, magnitude, keys_by_weighting)
+            for name in analysis.settings.types
+        ),
     )
 
 
 def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
     """Return how the models of each weighting are drawn."""
     others = cycle(_MORE_LINES)
-    looks = {name: _LINES.get(name) or next(others) for name in weightings}
+    keys_by_weighting = {name: _LINES.get(name) or next(others) for name in weightings}
     return {
-        name: Key(f"model, weights {name}", color, width) for name, (color, width) in looks.items()
+        name: Key(f"model, weights {name}", color, width)
+        for name, (color, width) in keys_by_weighting.items()
     }
 
 
@@ -166,7 +170,7 @@ def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     tables
         The same in numbers, as plain text.
     stream
-        Takes the drawings.
+        Receives the drawings.
     """
     for page in pages(analysis):
         _draw_page(page, stream)
@@ -181,7 +185,7 @@ def tab(analysis: WelchAnalysis) -> rrb.Container:
     return rrb.Tabs(*map(_page_view, pages(analysis)), tables, name=TITLE)
 
 
-def _draw_page(page: Page, stream: RecordingStream) -> None:
+def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
     thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _GROUPS)
     for graph in page.graphs:
         graph.chart.draw_frame(stream)
@@ -199,7 +203,7 @@ def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
     stream.log(entity, document, static=True)
 
 
-def _page_view(page: Page) -> rrb.Container:
+def _page_view(page: ChartPage) -> rrb.Container:
     def view(graph: Graph) -> rrb.Spatial2DView:
         chart = graph.chart
         return chart_view(graph.title, chart.entity, (chart.width, chart.height))
@@ -207,31 +211,31 @@ def _page_view(page: Page) -> rrb.Container:
     return chart_page(*map(view, page.graphs), name=page.title)
 
 
-def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
+def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
     entity = f"{FITS}/measured"
-    return Page(
+    return ChartPage(
         MEASURED_PAGE,
         (
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
                 response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY),
-                (Curve("measured", MEASURED_KEY, magnitude_db(response.response)),),
+                (ChartCurve("measured", MEASURED_KEY, magnitude_db(response.response)),),
             ),
             Graph(
                 "Phase of torque over angle",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY),
-                (Curve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
+                (ChartCurve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
             ),
             Graph(
                 "Coherence of angle and torque",
                 response_chart(
                     f"{entity}/coherence", _HALF, band_hz, COHERENCE_AXIS, COHERENCE_KEY
                 ),
-                (Curve("coherence", COHERENCE_KEY, coherence),),
+                (ChartCurve("coherence", COHERENCE_KEY, coherence),),
             ),
         ),
         response.frequency_hz,
@@ -239,9 +243,11 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
     )
 
 
-def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[str, Key]) -> Page:
+def _type_page(
+    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, Key]
+) -> ChartPage:
     models = [model for model in analysis.models if model.fit.structure.name == name]
-    keys = [looks[model.fit.weighting] for model in models]
+    keys = [keys_by_weighting[model.fit.weighting] for model in models]
     # Shorter on the narrow charts: in full they would run into the title of the axis.
     form = "weights {}" if len(models) <= _MOST_IN_WORDS else "{}"
     short = [
@@ -251,9 +257,9 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
     measured, band_hz = analysis.response.response, analysis.settings.band_hz
     entity = f"{FITS}/type_{name}"
 
-    def of_models(values: Callable[[FittedModel], Real]) -> list[Curve]:
+    def of_models(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
-            Curve(_plain(model.fit.weighting), key, values(model))
+            ChartCurve(_plain(model.fit.weighting), key, values(model))
             for key, model in zip(keys, models, strict=True)
         ]
 
@@ -261,7 +267,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
         f"{model.fit.weighting}: MSE {model.indices.mse:.3g}, WMSE {model.indices.wmse:.3g}"
         for model in models
     )
-    return Page(
+    return ChartPage(
         f"Type {name}",
         (
             Graph(
@@ -270,7 +276,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                     f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, *keys
                 ),
                 (
-                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
                     *of_models(lambda model: magnitude_db(model.response)),
                 ),
             ),
@@ -278,7 +284,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                 "Phase",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, *short),
                 (
-                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
                     *of_models(lambda model: phase_deg(model.response)),
                 ),
             ),
@@ -286,7 +292,7 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                 "Residual, measured − model",
                 response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, *short),
                 (
-                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
+                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
                     *of_models(lambda model: magnitude_db(measured - model.response)),
                 ),
             ),
@@ -331,13 +337,13 @@ class Lines:
     Attributes
     ----------
     entity
-        Where Rerun keeps them.
+        Their entity in Rerun.
     title
         Title of the view, with the unit.
     names, colors, widths
-        Look of each line, from the lowest to the topmost.
+        Style of each line, from the lowest to the topmost.
     values
-        Makes of the torque the lines' values (n, lines).
+        Computes the lines' values (n, lines) from the torque.
     """
 
     entity: str
@@ -368,7 +374,7 @@ _OVER_TIME: Final = (
 )
 
 
-def record_page(whole: WholeRecord) -> Page:
+def record_page(whole: WholeRecord) -> ChartPage:
     """Return response and residual of the fit that the numbers are of.
 
     Measured is the ratio of the whole record's transforms, without the model's delay.
@@ -384,31 +390,31 @@ def record_page(whole: WholeRecord) -> Page:
     key, name = Key(shown.name.removeprefix("the "), ORANGE, 2.0), "model"
     short = replace(key, label="model")
     entity = f"{RECORD}/response"
-    return Page(
+    return ChartPage(
         "Response",
         (
             Graph(
                 f"Magnitude of torque over angle, whole record, {shown.name.removeprefix('the ')}",
                 response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, key),
                 (
-                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
-                    Curve(name, key, magnitude_db(model)),
+                    ChartCurve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    ChartCurve(name, key, magnitude_db(model)),
                 ),
             ),
             Graph(
                 "Phase",
                 response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, short),
                 (
-                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
-                    Curve(name, key, phase_deg(model)),
+                    ChartCurve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    ChartCurve(name, key, phase_deg(model)),
                 ),
             ),
             Graph(
                 "Residual, measured − model",
                 response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, short),
                 (
-                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
-                    Curve(name, key, magnitude_db(measured - model)),
+                    ChartCurve("measured", _SIZE_DB, magnitude_db(measured)),
+                    ChartCurve(name, key, magnitude_db(measured - model)),
                 ),
             ),
         ),
@@ -420,7 +426,7 @@ def record_page(whole: WholeRecord) -> Page:
 def draw_record(
     whole: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
 ) -> None:
-    """Draw what the whole record gave: verdict, response, and torque over time.
+    """Draw the results of the whole record: verdict, response, and torque over time.
 
     Parameters
     ----------
@@ -431,14 +437,14 @@ def draw_record(
     tables
         Its tables, as plain text.
     stream
-        Takes the drawings.
+        Receives the drawings.
     """
-    said = [
+    sentences = [
         *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
         *whole.verdict.sentences,
         *(f"* {advice}" for advice in whole.verdict.experiments),
     ]
-    _draw_text(VERDICT, "\n\n".join((*said, f"```\n{tables}\n```")), stream)
+    _draw_text(VERDICT, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
     _draw_page(record_page(whole), stream)
     t_ns = np.round(1e9 * whole.record.time_s).astype(np.int64)
     for lines in _OVER_TIME:
@@ -465,13 +471,13 @@ def record_tab(whole: WholeRecord, torque: TorqueInBand) -> rrb.Container:
 
 
 def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesView:
-    """Return a view of the whole session, wherever its time stands."""
+    """Return a view of the whole session, independent of the current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
     start = rrb.TimeRangeBoundary.absolute(seconds=0.0)
     end = rrb.TimeRangeBoundary.absolute(seconds=end_s)
-    look = rr.SeriesLines(
+    series_style = rr.SeriesLines(
         names=lines.names,
         colors=lines.colors,
         widths=lines.widths,
@@ -481,7 +487,7 @@ def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesVie
     return rrb.TimeSeriesView(
         name=lines.title,
         origin=lines.entity,
-        overrides={lines.entity: look},
+        overrides={lines.entity: series_style},
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=rrb.ScalarAxis(range=_span(largest)),
@@ -511,7 +517,7 @@ def check_rerun_file(path: Path) -> None:
 
 
 def write_rerun_file(result: RecordResult, path: Path) -> None:
-    """Write the session in the layout of the live view, and in front of it what was found in it.
+    """Write the session in the layout of the live view, preceded by its results.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What tables say of the scales that no session shows: torque scale, length and density."""
+"""Notes of tables on scales that no session determines: torque scale, length and density."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 
 
 def scale_notes(whole: WholeRecord) -> Iterator[str]:
-    """Say what statistical intervals leave out, and what those with scales include."""
+    """Return the notes on what statistical intervals exclude, and those with scales include."""
     if not scales_absorbed(whole.fit):
         held = ", ".join(QUANTITIES[name][0] for name in whole.fixed)
         yield (

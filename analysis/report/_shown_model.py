@@ -26,7 +26,7 @@ class ShownModel:
     Attributes
     ----------
     name : str
-        As captions call it.
+        Name in captions.
     modal : ModalFit or None
     beam : RecordFit
         Shown where there is no modal model.
@@ -43,20 +43,22 @@ class ShownModel:
     stated_delay_s: float
 
     @classmethod
-    def of(cls, told: Headline, record: Record) -> ShownModel:
-        """Choose it for a record.
+    def of(cls, headline: Headline, record: Record) -> ShownModel:
+        """Choose the model for a record.
 
         Parameters
         ----------
-        told : Headline
+        headline : Headline
             Headline of the record.
         record : Record
         """
         return cls(
-            name=f"the model (type {told.name})" if told.modal is None else "the modal model",
-            modal=told.modal,
-            beam=told.fit,
-            modes=shown_modes(told),
+            name=f"the model (type {headline.name})"
+            if headline.modal is None
+            else "the modal model",
+            modal=headline.modal,
+            beam=headline.fit,
+            modes=shown_modes(headline),
             stated_delay_s=record.torque_delay_s - record.angle_delay_s,
         )
 
@@ -111,7 +113,7 @@ class ShownModel:
         return self.compared(analysis).fit_percent(fit)
 
 
-def shown_modes(told: Headline) -> tuple[ModeEstimate, ...]:
+def shown_modes(headline: Headline) -> tuple[ModeEstimate, ...]:
     """Return the modes of a headline that the record shows, with their deviations."""
     return tuple(
         ModeEstimate(
@@ -121,6 +123,6 @@ def shown_modes(told: Headline) -> tuple[ModeEstimate, ...]:
             damping_ratio=mode.damping_ratio.value,
             damping_ratio_std=mode.damping_ratio.std or 0.0,
         )
-        for mode in told.modes
+        for mode in headline.modes
         if mode.shown
     )

@@ -1,4 +1,4 @@
-"""Figures of a record's signals, beside what the fitted plant makes of its angle."""
+"""Figures of a record's signals, with the response of the fitted plant to its angle."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
 
-    Look = dict[str, Any]
-    Line = tuple[NDArray[np.float64], Look]
+    LineStyle = dict[str, Any]
+    Line = tuple[NDArray[np.float64], LineStyle]
 
 _PERIODS_SHOWN: Final = 12
 _SHORTEST_S: Final = 0.3
-_LARGEST_SHARE: Final = 1 / 8
+_LARGEST_FRACTION: Final = 1 / 8
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One stretch of the record.
+    """One interval of the record.
 
     Attributes
     ----------
     name
-        What is seen there.
+        Name of the interval.
     samples
         Range of samples.
     first_s, last_s
@@ -55,7 +55,7 @@ class Moment:
 
 
 def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
-    """Where the torque rings most at each of the first modes that the sampling can show."""
+    """Return the intervals of strongest vibration, one for each mode that the sampling shows."""
     duration_s = len(record.time_s) / record.rate_hz
     moments = []
     modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
@@ -63,17 +63,17 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
         if frequency_hz >= record.rate_hz / 2:
             break
         centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, frequency_hz)
-        length_s = min(_PERIODS_SHOWN / frequency_hz, _LARGEST_SHARE * duration_s)
+        length_s = min(_PERIODS_SHOWN / frequency_hz, _LARGEST_FRACTION * duration_s)
         length_s = max(length_s, _SHORTEST_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))
         first = round((centre_s - length_s / 2) * record.rate_hz)
         first = min(max(first, 0), len(record.time_s) - samples)
-        stretch = slice(first, first + samples)
-        times_s = record.time_s[stretch]
+        block = slice(first, first + samples)
+        times_s = record.time_s[block]
         moments.append(
             Moment(
                 name=f"Mode {number}, {frequency_hz:.3g} Hz",
-                samples=stretch,
+                samples=block,
                 first_s=float(times_s[0]),
                 last_s=float(times_s[-1]),
             )
@@ -82,7 +82,7 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
 
 
 def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
-    """Shade the stretches in the panel of the whole record, numbered from 1."""
+    """Shade the intervals in the panel of the whole record, numbered from 1."""
     for number, moment in enumerate(moments, start=1):
         axes.axvspan(moment.first_s, moment.last_s, color=style.SHADE, linewidth=0, zorder=0)
         axes.text(
@@ -93,7 +93,7 @@ def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
 
 
 def enlarge(axes: Axes, number: int, moment: Moment) -> None:
-    """Make a panel the enlargement of one stretch, which is numbered like its mark."""
+    """Turn a panel into the enlargement of one interval, numbered like its mark."""
     axes.set_title(f"{number}  {moment.name}", fontsize=8.5, fontweight="normal")
     axes.set_xlim(moment.first_s, moment.last_s)
     axes.set_facecolor("#FCFAF4")
@@ -188,11 +188,11 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
 _ANGLE: Final = "Angle (mrad)"
 _TORQUE: Final = "Torque (N·m)"
 _LEFT: Final = "Residual, measured − modelled"
-_THIN: Final[Look] = {"linewidth": 0.7}
-_MEASURED: Final[Look] = {"color": style.GREY, "linewidth": 1.0}
-_MODELLED: Final[Look] = {"color": style.BLUE, "linewidth": 0.6}
-_RESIDUAL: Final[Look] = {"color": style.VERMILION, "linewidth": 0.7, "label": "residual"}
-_CLOSE: Final[tuple[Look, ...]] = (
+_THIN: Final[LineStyle] = {"linewidth": 0.7}
+_MEASURED: Final[LineStyle] = {"color": style.GREY, "linewidth": 1.0}
+_MODELLED: Final[LineStyle] = {"color": style.BLUE, "linewidth": 0.6}
+_RESIDUAL: Final[LineStyle] = {"color": style.VERMILION, "linewidth": 0.7, "label": "residual"}
+_CLOSE: Final[tuple[LineStyle, ...]] = (
     {"color": style.GREY, "linewidth": 2.6},
     {"color": style.BLUE, "linewidth": 1.0},
     {"color": style.VERMILION, "linewidth": 0.8},
@@ -210,8 +210,8 @@ def _whole(
 ) -> None:
     """Draw signals over the whole record."""
     drawn = tuple(lines)
-    for values, look in drawn:
-        axes.plot(*style.envelope(record.time_s, values), **look)
+    for values, line_style in drawn:
+        axes.plot(*style.envelope(record.time_s, values), **line_style)
     axes.set_title(title, pad=pad)
     axes.set_ylabel(label)
     axes.set_ylim(style.limits(*(values for values, _ in drawn)))
@@ -221,9 +221,9 @@ def _whole(
 def _detail(
     axes: Axes, record: Record, lines: Iterable[Line], column: int, moment: Moment, label: str
 ) -> None:
-    """Draw one stretch of signals; the first panel of a row says what they are."""
-    for values, look in lines:
-        axes.plot(record.time_s[moment.samples], values[moment.samples], **look)
+    """Draw one interval of signals; the first panel of a row has the legend."""
+    for values, line_style in lines:
+        axes.plot(record.time_s[moment.samples], values[moment.samples], **line_style)
     enlarge(axes, column + 1, moment)
     if column == 0:
         axes.set_ylabel(label)
@@ -267,8 +267,8 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
         above = figure.add_subplot(grid[1, column])
         _detail(above, record, near, column, moment, _ANGLE)
         below = figure.add_subplot(grid[3, column])
-        look = green | {"linewidth": 0.9}
-        _detail(below, record, ((record.torque_nm, look),), column, moment, _TORQUE)
+        line_style = green | {"linewidth": 0.9}
+        _detail(below, record, ((record.torque_nm, line_style),), column, moment, _TORQUE)
         below.set_xlabel("Time (s)", labelpad=1)
     return figure
 
@@ -290,13 +290,13 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     modelled = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
     measured = band_limited(record.torque_nm, record.rate_hz, band_hz)
     residual = measured - modelled
-    share = _rms(residual) / _rms(measured) if measured.any() else np.nan
+    residual_fraction = _rms(residual) / _rms(measured) if measured.any() else np.nan
     figure = style.new_figure(
         13.0, 8.0, "Torque, measured and modelled",
         f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
         f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
-        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * share:.3g} % of the torque, the bias of "
-        "Welch's estimate included",
+        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, the "
+        "bias of Welch's estimate included",
     )  # fmt: skip
     moments = resonance_moments(record, len(analysis.peaks))
     grid = figure.add_gridspec(
@@ -311,8 +311,8 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     _whole(middle, record, ((residual, _RESIDUAL),), _LEFT, _TORQUE)
     middle.set_xlabel("Time (s)", labelpad=1)
     mark(top, moments)
-    looks = (_CLOSE[0], _CLOSE[1] | {"linewidth": 1.1}, _CLOSE[2])
-    close = tuple(zip((measured, modelled, residual), looks, strict=True))
+    styles = (_CLOSE[0], _CLOSE[1] | {"linewidth": 1.1}, _CLOSE[2])
+    close = tuple(zip((measured, modelled, residual), styles, strict=True))
     for column, moment in enumerate(moments):
         axes = figure.add_subplot(grid[1, column])
         _detail(axes, record, close, column, moment, _TORQUE)

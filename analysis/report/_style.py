@@ -1,7 +1,7 @@
-"""How figures look: palette, fonts, axes, and lines decimated to what a pixel can show.
+"""Style of figures: palette, fonts, axes, and lines decimated to the pixels.
 
-The palette is Okabe and Ito's, told apart by readers with any common colour blindness; lines that
-lie on each other differ in dash as well as in colour.
+The palette is Okabe and Ito's, distinguishable with any common colour blindness; lines that lie on
+each other differ in dash as well as in colour.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from analysis.results import FigureFormat
 
 # Of its cache of fonts, which is slow to make or just being made by another process: no figure
-# suffers, and nobody who reads it in a log can tell.
+# suffers, and it means nothing to the reader of a log.
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 BLUE: Final = "#0072B2"
@@ -74,7 +74,7 @@ _RC: Final[dict[Any, Any]] = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    # Where they stand anyway, as no axis is on top: to look for labels in the way takes a tenth of
+    # The default position, as no axis is on top: the search for labels in the way takes a tenth of
     # all drawing.
     "axes.titley": 1.0,
     "axes.labelcolor": INK,
@@ -127,8 +127,10 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
             left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common
         ),
     ):
-        share = text.get_window_extent().width / (DPI * width_in)
-        text.set_fontsize(float(text.get_fontsize()) * (1 - 2 * left) / max(share, 1 - 2 * left))
+        width_fraction = text.get_window_extent().width / (DPI * width_in)
+        text.set_fontsize(
+            float(text.get_fontsize()) * (1 - 2 * left) / max(width_fraction, 1 - 2 * left)
+        )
     return figure
 
 
@@ -141,7 +143,7 @@ class Picture:
     name : str
         Name of its file, without the ending.
     description : str
-        What is seen in it, for those who do not see it, and as its caption.
+        Alternative text, and caption.
     png : bytes
         Content of its file.
     svg : bytes or None
@@ -155,7 +157,7 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """The figure itself, in the place of an address.
+        """The figure itself, as a data URL.
 
         SVG, which can be searched and is sharp on paper, but of a figure with very many strokes,
         such as many sessions' responses.

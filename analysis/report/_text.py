@@ -30,7 +30,7 @@ _WIDTH: Final = 120
 
 
 def as_text(shown: RenderableType) -> str:
-    """Return what a terminal would show, as plain text."""
+    """Return a renderable as plain text."""
     console = Console(width=_WIDTH, color_system=None, force_terminal=False)
     with console.capture() as capture:
         console.print(shown)
@@ -59,7 +59,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
             shown += spaced((fit_tables.welch_fits_table(welch),))
         shown += _warnings(result.warnings)
     else:
-        # Why Welch's fits are left out was told when they were.
+        # The reason for missing Welch fits was reported before.
         shown += _warnings(each for each in result.warnings if not each.startswith(LEFT_OUT))
     return Group(*shown)
 
@@ -86,7 +86,7 @@ def _main_results(whole: WholeRecord) -> RenderableType:
 
 
 def _bare(table: Table, caption: str = "") -> Table:
-    """Leave of what stands around a table the reasons for marked numbers."""
+    """Return a table with only those notes that explain marked numbers."""
     notes = tuple(note for note in table.notes if note.startswith(MARK))
     return replace(table, caption=caption, notes=notes)
 
@@ -136,14 +136,14 @@ def summary_table(results: Sequence[RecordResult]) -> RenderableType:
 def record_text(whole: WholeRecord) -> RenderableType:
     """Return the verdict on one record, its parameters and its modes."""
     verdict = whole.verdict
-    said = [
+    sentences = [
         *(Text(sentence, style="bold") for sentence in damping_sentences(whole.headline)),
         *map(Text, verdict.sentences),
         *(Text(text, style="dim") for text in verdict.experiments),
     ]
     return Group(
         Text(f"{whole.record.path.name}: verdict", style="italic"),
-        *(Padding(sentence, (0, 0, 0, 2)) for sentence in said),
+        *(Padding(sentence, (0, 0, 0, 2)) for sentence in sentences),
         "",
         record_tables(whole),
     )
@@ -181,7 +181,7 @@ def spaced(shown: Iterable[Table]) -> Iterator[RenderableType]:
 # Damping in sentences
 
 _SMALL: Final = 1e-3
-"""Sizes below are told in the power of ten that zeta has in the paper."""
+"""Sizes below are shown in the power of ten that zeta has in the paper."""
 
 _SYMBOLS: Final = {
     "internal": ("ζ", "", "zeta", "alpha", "α"),
@@ -189,12 +189,12 @@ _SYMBOLS: Final = {
 }
 
 
-def damping_sentences(told: Headline) -> tuple[str, ...]:
-    """Say how the modes are damped, and by which internal and external damping.
+def damping_sentences(headline: Headline) -> tuple[str, ...]:
+    """Describe the damping of the modes, and the internal and external damping.
 
-    Nothing is said about modes that the record does not show, nor about any where no number is the
-    antenna's. Where part of the record is unexplained the numbers are named as what they would be,
-    without intervals.
+    Modes that the record does not show are omitted, and all if no number is the antenna's. Where
+    part of the record is unexplained the numbers are named as what they would be, without
+    intervals.
 
     Returns
     -------
@@ -202,10 +202,10 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
         95 % intervals in brackets.
     """
     found = []
-    if any(mode.damping_ratio.flag == MISREAD for mode in told.modes):
+    if any(mode.damping_ratio.flag == MISREAD for mode in headline.modes):
         return ()
-    shown = [_mode(mode) for mode in told.modes if mode.shown]
-    if not told.explained:
+    shown = [_mode(mode) for mode in headline.modes if mode.shown]
+    if not headline.explained:
         if not shown:
             return ()
         return (
@@ -218,10 +218,10 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
             "statistical only)."
         )
     found.extend(
-        f"The {each.damping} damping {_size(each)}{_order(told, each)}."
-        for each in told.sizes
-        # A coefficient that holds for one assumed order says nothing of the antenna.
-        if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(told, each))
+        f"The {each.damping} damping {_size(each)}{_order(headline, each)}."
+        for each in headline.sizes
+        # A coefficient for an assumed order is no property of the antenna.
+        if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(headline, each))
     )
     return tuple(found)
 
@@ -251,22 +251,22 @@ def _size(each: Size) -> str:
     return f"has a loss factor of {bounds} at {each.omega_rad_s / (2 * math.pi):.3g} Hz"
 
 
-def _flagged(told: Headline, each: Size) -> bool:
+def _flagged(headline: Headline, each: Size) -> bool:
     """Whether coefficient and order of a damping carry a flag."""
-    return told.parameters[_SYMBOLS[each.damping][2]].flag is not None
+    return headline.parameters[_SYMBOLS[each.damping][2]].flag is not None
 
 
-def _order(told: Headline, each: Size) -> str:
+def _order(headline: Headline, each: Size) -> str:
     *_others, name, symbol = _SYMBOLS[each.damping]
-    order = told.parameters[name]
-    if told.tolerant is None and name not in told.fit.structure.free:
+    order = headline.parameters[name]
+    if headline.tolerant is None and name not in headline.fit.structure.free:
         return f", of the fixed order {symbol}\u00a0=\u00a0{order.value:g}"
     if order.interval_95 is None or order.flag is not None:
         return f"; its order {symbol} is not known"
-    if told.tolerant is not None:
+    if headline.tolerant is not None:
         return ""  # the verdict has the slope of the loss, with its condition
     value, low, high = estimate((order.value, *order.interval_95), order.std)
-    condition = f", {EXACT_CONDITION}" if told.modal is not None else ""
+    condition = f", {EXACT_CONDITION}" if headline.modal is not None else ""
     return (
         f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"
     )

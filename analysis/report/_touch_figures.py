@@ -27,7 +27,7 @@ _LEAST_LOG: Final = 40.0
 _LINEAR: Final = 5.0
 """Innovations up to so many standard deviations are drawn to a linear scale."""
 _DETAIL: Final = 0.25
-"""Share of the antenna's length up to which the points have a detail of their own."""
+"""Fraction of the antenna's length up to which the points have a detail of their own."""
 _COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 
 
@@ -64,7 +64,7 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
     ----------
     touch : Touch
     estimate : TouchEstimate
-        Its own.
+        Estimate of this touch.
     """
     rows = estimate.channels
     figure = style.new_figure(9.0, 4.6)
@@ -172,8 +172,8 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
 
 
 def _map(axes: Axes, sessions: Sequence[TouchedSession], *, numbered: bool) -> None:
-    for place, session in enumerate(sessions):
-        color = _COLORS[place % len(_COLORS)]
+    for number, session in enumerate(sessions):
+        color = _COLORS[number % len(_COLORS)]
         name: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:

@@ -29,7 +29,7 @@ _TITLES: Final = {
     "ln_residue": "Residue, magnitude",
     "residue_phase_rad": "Residue, phase",
 }
-"""Modal constants as people read them; all but the phase are compared by their logarithms."""
+"""Titles of the modal constants; all but the phase are compared by their logarithms."""
 
 _PER_CENT: Final = 100.0
 
@@ -103,7 +103,7 @@ def _frame(axes: Axes, modes: tuple[int, ...], reach: float, *, least: float = 0
 
 
 def uniformity_description(test: UniformBeamTest) -> str:
-    """Say what the figure shows, and with which result."""
+    """Describe the figure and its result."""
     return (
         "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
@@ -117,18 +117,18 @@ def uniformity_table(test: UniformBeamTest) -> Table:
     """Measured and predicted modal constants with their deviations."""
     rows: list[tuple[Entry, ...]] = []
     away = _deviations(test).ravel()
-    for place, (measured, std, predicted, off) in enumerate(
+    for index, (measured, std, predicted, off) in enumerate(
         zip(
             test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), away.tolist(),
             strict=True,
         )
     ):  # fmt: skip
-        name = CONSTANTS[place % len(CONSTANTS)]
+        name = CONSTANTS[index % len(CONSTANTS)]
         words = Cell(name, name.removesuffix("_rad").replace("_", " "))
         shown = estimate((measured, std, predicted), std)
         rows.append(
             (
-                test.modes[place // len(CONSTANTS)], words, *shown,
+                test.modes[index // len(CONSTANTS)], words, *shown,
                 number(off / std, "+.1f"), number(off, "+#.2g", _PER_CENT),
             )
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""95 % bands of a fit's curves, and the band in which a record says something of the damping."""
+"""95 % bands of a fit's curves, and the band in which a record determines the damping."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _OVER_NOISE: Final = 4.0
 
 
 def supported_band_hz(whole: WholeRecord) -> Band | None:
-    """Band in which the selected fit's loss factors rest on data.
+    """Return the band in which the selected fit's loss factors are supported by data.
 
     The modes show the damping. A model whose orders the data support is also right between and
     beyond them, as far as the beam was excited; one with an order that they do not support only
@@ -51,7 +51,7 @@ def supported_band_hz(whole: WholeRecord) -> Band | None:
 
 
 def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
-    """Frequencies between which the measured torque stands out of the noise.
+    """Return the frequencies between which the measured torque exceeds the noise.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     Returns
     -------
     tuple of float or None
-        In Hz; None if nothing stands out.
+        In Hz; None if it never does.
     """
     torque = record.torque_nm - record.torque_nm.mean()
     frequency_hz = np.fft.rfftfreq(torque.size, 1 / record.rate_hz)
@@ -87,11 +87,11 @@ class Estimate(Protocol):
 
     @property
     def structure(self) -> Structure:
-        """Which damping it has."""
+        """Structure of the damping."""
 
     @property
     def plant(self) -> Plant:
-        """What was found."""
+        """Fitted plant."""
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -127,16 +127,18 @@ class NearlyUniformBeam:
 
     @classmethod
     def of(cls, found: TolerantEstimate) -> NearlyUniformBeam:
-        """Take it from an estimate with both orders free."""
+        """Return it for an estimate with both orders free."""
         return cls(STRUCTURES["VI"], found.plant, found.values, PARAMETERS, found.covariance)
 
 
 def loss_estimate(whole: WholeRecord) -> Estimate | None:
     """Choose the beam whose loss factors are drawn over frequency; None if none explains them."""
-    told = whole.headline
-    if told.tolerant is not None:
-        return None if told.tolerant.basis == "none" else NearlyUniformBeam.of(told.tolerant)
-    refused = told.uniform_beam is not None and told.uniform_beam.status == "refused"
+    headline = whole.headline
+    if headline.tolerant is not None:
+        return (
+            None if headline.tolerant.basis == "none" else NearlyUniformBeam.of(headline.tolerant)
+        )
+    refused = headline.uniform_beam is not None and headline.uniform_beam.status == "refused"
     return None if refused else whole.fit
 
 
@@ -169,12 +171,12 @@ _GRADIENT_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
 }
-"""What the response is differentiated by as a logarithm already."""
+"""Parameters by whose logarithm the response is differentiated already."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseBand:
-    """Frequency response of a fitted plant, and how well it is known.
+    """Frequency response of a fitted plant, with its uncertainty.
 
     Attributes
     ----------

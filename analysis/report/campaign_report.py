@@ -41,21 +41,21 @@ _NO_VERDICT: Final = (
 
 
 def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
-    """Return the verdict; without one, what it would have said first, and why there is none.
+    """Return the verdict; without one, the statement on the specimen, and the reason.
 
     The second sentence, or the only one, is on the validity of the numbers.
     """
-    said = _verdict_sentences(campaign)
-    return (*said[:1], campaign.validity.sentence, *said[1:])
+    sentences = _verdict_sentences(campaign)
+    return (*sentences[:1], campaign.validity.sentence, *sentences[1:])
 
 
 def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     if campaign.verdict is not None:
         return campaign.verdict.sentences
-    asked = any(each.record_estimates for each in campaign.sessions)
+    has_estimates = any(each.record_estimates for each in campaign.sessions)
     return (
         *specimens(campaign.homogeneity),
-        *([_NO_VERDICT] if asked else []),
+        *([_NO_VERDICT] if has_estimates else []),
         *lost_trials(campaign.lost_trials, campaign.trials),
     )
 
@@ -63,21 +63,21 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
 def campaign_tables(
     campaign: CampaignResult, *, with_paper: bool = False, verbose: bool = True
 ) -> RenderableType:
-    """Return the verdict, what it rests on, and the paper's Tables 3 to 5.
+    """Return the verdict, its basis, and the paper's Tables 3 to 5.
 
     Parameters
     ----------
     campaign : CampaignResult
     with_paper : bool
-        Whether the paper's numbers stand beside these.
+        Whether the paper's numbers are included.
     verbose : bool
-        Whether all tables are shown; otherwise, beside the verdict, the pooled modes and parameters
-        are, and the tables of the paper if its numbers are to stand beside them.
+        Whether all tables are shown; otherwise the verdict, the pooled modes and parameters, and
+        with `with_paper` the tables of the paper.
     """
     parts: list[RenderableType] = []
-    said = campaign_sentences(campaign)
-    if said:
-        first, *others = said
+    sentences = campaign_sentences(campaign)
+    if sentences:
+        first, *others = sentences
         parts += [Text(first, style="bold"), *map(Text, others)]
         if campaign.verdict is not None and campaign.verdict.experiments:
             parts.append(Text("Further experiments:"))
@@ -117,16 +117,16 @@ _OF_RECORDS: Final = ("damping", "pooled_response", "pooled", "validation")
 def campaign_page(
     campaign: CampaignResult, pictures: Sequence[Picture], made_at: datetime, *, with_paper: bool
 ) -> str:
-    """Put a campaign's report together.
+    """Return a campaign's report.
 
     Parameters
     ----------
     campaign : CampaignResult
     pictures : sequence of Picture
     made_at : datetime
-        When, with a time zone.
+        Date of the report, with a time zone.
     with_paper : bool
-        Whether the paper's numbers stand beside these.
+        Whether the paper's numbers are included.
 
     Returns
     -------
@@ -169,7 +169,7 @@ def _warnings(campaign: CampaignResult) -> list[str]:
 
 
 def _how(campaign: CampaignResult) -> list[Facts]:
-    """Collect what is known of specimen and estimators."""
+    """Collect the facts on specimen and estimators."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     beam = campaign.sessions[0].beam
     parts = [
@@ -221,7 +221,7 @@ def _how(campaign: CampaignResult) -> list[Facts]:
 
 
 def _of_geometry(campaign: CampaignResult) -> list[tuple[str, str]]:
-    """Say what modes and parameters are of, where a tolerance of the geometry is stated."""
+    """Describe the model of modes and parameters if a tolerance of the geometry is stated."""
     if campaign.modal is None or not campaign.modal.leads:
         return []
     return [
@@ -253,7 +253,7 @@ def write_campaign(
     folder : Path
         An existing folder without these files.
     with_paper : bool
-        Whether the paper's numbers stand beside these.
+        Whether the paper's numbers are included.
     formats : sequence of str
         Formats of the figures.
     on_step : callable, optional
@@ -285,7 +285,7 @@ def write_campaign(
 
 
 def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:
-    """Drawings by name, with what is seen in them: those for which there are data."""
+    """Return the figures for which there are data by name, with their descriptions."""
     from analysis.report._campaign_figures import (
         best_figure,
         index_figure,

@@ -1,7 +1,7 @@
-"""Where reports go: a folder is complete or absent, and nothing of somebody else's is overwritten.
+"""Folders of reports: each is complete or absent, and no other files are overwritten.
 
-Each folder lists its files with their SHA-256 (``SHA256SUMS``, as ``sha256sum -c`` checks it). What
-stands in the list, and is unchanged, was written by an analysis: nothing else is ever replaced or
+Each folder lists its files with their SHA-256 (``SHA256SUMS``, as ``sha256sum -c`` checks it). A
+file that is in the list and unchanged was written by an analysis: nothing else is ever replaced or
 removed.
 """
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 _LONGEST_LIST: Final = 10_000_000
-"""Bytes: a hundred thousand files."""
+"""Largest list in bytes: a hundred thousand files."""
 LIST: Final = "SHA256SUMS"
 """Name of the list of a report's files."""
 
@@ -29,7 +29,7 @@ _KEYS_OF_RESULTS: Final = frozenset(("versions", "headlines", "fits"))
 
 
 class OutputExistsError(ValueError):
-    """What was asked to be written exists already."""
+    """A file or folder to be written exists already."""
 
 
 class OutputError(Exception):
@@ -48,8 +48,8 @@ def report_folders(
     ----------
     files : sequence of Path
     report : Path, optional
-        The folder asked for: that of the report of one file, or that which is to hold one folder
-        per file, named like it. Default: ``NAME.report`` beside each file, or if that exists
+        Requested folder: that of the report of one file, or one that is to hold a folder per file,
+        named like the file. Default: ``NAME.report`` next to each file, or if that exists
         ``NAME.report-2`` and so on.
     overwrite : bool
         Whether an earlier report is to be replaced.
@@ -61,9 +61,9 @@ def report_folders(
     """
     if report is None:
         # A folder given for a file may have no name of its own ("." or "/").
-        asked = [file.parent / f"{file.stem}.report" for file in files]
+        requested = [file.parent / f"{file.stem}.report" for file in files]
     elif overwrite or _is_free(report):
-        asked = [report] if len(files) == 1 else [report / file.stem for file in files]
+        requested = [report] if len(files) == 1 else [report / file.stem for file in files]
     else:
         raise OutputExistsError(
             f"--report {report} exists and is not an empty folder; choose another name, or replace "
@@ -71,8 +71,8 @@ def report_folders(
         )
     taken: set[Path] = set()
     if not overwrite:
-        return asked if asked == [report] else [_free(each, taken) for each in asked]
-    folders = [_free(each, taken, overwrite=True) for each in asked]
+        return requested if requested == [report] else [_free(each, taken) for each in requested]
+    folders = [_free(each, taken, overwrite=True) for each in requested]
     for folder in folders:
         _check_earlier(folder)
     return folders
@@ -86,7 +86,7 @@ def check_new_file(path: Path, what: str, *, overwrite: bool = False) -> None:
     path : Path
         The new file.
     what : str
-        Option that asked for it.
+        Option that requests it.
     overwrite : bool
         Whether it may be there already, holding results of an analysis in JSON.
     """
@@ -133,7 +133,7 @@ def _holds_results(path: Path) -> bool:
 
 @contextmanager
 def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary folder that takes its name when all went well, and vanishes otherwise.
+    """Yield a temporary folder that is renamed on success, and removed otherwise.
 
     Parameters
     ----------
@@ -188,9 +188,9 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
     path : Path
         The new file.
     content : str or bytes
-        What goes into it.
+        Its content.
     overwrite : bool
-        Whether it takes the place of earlier results of an analysis.
+        Whether it replaces earlier results of an analysis.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
 
 
 def _write_over(path: Path, content: bytes) -> None:
-    """Put new content in a file's place at one moment: a full disk leaves the old one."""
+    """Replace a file atomically: a full disk leaves the old one."""
     part = path.with_name(f".{path.name}.part-{os.getpid()}")
     try:
         part.write_bytes(content)
@@ -226,7 +226,7 @@ def _write_over(path: Path, content: bytes) -> None:
 
 
 def _check_earlier(folder: Path) -> None:
-    """Refuse a folder that is neither free nor an earlier report."""
+    """Raise if a folder is neither free nor an earlier report."""
     if not _is_free(folder) and not (folder.is_dir() and (folder / LIST).is_file()):
         raise OutputExistsError(
             f"--overwrite replaces reports of an analysis, and {folder} is not one: it has no list "
@@ -245,7 +245,7 @@ def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
                 "another folder with --report."
             )
     try:
-        # Whenever this is cut short, the list holds all that is there.
+        # If this is interrupted, the list still contains all files.
         both = {
             name: earlier.get(name, set()) | sums.get(name, set()) for name in {*earlier, *sums}
         }
@@ -256,7 +256,7 @@ def _replace(folder: Path, part: Path, sums: Mapping[str, set[str]]) -> None:
         for name in earlier.keys() - sums.keys():
             if _is_own(folder, name, earlier):
                 (folder / name).unlink()
-                with suppress(OSError):  # what is not empty stays
+                with suppress(OSError):  # folders that are not empty stay
                     (folder / name).parent.rmdir()
         _write_over(folder / LIST, _listed(sums).encode())
     except OSError as error:

@@ -39,7 +39,7 @@ def record_page(
     paper_pictures: Sequence[Picture] = (),
     paper_tables: Sequence[Table] = (),
 ) -> str:
-    """Put a report together.
+    """Return a report.
 
     Parameters
     ----------
@@ -96,14 +96,14 @@ def record_page(
 
 
 def _session(record: Record) -> list[str]:
-    """Say whose session it is, as far as the file does."""
+    """Return specimen, operator and outcome of the session, as the file states them."""
     metadata = record.metadata
-    told = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
-    return [*_start(metadata), f"outcome {record.outcome}", *told]
+    lines = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
+    return [*_start(metadata), f"outcome {record.outcome}", *lines]
 
 
 def _start(metadata: Mapping[str, str]) -> list[str]:
-    """Say when the session started, if the file knows."""
+    """Return the start time of the session, if the file states it."""
     try:
         seconds = int(metadata["start_utc_ns"]) / 1e9
         start = datetime.fromtimestamp(seconds, UTC)
@@ -121,7 +121,7 @@ _SHOWN_ALREADY = frozenset(
 
 
 def _how(result: RecordResult, whole: WholeRecord) -> list[Facts]:
-    """Collect what is known of file, record, session and settings."""
+    """Collect the facts on file, record, session and settings."""
     record, welch = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
@@ -294,8 +294,8 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
 
 
 _FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
-_FIGURES_BESIDE_RECORD: Final = ("welch_frf",)
-"""Figures of the Welch fits where the whole-record fit has its own of signals and torque."""
+_FIGURES_WITH_RECORD: Final = ("welch_frf",)
+"""Figures of the Welch fits if the whole-record fit has its own of signals and torque."""
 
 
 def write_report(
@@ -347,7 +347,7 @@ def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
     """
     if not paper:
         return ()
-    return _FIGURES_BESIDE_RECORD if whole_record else _FIGURES
+    return _FIGURES_WITH_RECORD if whole_record else _FIGURES
 
 
 def _draw(

@@ -1,4 +1,4 @@
-"""A table, described once, and what it is on the terminal, in LaTeX, in CSV and in JSON.
+"""A table, described once, and its output on the terminal, in LaTeX, CSV and JSON.
 
 For a page the template's macro `table` makes it, from the same cells.
 """
@@ -33,16 +33,16 @@ Value = str | float | bool | None
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A cell whose text is not its column's business.
+    """A cell with a text of its own.
 
     Attributes
     ----------
     value : str, float, bool or None
-        As programs read it: in SI units and in full; None if it is not known.
+        Value for programs: in SI units and in full; None if it is not known.
     text : str
-        As people see it, in the unit that the table states.
+        Text for people, in the unit that the table states.
     strong : bool
-        Whether the eye should stop at it.
+        Whether it is emphasised.
     doubtful : bool
         Whether it is not reported: shown in grey, as the data do not support it.
     """
@@ -78,8 +78,8 @@ class Column:
     factor : float
         By which a number in SI units is multiplied to be shown.
     spread : bool
-        Whether it is the standard deviation of the column before it, where it stands behind a ±
-        on the terminal, which is narrow.
+        Whether it is the standard deviation of the column before it; on the terminal, which is
+        narrow, it follows a ±.
     """
 
     heading: str
@@ -116,8 +116,8 @@ class Table:
     columns : tuple of Column
         Those that people see, in their order; the first one names the rows.
     rows : tuple of mapping of str to Entry
-        By the columns' keys. What a row holds beside them is for programs only. A row may lack
-        what does not exist for it.
+        By the columns' keys. Further entries of a row are for programs only. A row may lack
+        entries.
     notes : tuple of str
         Sentences under it.
     selected : int or None
@@ -197,7 +197,7 @@ class Table:
 
 
 def with_validity(table: Table, validity: Validity) -> Table:
-    """State in a table that stands alone how exact the linear model is for its numbers.
+    """Add to a table the validity of the linear model for its numbers.
 
     People read it under the table; programs have it in each row.
 
@@ -206,7 +206,7 @@ def with_validity(table: Table, validity: Validity) -> Table:
     table : Table
         The table.
     validity : Validity
-        How exact the linear model is.
+        Validity of the linear model.
     """
     stated = {
         "predicted_peak_tip_slope_rad": validity.predicted_peak_tip_slope_rad,
@@ -219,7 +219,7 @@ def with_validity(table: Table, validity: Validity) -> Table:
 def csv_text(table: Table) -> str:
     """Write a table as CSV: keys as header, numbers in SI units and full precision.
 
-    What is not known is an empty field.
+    Unknown values are empty fields.
     """
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, table.keys, lineterminator="\n")
@@ -255,7 +255,7 @@ def terminal_table(table: Table) -> rich.table.Table:
         if not column.spread:
             shown.add_column(Text(column.heading), justify="right" if column.numeric else "left")
     rows = table.shown_rows
-    for place, row in enumerate(rows):
+    for index, row in enumerate(rows):
         cells: list[Text] = []
         for cell, spread in zip(row, spreads, strict=True):
             if not spread:
@@ -263,8 +263,8 @@ def terminal_table(table: Table) -> rich.table.Table:
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
                 cells[-1].append(f" ±{cell.text}")
-        ends = table.grouped and row[0].text != rows[min(place + 1, len(rows) - 1)][0].text
-        shown.add_row(*cells, end_section=ends, style="bold" if place == table.selected else "")
+        ends = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
+        shown.add_row(*cells, end_section=ends, style="bold" if index == table.selected else "")
     return shown
 
 
@@ -280,7 +280,7 @@ _ESCAPED: Final = {
     "–": "--",
 }  # fmt: skip
 _RAISED: Final = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_PIECES: Final = re.compile(
+_LATEX_TOKENS: Final = re.compile(
     r"(?P<digits>\d+(?:\.\d+)?)e(?P<power>[+-]?\d+)|\^(?P<up>[^\W⁰¹²³⁴⁵⁶⁷⁸⁹]+)"
     rf"|(?P<raised>[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)|(?P<letter>[{''.join(_LETTERS)}])(?P<index>\d*)"
     r"|(?P<minus>−)|(?P<stiffness>\bEI\b)|(?P<other>.)",
@@ -297,12 +297,12 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
-    found = "".join(map(_latex_piece, _PIECES.finditer(text)))
+    found = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
     return found.replace("$$", "")
 
 
-def _latex_piece(piece: re.Match[str]) -> str:
-    part = piece.groupdict()
+def _latex_token(token: re.Match[str]) -> str:
+    part = token.groupdict()
     if part["power"]:
         digits = "" if part["digits"] == "1" else rf"{part['digits']} \cdot "
         return f"${digits}10^{{{int(part['power'])}}}$"
@@ -397,7 +397,7 @@ _SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
 
 
 def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str]:
-    """Parameters of a fit whose numbers say nothing of the antenna.
+    """Return the parameters of a fit that are not properties of the antenna.
 
     Parameters
     ----------
@@ -423,12 +423,12 @@ def marked(cell: Cell) -> Cell:
 
 
 def greyed(cell: Cell) -> Cell:
-    """Show a number in grey, such as what belongs to one that is marked."""
+    """Return a cell in grey, such as those that belong to a marked number."""
     return replace(cell, doubtful=cell.value is not None)
 
 
 def footnotes(withheld: Collection[str]) -> tuple[str, ...]:
-    """Say what the mark means, if it occurs."""
+    """Return the meaning of the mark, if it occurs."""
     if not withheld:
         return ()
     orders = " or ".join(_SYMBOLS[order] for order in sorted(withheld))

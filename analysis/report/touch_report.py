@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rigd.touch import Estimated
 
 _LOPSIDED = 0.25
-"""Distance of a value from the middle of its interval, as a share of that, from which on the
-ends are told instead."""
+"""Distance of a value from the middle of its interval, relative to the interval, above which the
+ends are shown instead."""
 _KINDS = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
@@ -68,16 +68,16 @@ def _row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
         "angle_rad": touch.angle_rad,
         "kind": "not estimated" if estimate is None else _KINDS.get(estimate.kind, estimate.kind),
     }
-    told: dict[str, tuple[Estimated | None, float]] = {}
+    estimates: dict[str, tuple[Estimated | None, float]] = {}
     if estimate is not None:
-        told = {
+        estimates = {
             "time_s": (estimate.time_s, touch.start_s),
             "x_m": (estimate.x_m, 0.0),
             "force_n": (estimate.force_n, 0.0),
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        found, start = told.get(key, (None, 0.0))
+        found, start = estimates.get(key, (None, 0.0))
         row[key] = _cell(found, start)
         row[f"{key}_std"] = None if found is None else found.std
     return row
@@ -95,7 +95,7 @@ def _cell(found: Estimated | None, start: float) -> Cell:
 
 
 def session_lines(session: TouchedSession) -> list[str]:
-    """Say what was found in a session, and by what model.
+    """Return the lines on a session's touches, and on the model.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def session_lines(session: TouchedSession) -> list[str]:
 
 
 def model_words(session: TouchedSession) -> str:
-    """Say where the model of the beam comes from."""
+    """Describe the source of the beam model."""
     source = session.model.source
     return "the nominal beam of the attached profile" if source == "profile" else source
 
@@ -211,7 +211,7 @@ def write_touch_report(
 
 
 def _how(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Collect what is known of sessions, model and estimator."""
+    """Collect the facts on sessions, model and estimator."""
     return [
         (
             "Sessions",

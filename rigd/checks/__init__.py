@@ -1,6 +1,6 @@
-"""``rigd check``: everything that can be known of a rig before a torque acts, in rows.
+"""``rigd check``: all checks of a rig that need no torque, in rows.
 
-Offers the whole check (`check_rig`) and its part that every session asks for (`check_on_paper`). In
+Offers the whole check (`check_rig`) and the part that every session runs (`check_on_paper`). In
 this order: what profile and EDS file show (module `on_paper`, its functions listed in `_gate`),
 this computer (`machine`), the devices (`devices`). Each is a list of `rows.Row`, with their
 verdict. No torque is ever commanded.

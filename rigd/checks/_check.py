@@ -17,8 +17,8 @@ from rigd.runner.planning import LoopPreview, excitation_for
 def check_rig(profile: Profile) -> list[Row]:
     """Check the rig of a profile without a torque: on paper, this computer, then the devices.
 
-    Where the identifiers meet or the bus cannot carry the frames, nothing is connected: devices
-    might obey what is not meant for them. Nor is it while a value of the profile is unknown.
+    If identifiers collide or the bus load is too high, nothing is connected, because devices might
+    obey frames for others; nor if a value of the profile is unknown.
     """
     rows = _rows_without_devices(profile)
     if any(row.verdict is Verdict.FAIL for row in wiring_rows(profile.rig)):
@@ -31,14 +31,14 @@ def check_rig(profile: Profile) -> list[Row]:
 
 
 def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> list[Row]:
-    """Check the rig of a profile while a daemon has its devices: they are not asked anything.
+    """Check the rig of a profile while a daemon uses its devices, which are not polled.
 
     Parameters
     ----------
     profile
         Rig to check.
     calibration
-        What the sensor told of itself when the daemon connected it; None: it is not connected.
+        Calibration that the sensor reported when the daemon connected it; None: not connected.
     """
     rows = _rows_without_devices(profile)
     if calibration is None:
@@ -57,7 +57,7 @@ def _rows_without_devices(profile: Profile) -> list[Row]:
 
 
 def default_session_rows(profile: Profile) -> Iterator[Row]:
-    """Say whether `rigd run chirp` without options stays within the limits of the profile.
+    """Check whether `rigd run chirp` without options stays within the limits of the profile.
 
     Advice, since another session may: a hold moves nothing.
     """

@@ -44,7 +44,7 @@ class PaperCheck:
     names: tuple[str, ...] = ()
     """Names of the rows that can fail; none: it gives advice only and refuses no session."""
     not_acceptable: str = ""
-    """Why a failure cannot be accepted for a session; empty: it can."""
+    """Why a failure cannot be accepted for a session; empty if it can."""
     needs_values: bool = True
     """It computes with values of the profile, so that it is left out while any is unknown."""
 
@@ -141,7 +141,7 @@ class Clearance:
         return tuple(each for each in self.failed if each.accepted)
 
     def require(self) -> None:
-        """Refuse the session unless all that failed is accepted.
+        """Raise unless all failed rows are accepted.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class Clearance:
 
 
 def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
-    """Ask of a session what `rigd check` asks without a device.
+    """Run the checks that need no device for a session.
 
     Parameters
     ----------

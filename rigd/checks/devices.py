@@ -1,8 +1,8 @@
 """Checks of the connected devices: drive, sensor and their exchange, without a torque.
 
-The devices are connected, asked and polled, but the drive is never enabled. The exchange of a tick
+The devices are connected, read and polled, but the drive is never enabled. The exchange of a tick
 is as in a session before the drive is enabled: SYNC, poll, replies. It runs in an ordinary process,
-which oversleeps now and then; what a device cannot do shows in most ticks.
+which wakes up late now and then; a fault of a device shows in most ticks.
 """
 
 import time
@@ -15,7 +15,7 @@ import numpy as np
 
 from rigd.checks.rows import Row, Verdict, grade, name_of, value_of
 from rigd.devices import WhatMoves, open_devices, reality
-from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters
@@ -49,15 +49,15 @@ class InspectableDrive(Protocol):
     """A drive with an identity; simulated ones in this process have none."""
 
     def identity(self) -> Mapping[str, object]:
-        """Return what it said of itself when it was connected; the keys end in their units."""
+        """Return the identity reported at connecting; the keys end in their units."""
 
 
 @runtime_checkable
-class OutfittedDrive(Protocol):
-    """A drive whose objects were looked through when it was connected."""
+class InspectedDrive(Protocol):
+    """A drive whose objects were checked when it was connected."""
 
-    def outfit(self) -> Outfit | None:
-        """Return what it turned out to have."""
+    def capabilities(self) -> DriveCapabilities | None:
+        """Return the capabilities found at connecting."""
 
 
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
@@ -82,39 +82,39 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
             found = f"unknown: the drive does not state it (object {_SCALES[key]})"
             verdict = Verdict.SKIPPED
         yield Row("drive", name_of(key), found, wanted.get(key, ""), verdict)
-    outfit = drive.outfit() if isinstance(drive, OutfittedDrive) else None
-    if outfit is not None:
-        yield from _safeguard_rows(outfit)
+    capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
+    if capabilities is not None:
+        yield from _safeguard_rows(capabilities)
 
 
-def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
+def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[Row]:
     """Show the watchdog, the replacements of missing objects, and what was accepted."""
-    stands, after_s = outfit.watchdog, outfit.watchdog_s
-    unproven = stands in (Watchdog.OWN, Watchdog.NONE)
+    watchdog, after_s = capabilities.watchdog, capabilities.watchdog_s
+    unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield Row(
         "drive",
         "watchdog",
-        f"{stands.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
+        f"{watchdog.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
         Verdict.WARNING if unproven else Verdict.OK,
-        _WATCHDOG_DETAIL.get(stands, ""),
+        _WATCHDOG_DETAIL.get(watchdog, ""),
     )
-    accepted = outfit.accepted
-    for row in outfit.lacks:
+    accepted = capabilities.accepted
+    for row in capabilities.lacks:
         missing = row.accept in accepted
-        told = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+        substitute = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
         if row.accept == WATCHDOG:
-            told = f"stands in: {stands.value}" if stands is not Watchdog.NONE else ""
+            substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
         by_name = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
         yield Row(
             "drive",
-            f"object {row.place} ({row.name})",
-            "; ".join(("absent or not usable", *filter(None, (by_name, told)))),
+            f"object {row.address} ({row.name})",
+            "; ".join(("absent or not usable", *filter(None, (by_name, substitute)))),
             "",
             Verdict.WARNING if missing else Verdict.OK,
             f"{row.name}: {row.sentence}" if missing else "",
         )
-    for text in outfit.assigned:
+    for text in capabilities.assigned:
         yield Row("drive", "object set", text, "read back", Verdict.OK)
 
 
@@ -138,7 +138,7 @@ class MeasurableSensor(Protocol):
     """A sensor whose rate can be measured; simulated ones in this process have none."""
 
     def measure(self, duration_s: float) -> Mapping[str, float]:
-        """Poll it, or watch its stream, for a while; the keys of the result end in their units."""
+        """Measure polls or stream for a while; the keys of the result end in their units."""
 
 
 def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[Row]:
@@ -162,7 +162,7 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
             "sensor",
             "counts and units",
             "assumed, below",
-            "told by the sensor",
+            "reported by the sensor",
             Verdict.WARNING,
             f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
         )
@@ -189,9 +189,9 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
 def _measured_rows(
     measured: Mapping[str, float], rig: RigParameters, cause: str = ""
 ) -> Iterator[Row]:
-    """Judge rate and turn-round of the sensor; `cause` is what it says of gaps in its stream."""
+    """Return the rows on rate and turn-round; `cause` is the sensor's reason for gaps."""
     for key, value in measured.items():
-        wanted, verdict = _judge(key, value, rig)
+        wanted, verdict = _assess_diagnostic(key, value, rig)
         detail = cause if key == "longest_gap_s" and verdict is not Verdict.OK else ""
         yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
 
@@ -204,8 +204,8 @@ def _value(key: str, found: Mapping[str, object]) -> str:
 def _wanted(key: str, rig: RigParameters) -> str:
     if key != "serial_number":
         return ""
-    asked = rig.ati_can.serial_number if rig.ati_can else ""
-    return asked or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
+    expected = rig.ati_can.serial_number if rig.ati_can else ""
+    return expected or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
 
 
 def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
@@ -219,8 +219,8 @@ def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
     return Row("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
 
 
-def _judge(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
-    """Return what a measured value should be, and whether it is."""
+def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
+    """Return the expected value of a diagnostic, and the verdict."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
     same_tick = acquisition is not None and acquisition.mode == "same_tick"
@@ -251,14 +251,14 @@ _GROUP = "exchange"
 
 
 def _exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
-    """Run some ticks without a torque, and judge how quickly and how surely the replies come.
+    """Run some ticks without a torque, and check latency and losses of the replies.
 
     Parameters
     ----------
     profile
         Profile whose limits count.
     devices
-        Connected, not enabled.
+        Devices that are connected, not enabled.
     moves
         What moves. In lock-step the simulated rig waits for this computer: times mean nothing.
 
@@ -334,7 +334,7 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row
 
 
 def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
-    """Say whether scales and signs are known, or verified before the first session."""
+    """Return the row on scales and signs: known, or verified before the first session."""
     if moves is WhatMoves.SIMULATED:
         return
     missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
@@ -357,7 +357,7 @@ def _probing_rows(profile: Profile, moves: WhatMoves) -> Iterator[Row]:
 
 
 def inspect_devices(profile: Profile) -> list[Row]:
-    """Connect to the devices of a profile, ask them, run some ticks, and let go of them.
+    """Connect to the devices of a profile, read them, run some ticks, and release them.
 
     No torque: the drive is never enabled. Whatever happens, both devices are closed.
     """
@@ -410,7 +410,7 @@ def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) 
 
 
 def _try(group: str, found: Iterable[Row], rows: list[Row]) -> bool:
-    """Take in rows up to the first error, which becomes one too; say whether there was none."""
+    """Collect rows up to the first error, which becomes a row; return whether there was none."""
     try:
         rows.extend(found)
     except (DeviceError, OSError) as error:

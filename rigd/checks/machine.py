@@ -25,9 +25,9 @@ _TRY = """
 import json, sys
 from rigd.engine.realtime import Precedence, obtain
 priority, below, cpu = map(int, sys.argv[1:])
-beside = Precedence(below, cpu)
-supervision = beside.take()
-beside.release()
+other = Precedence(below, cpu)
+supervision = other.take()
+other.release()
 print(json.dumps([obtain(priority=priority, cpu=cpu), supervision]))
 """
 _ROWS = {"supervision": "supervisor and recorder"}
@@ -46,9 +46,9 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return what the control process is granted, tried in its own process.
+    """Return the settings granted to the control process, tried in a process of its own.
 
-    Under ``supervision`` stands what supervisor and recorder are.
+    The key ``supervision`` holds the settings of supervisor and recorder.
 
     Raises
     ------
@@ -68,14 +68,14 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
-    """Show which of the profile's real-time settings a session would be granted."""
+    """Return the rows on the real-time settings that a session would be granted."""
     try:
         obtained = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         yield Row("real time", "rights", f"could not be tried: {error}", "", Verdict.WARNING)
         return
     if settings.priority == 0:
-        yield Row("real time", "scheduling", "not asked for", "", Verdict.OK)
+        yield Row("real time", "scheduling", "not requested", "", Verdict.OK)
     for name, text in obtained.items():
         lacking = (
             text.startswith(REFUSED)
@@ -96,7 +96,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
 
 
 def _remedy(name: str, settings: RealtimeSettings) -> str:
-    """Return what is too long for the table."""
+    """Return the remedy, which is too long for the table."""
     if name == "idle_states":
         return _IDLE_STATES_REMEDY
     lines = {
@@ -132,13 +132,13 @@ _TIMEX_SIZE = 512
 """More than the kernel's structure has on any architecture."""
 _NOT_SYNCHRONISED = 5
 _LEAST_RUNTIME = 0.95
-"""Share of each period that the kernel leaves to real-time processes by default."""
+"""Fraction of each period that the kernel leaves to real-time processes by default."""
 
 
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[Row]:
-    """Show what on this computer makes ticks late, and the remedies.
+    """Return the rows on settings of this computer that delay ticks, with remedies.
 
     Parameters
     ----------
@@ -281,12 +281,12 @@ def _wall_clock_row() -> Row:
 def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
     runtime_us = _number(root / _THROTTLING, -1)
     period_us = _number(root / _THROTTLING_PERIOD, 1_000_000)
-    share = runtime_us / period_us if runtime_us >= 0 else 1.0
-    low = share < _LEAST_RUNTIME and settings.priority > 0
+    fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
+    low = fraction < _LEAST_RUNTIME and settings.priority > 0
     return Row(
         _GROUP,
         "real-time share",
-        "all of a core" if runtime_us < 0 else f"{100 * share:.0f} % of a core",
+        "all of a core" if runtime_us < 0 else f"{100 * fraction:.0f} % of a core",
         f"{100 * _LEAST_RUNTIME:.0f} %",
         grade(fail=False, warn=low),
         "Real-time share: the kernel stops real-time processes that take more; "
@@ -297,7 +297,7 @@ def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
 
 
 def _synchronised() -> bool:
-    """Whether the kernel knows of somebody who keeps its wall clock right."""
+    """Return whether the kernel reports a synchronised wall clock."""
     try:
         state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
     except (OSError, AttributeError):

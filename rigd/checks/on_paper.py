@@ -1,14 +1,14 @@
 """Checks of profile and EDS file alone: closed loop, stopping distance, identifiers, sources.
 
-Closed loop: stability, and the margins. What is asked for depends on what a margin stands for (see
-:mod:`rigd.control._margins`). At the angle it is the rule of thumb for the gain of a feedback loop,
-a factor of 2. At torque command and torque reading, where the beam is cancelled and a factor of 2
-cannot be had, it is the tolerance of a drive's torque constant and of a calibration, taken twice:
-20 %. The phase has to bear what such an error turns a signal by at most (an error of 20 % across
-it: 11.5°), together with one period of delay at the second mode (16 Hz: 5.8°): 20°, rounded up. The
-delay has to bear one period more than the profile states: a reading or a command that is a tick
-late. A loop that misses this is a warning, not a failure: it is stable as described, and whether
-the description is right is what such a session may be for.
+Closed loop: stability, and the margins. The required value depends on what a margin protects
+against (see :mod:`rigd.control._margins`). At the angle it is the rule of thumb for the gain of a
+feedback loop, a factor of 2. At torque command and torque reading, where the beam is cancelled and
+a factor of 2 cannot be had, it is the tolerance of a drive's torque constant and of a calibration,
+taken twice: 20 %. The phase margin has to tolerate the largest rotation by such an error (an error
+of 20 % across it: 11.5°), together with one period of delay at the second mode (16 Hz: 5.8°): 20°,
+rounded up. The delay margin has to tolerate one period more than the profile states: a reading or a
+command that is a tick late. A loop that misses this is a warning, not a failure: it is stable as
+described, and whether the description is right is what such a session may be for.
 
 Stopping distance: how far the shaft still turns when nothing controls it, because the loop has
 failed or runs blind. It is the worst that the limits allow: at the limit of the angle, moving
@@ -20,11 +20,11 @@ after its own time:
   session after ``limits.stale_ticks_in_a_row``;
 * a loop whose encoder has failed, though its messages are fresh, ends the session by what the
   torques say of the shaft, at full torque within `ENCODER_FAILURE_S`;
-* a loop that was held up looks again after the ticks it missed, up to
+* a loop that was delayed reads its sensors again after the ticks it missed, up to
   ``limits.missed_ticks_in_a_row`` of them.
 
-Each is judged by itself, as if the others did not act. Then the shaft runs out, held back by its
-friction alone.
+Each is checked by itself, as if the others did not act. Then the shaft coasts to rest, braked by
+its friction alone.
 """
 
 from collections.abc import Iterator
@@ -66,7 +66,7 @@ STABILITY = "loop_stability"
 
 
 def stability_rows(profile: Profile) -> Iterator[Row]:
-    """Judge whether the loop of a profile's rig is stable."""
+    """Check whether the loop of a profile's rig is stable."""
     try:
         loop, warning = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
@@ -84,7 +84,7 @@ def stability_rows(profile: Profile) -> Iterator[Row]:
 
 
 def margin_rows(profile: Profile) -> Iterator[Row]:
-    """Judge the margins of a stable loop."""
+    """Check the margins of a stable loop."""
     from rigd.control import loop_margins
 
     try:
@@ -171,7 +171,7 @@ class Travel:
 
     @property
     def total_rad(self) -> float:
-        """Angle to where the shaft stands."""
+        """Angle until the shaft is at rest."""
         return self.driven_rad + self.coasting_rad
 
 
@@ -192,8 +192,8 @@ def worst_travel(
 
     Notes
     -----
-    What is not known is taken at its worst: while the torque is on the beam does not hold the motor
-    back, and after it all of the beam turns on with the shaft, as if it were rigid.
+    Unknown quantities are taken at their worst: while the torque is on the beam does not hold the
+    motor back, and after it all of the beam turns on with the shaft, as if it were rigid.
     """
     if isinf(blind_s):
         return Travel(inf, inf)
@@ -283,7 +283,7 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
 
 
 def travel_rows(profile: Profile) -> Iterator[Row]:
-    """Compare the worst travel of each way with what is left behind the limit of the angle."""
+    """Compare the worst travel of each way with the angle available beyond the limit."""
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     if drive is None:
         why = "the drive is part of this program and ends with it"
@@ -355,7 +355,7 @@ EDS = "eds"
 
 
 def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
-    """Hold an EDS file against what rigd asks of a drive.
+    """Check an EDS file against the requirements on a drive.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
 
     verdicts = {
         Grade.FITS: Verdict.OK,
-        Grade.STANDS_IN: Verdict.OK,
+        Grade.SUBSTITUTED: Verdict.OK,
         Grade.ASK: Verdict.SKIPPED,
         Grade.ACCEPTED: Verdict.WARNING,
         Grade.DOUBT: Verdict.WARNING,
@@ -408,7 +408,7 @@ HIGH_LOAD = 0.7
 
 
 def profile_rows(profile: Profile) -> Iterator[Row]:
-    """Say which profile it is, and which of its numbers are unverified."""
+    """Return the rows on the profile's name and its unverified numbers."""
     yield Row("profile", profile.name, str(profile.path), "", Verdict.OK)
     assumed = [key for key, source in profile.sources.items() if source == "assumed"]
     yield Row(
@@ -422,7 +422,7 @@ def profile_rows(profile: Profile) -> Iterator[Row]:
 
 
 def record_rows(profile: Profile) -> Iterator[Row]:
-    """Return how long a record may be, and whether a chirp as it is by default fits into it."""
+    """Return the row on the longest record, and whether a default chirp fits into it."""
     options = signature(chirp).parameters
     limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
     usual_s = sum(float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s"))
@@ -445,7 +445,7 @@ _EXAMPLE_TILT_DEG = 0.5
 
 
 def plumb_rows(profile: Profile) -> Iterator[Row]:
-    """Say whether the motor's axis is known to be vertical; no session is refused for it."""
+    """Check whether the motor's axis is stated to be vertical; no session is refused for it."""
     if profile.rig.devices.drive == "sim":
         found, detail, verdict = "the simulated rig has no gravity", "", Verdict.SKIPPED
     elif profile.axis_tilt_deg is None:
@@ -468,15 +468,15 @@ def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
     """Return the relative change of mode 1's frequency by gravity along the beam, first order."""
     first_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
     along_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
-    share = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
-    return float(100.0 * share)
+    sag = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
+    return float(100.0 * sag)
 
 
 UNKNOWN_VALUES = "unknown_values"
 
 
 def unknown_rows(profile: Profile) -> Iterator[Row]:
-    """Name the values without which no session can be computed."""
+    """Return the row on unknown values that every session needs."""
     for key in unknown_values(profile.rig):
         remedy = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
         yield Row("profile", key, "unknown", "a value", Verdict.FAIL, remedy, UNKNOWN_VALUES)
@@ -486,7 +486,7 @@ CAN_IDENTIFIERS, CAN_LOAD, SERIAL_LOAD = "can_identifiers", "can_load", "serial_
 
 
 def wiring_rows(rig: RigParameters) -> Iterator[Row]:
-    """Judge identifiers and load of what the profile connects."""
+    """Check identifiers and load of the bus or line in the profile."""
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 

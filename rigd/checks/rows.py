@@ -63,16 +63,16 @@ class Verdict(Enum):
 
     OK = "ok"
     WARNING = "warning"
-    """A session can be run; somebody should know."""
+    """A session can be run, with a caution."""
     FAIL = "failed"
     """No session may be run."""
     SKIPPED = "skipped"
-    """Not looked at; what was found says why."""
+    """Not checked; `found` says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One thing that was looked at; all texts are for the operator."""
+    """One check and its result; all texts are for the operator."""
 
     group: str
     """Part of the rig it belongs to."""
@@ -83,7 +83,7 @@ class Row:
     wanted: str
     """Value it is compared with; empty if there is none."""
     verdict: Verdict
-    """Whether it will do."""
+    """Result of the check."""
     detail: str = ""
     """Text that is too long for a table."""
     name: str = ""
@@ -104,7 +104,7 @@ class Row:
 
 
 def overall(rows: Iterable[Row]) -> str:
-    """Return ``failed``, ``warnings`` or ``ok``; what was skipped does not count."""
+    """Return ``failed``, ``warnings`` or ``ok``; skipped rows do not count."""
     verdicts = {row.verdict for row in rows}
     if Verdict.FAIL in verdicts:
         return "failed"
@@ -148,14 +148,14 @@ OF_AN_EDS = {
 
 
 def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG) -> None:
-    """Print the table, what is too long for it, and the verdict, to standard output.
+    """Print the table, the longer details, and the verdict, to standard output.
 
     Parameters
     ----------
     rows
         Rows, those of a group together.
     consequences
-        Verdict → what follows, said under the table.
+        Verdict → consequence, printed under the table.
     """
     from rich.box import SIMPLE_HEAD  # late: a session prints no table
     from rich.console import Console

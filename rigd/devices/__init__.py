@@ -1,7 +1,9 @@
 """Devices that the loop talks to: contracts, their parameters, and the registry of drivers.
 
-Offers the opening of the devices that a profile names (`open_devices`) and what will move
-(`reality`). Public modules: `contracts` (`Devices`, `WrenchSensor`, `DeviceError`), `parameters`
+Offers the opening of the devices that a profile names (`open_devices`), and what will move: the
+hardware or a simulation (`reality`).
+
+Public modules: `contracts` (`Devices`, `WrenchSensor`, `DeviceError`), `parameters`
 (`RigParameters`), `running_simulator` (the address of ``rigd simulate``), `obstacles` and `eds`
 (EDS files). The drivers are in `canbus`, `cia402` and `ati`, the simulated devices in `rigd.sim`.
 Nothing here knows of sessions, limits or the controller.

@@ -13,7 +13,7 @@ from rigd.devices.parameters import RigParameters, Selection
 from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
 
-# Drive and sensor share a plant or a bus, so drivers are opened by the pair.
+# Drive and sensor use the same plant or bus, so drivers are opened in pairs.
 _OPENERS = {
     Selection(drive="sim", sensor="sim"): ("rigd.sim._devices", "open_simulated_rig"),
     Selection(drive="cia402", sensor="ati_can"): ("rigd.devices._wired_rig", "open_wired_rig"),
@@ -22,11 +22,11 @@ _OPENERS = {
 
 
 class UnknownDeviceError(UserError, ValueError):
-    """A profile names drivers that do not exist or do not belong together."""
+    """A profile names drivers that do not exist or cannot be combined."""
 
 
 class WhatMoves(Enum):
-    """What moves when a rig is opened now."""
+    """Target of the actuation: the hardware, or which simulation."""
 
     HARDWARE = "the hardware"
     SIMULATED = "the simulated rig"
@@ -36,12 +36,12 @@ class WhatMoves(Enum):
 
     @property
     def any_clock(self) -> bool:
-        """Whether time may be skipped."""
+        """Whether the rig may run under the virtual clock."""
         return self in (WhatMoves.SIMULATED, WhatMoves.LOCK_STEP)
 
 
 def check_selection(selection: Selection, source: Path | None = None) -> None:
-    """Refuse a selection of drivers that cannot be opened.
+    """Raise if no driver exists for a selection of devices.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
     Raises
     ------
     UnknownDeviceError
-        Naming what there is to choose from.
+        If the combination does not exist; the message lists those that do.
     """
     if selection not in _OPENERS:
         known = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
@@ -65,7 +65,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
 
 
 def reality(rig: RigParameters) -> WhatMoves:
-    """Return what would move if the devices of a rig were opened now."""
+    """Return what moves if the devices of a rig are opened now."""
     if rig.devices.drive == "sim":
         return WhatMoves.SIMULATED
     simulator = find_simulator(rig.name)
@@ -82,7 +82,7 @@ def what_moves(rig: RigParameters, moving: WhatMoves) -> str:
     rig
         Parameters of the rig.
     moving
-        What `reality` found.
+        Result of `reality`.
     """
     if moving is not WhatMoves.HARDWARE:
         how = "in this process" if moving is WhatMoves.SIMULATED else moving.value
@@ -102,7 +102,7 @@ def simulated_differently(rig: RigParameters) -> list[str]:
 
 
 def objections(rig: RigParameters) -> list[str]:
-    """Say why the devices of a rig cannot share their bus, before anything is sent."""
+    """List the reasons why the devices of a rig cannot use one bus, before anything is sent."""
     if rig.can is None:
         return []
     from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
@@ -131,7 +131,7 @@ def open_devices(rig: RigParameters, moving: WhatMoves | None = None) -> Devices
     rig
         Parameters of a profile.
     moving
-        What the operator was told would move, if that was told before.
+        Target that the operator has confirmed, if any.
 
     Raises
     ------

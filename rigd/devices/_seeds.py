@@ -9,7 +9,7 @@ _BITS: Final = 53
 
 
 def fresh_seed() -> int:
-    """Return a seed that no other session has."""
+    """Return a random seed."""
     return secrets.randbits(_BITS)
 
 

@@ -31,7 +31,7 @@ MAY_BE_UNKNOWN: Final = {
         "less"
     ),
     "motor.continuous_torque_nm": (
-        "data sheet of the motor: torque that it bears for ever, times the gear ratio"
+        "data sheet of the motor: continuous torque rating, times the gear ratio"
     ),
     "motor.thermal_time_constant_s": "data sheet of the motor: time constant of its winding",
     "encoder.resolution_rad": (
@@ -69,7 +69,7 @@ def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
 
 
 def describe_unknown_values(rig: "RigParameters") -> str:
-    """Name the unknown values, a line for each with the place to find it; empty: none.
+    """List the unknown values, one a line, with where to find each; empty if there are none.
 
     Parameters
     ----------

@@ -24,8 +24,8 @@ def open_wired_rig(rig: RigParameters) -> Devices:
     Raises
     ------
     DeviceError
-        If identifiers collide, the bus would be too full, or the hardware and a simulated rig are
-        both there.
+        If identifiers collide, the bus load is too high, or both hardware and a simulated rig are
+        available.
     """
     bus = rig.can
     assert bus is not None
@@ -49,7 +49,7 @@ def open_wired_rig(rig: RigParameters) -> Devices:
 
 
 def _renew_noise(simulator: SimulatorAddress, seed: int | None) -> int:
-    """Have a simulated rig begin its noise anew; return the seed."""
+    """Restart the noise of a simulated rig; return the seed."""
     return int(ask_simulator(simulator, {"renew_noise": seed})["seed"])
 
 
@@ -64,7 +64,7 @@ def _sensor(rig: RigParameters, link: CanLink, simulator: SimulatorAddress | Non
 
 
 def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
-    """Refuse to guess between a simulated rig and hardware that is there as well."""
+    """Raise if both a simulated rig and hardware are available."""
     assert rig.can is not None
     found = []
     if simulator.can_socket and (_INTERFACES / rig.can.channel).exists():
@@ -81,7 +81,7 @@ def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
 
 @runtime_checkable
 class ResettableDrive(Protocol):
-    """A drive that can be in fault; simulated ones in this process cannot."""
+    """Drive that can be in fault; drives simulated in this process cannot."""
 
     def reset_fault(self) -> str | None:
         """Switch off, reset a fault, check that it would get ready; return the fault, or None.
@@ -89,12 +89,12 @@ class ResettableDrive(Protocol):
         Raises
         ------
         DeviceError
-            If the drive may still turn, the fault stands, or no session could be started.
+            If the drive may still turn, the fault persists, or no session could be started.
         """
 
 
 def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
-    """Reset the drive of a rig, and let go of it.
+    """Reset the fault of a rig's drive, and release the drive.
 
     Parameters
     ----------
@@ -104,13 +104,13 @@ def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
     Returns
     -------
     str
-        What was found and how the drive stands now, for the operator.
+        Fault that was found and present state of the drive, for the operator.
 
     Raises
     ------
     DeviceError
-        If the drive does not answer, may still turn, the fault stands, or it does not get ready,
-        as with STO open.
+        If the drive does not answer, may still turn, the fault persists, or the drive does not
+        become ready, for instance because STO is open.
     """
     drive = open_devices(rig, moving).drive
     if not isinstance(drive, ResettableDrive):

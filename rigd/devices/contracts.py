@@ -1,7 +1,7 @@
 """Contracts between the 1 kHz cycle and its devices: a drive and a force-torque sensor.
 
-Real and simulated devices stand behind the same two contracts, and one conformance suite runs on
-every implementation. Constructors touch no hardware; ``connect`` does.
+Real and simulated devices implement the same two contracts, and one conformance suite runs on every
+implementation. Constructors touch no hardware; ``connect`` does.
 
 In every tick the cycle calls, in this order: ``drive.latch``, ``sensor.request``,
 ``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver that has no fresh value
@@ -22,7 +22,7 @@ Wrench = tuple[float, float, float, float, float, float]
 
 
 class DeviceError(FailureError):
-    """A device did not do what it was asked: the message names device, expectation and reply."""
+    """A device did not act as requested: the message states device, expectation and reply."""
 
 
 def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
@@ -56,12 +56,12 @@ class LineHealth:
     status
         Status word of the device; 0: all is well.
     doubt
-        Why its readings may be older than they are said to be, for the operator, in the same words
-        as long as the reason is the same; empty: they are not.
+        Why its readings may be older than reported, for the operator, in the same words as long as
+        the reason is the same; empty: no doubt.
     doubt_count
         How much of it there has been so far, a sentence; empty without a doubt.
     cause
-        What probably keeps readings from coming, with its remedy; empty: not known.
+        Probable cause of missing readings, with its remedy; empty: not known.
     """
 
     bits: int | None = None
@@ -99,13 +99,12 @@ class Drive(Protocol):
         Parameters
         ----------
         stop
-            Whether the session is to be stopped; asked again and again where it takes its time. The
-            drive is then disabled instead.
+            Called repeatedly; if it returns True, the drive is disabled instead.
 
         Raises
         ------
         DeviceError
-            If it does not get there.
+            If the drive does not reach that state.
         """
 
     def latch(self, due_ns: int) -> None:
@@ -148,7 +147,7 @@ class WrenchSensor(Protocol):
     wrench_stale: bool
     """The last wrench read is not the answer to the last request."""
     wrench_time_ns: int
-    """When the last wrench read was asked for, or arrived if it is streamed; as for the angle."""
+    """When the last wrench read was requested, or arrived if it is streamed; as for the angle."""
     wrench_saturated: bool
     """An axis of the last wrench is at the end of its range."""
 
@@ -168,7 +167,7 @@ class WrenchSensor(Protocol):
         """Ask for the wrench as it is now; ``due_ns`` is when the tick was due."""
 
     def read_wrench(self) -> Wrench:
-        """Return the wrench that was asked for."""
+        """Return the requested wrench."""
 
     def health(self) -> LineHealth:
         """Return the health of line and sensor; quick enough for an occasional call in the loop."""
@@ -196,8 +195,8 @@ class Devices:
     simulated: bool
     """No motor moves: the rig may run under the virtual clock."""
     renew_noise: Callable[[int | None], int] | None = None
-    """Begins the noise of a simulated rig anew before a session, from the seed given or (None) one
-    of the rig's own, and returns that seed; None: there is nothing to begin anew."""
+    """Restarts the noise of a simulated rig before a session, from a given seed or (None) one of
+    its own, and returns the seed; None: there is no noise to restart."""
 
     @property
     def on_lines(self) -> bool:

@@ -2,8 +2,8 @@
 
 Real files have what the canopen library refuses: byte order marks, keys in lower case, sections
 given twice or out of order, empty values, octal numbers, missing names. :func:`_put_right` corrects
-all of it in one place. What the library accepts is read with the same result, but without importing
-it, which takes longer than reading a file.
+all of it. A file that the library accepts is read with the same result, but without importing the
+library, which takes longer than reading a file.
 """
 
 import re
@@ -73,14 +73,14 @@ class EdsEntry:
     mappable: bool
     """Into a PDO."""
     default: int | None
-    """Value after power-up, or the one that a DCF sets; None: not told, or no whole number."""
+    """Value after power-up, or the one that a DCF sets; None: not stated, or no integer."""
     low: int | None
     """Least value; None: not stated."""
     high: int | None
     """Largest value; None: not stated."""
     content: bytes = b""
     """The default where it is a text, a block or a fraction, as the drive holds it; empty: not
-    told."""
+    stated."""
 
     @property
     def writable(self) -> bool:
@@ -89,7 +89,7 @@ class EdsEntry:
 
     @property
     def bits(self) -> int | None:
-        """Length of the value; None of a text or block, or where no type is told."""
+        """Length of the value; None for a text or block, or if no type is stated."""
         return _BITS.get(self.data_type)
 
 
@@ -112,7 +112,7 @@ class Eds:
     revision: int
     """Value of object 1018:3; 0: not stated."""
     bit_rates_bit_s: tuple[int, ...]
-    """Empty: not told."""
+    """Bit rates that the drive supports; empty: not stated."""
     commissioned_node_id: int
     """Node number of the one drive that a DCF configures; 0: not stated."""
     entries: Mapping[tuple[int, int], EdsEntry]
@@ -141,7 +141,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     path
         Path of the EDS or DCF file.
     node_id
-        Node number of the drive: what ``$NODEID`` stands for in the file.
+        Node number of the drive: the value of ``$NODEID`` in the file.
 
     Returns
     -------
@@ -223,7 +223,7 @@ def _text(path: Path) -> str:
 def _sections(text: str, path: Path) -> Sections:
     """Parse a file into sections; lines that are neither section nor key are ignored.
 
-    Where a section or key stands twice, the first one counts.
+    If a section or key is given twice, the first one counts.
     """
     sections: Sections = {}
     keys: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""What a simulated beam meets, as it is written in a profile or on the command line.
+"""Obstacles and impacts on a simulated beam, as written in a profile or on the command line.
 
 ``x=0.62,angle=0.6,stiffness=3000`` is an obstacle, ``x=0.5,force=2,duration=0.02,at=3`` a knock.
 """
@@ -13,12 +13,12 @@ from rigd.errors import UserError
 
 
 class ObstacleError(UserError, ValueError):
-    """An obstacle is not written as it should be; the message says what may stand there."""
+    """An obstacle has a syntax error; the message states what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Something that stands in the way of the beam: it pushes, and never pulls.
+    """Obstacle in the path of the beam: it pushes, and never pulls.
 
     Its force is ``stiffness · penetration + damping · its rate``, while that pushes.
     """
@@ -42,7 +42,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
+class ImpactSpecification:
     """Pulse of force on the beam: half a sine."""
 
     x_m: float
@@ -55,12 +55,12 @@ class Knock:
     """When it begins, from the first enabling of the drive."""
 
 
-Encounter = Obstacle | Knock
-"""What the beam may meet."""
+Disturbance = Obstacle | ImpactSpecification
+"""Obstacle or impact on the simulated beam."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Key:
+class _ObstacleKey:
     field: str
     says: str
     fits: Callable[[float], bool]
@@ -75,30 +75,36 @@ def _time(value: float) -> bool:
     return 0 <= value <= _LONGEST_S
 
 
-_KEYS: dict[type[Encounter], dict[str, _Key]] = {
+_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
     Obstacle: {
-        "x": _Key("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
-        "angle": _Key("angle_rad", "an angle in rad, -10 to 10", lambda v: abs(v) <= 10, True),
-        "stiffness": _Key(
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "angle": _ObstacleKey(
+            "angle_rad", "an angle in rad, -10 to 10", lambda v: abs(v) <= 10, True
+        ),
+        "stiffness": _ObstacleKey(
             "stiffness_n_per_m",
             f"a stiffness of 1 to {_MOST_STIFF:.0f} N/m, or rigid",
             lambda v: 1 <= v <= _MOST_STIFF or v == inf,
         ),
-        "damping": _Key(
+        "damping": _ObstacleKey(
             "damping_n_s_per_m", "a damping of 0 to 10000 N·s/m", lambda v: 0 <= v <= 1e4
         ),
-        "side": _Key("side", "1 or -1", lambda v: v in (1, -1)),
-        "rate": _Key("rate_rad_s", "a speed in rad/s, -100 to 100", lambda v: abs(v) <= 100),
-        "from": _Key("from_s", "a time in s, at least 0", _time),
-        "until": _Key("until_s", "a time in s, at least 0", _time),
+        "side": _ObstacleKey("side", "1 or -1", lambda v: v in (1, -1)),
+        "rate": _ObstacleKey(
+            "rate_rad_s", "a speed in rad/s, -100 to 100", lambda v: abs(v) <= 100
+        ),
+        "from": _ObstacleKey("from_s", "a time in s, at least 0", _time),
+        "until": _ObstacleKey("until_s", "a time in s, at least 0", _time),
     },
-    Knock: {
-        "x": _Key("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
-        "force": _Key("force_n", "a force in N, -1000 to 1000", lambda v: abs(v) <= 1e3, True),
-        "duration": _Key(
+    ImpactSpecification: {
+        "x": _ObstacleKey("x_m", "a distance above 0 m", lambda v: 0 < v <= 100, needed=True),
+        "force": _ObstacleKey(
+            "force_n", "a force in N, -1000 to 1000", lambda v: abs(v) <= 1e3, True
+        ),
+        "duration": _ObstacleKey(
             "duration_s", "a time in s, 0.0001 to 100", lambda v: 1e-4 <= v <= 100, True
         ),
-        "at": _Key("at_s", "a time in s, at least 0", _time, True),
+        "at": _ObstacleKey("at_s", "a time in s, at least 0", _time, True),
     },
 }
 _WORDS = {"rigid": inf}
@@ -113,7 +119,7 @@ NOT_BESIDE_OBSTACLES = (
 """Keys of ``[simulation]`` with which no obstacle is simulated."""
 
 
-def parse_obstacle(text: str) -> Encounter:
+def parse_obstacle(text: str) -> Disturbance:
     """Read an obstacle or a knock.
 
     Parameters
@@ -127,7 +133,7 @@ def parse_obstacle(text: str) -> Encounter:
     Raises
     ------
     ObstacleError
-        Naming the key that is wrong and what may stand there.
+        If a key or value is wrong; the message states what is allowed.
 
     Examples
     --------
@@ -136,7 +142,11 @@ def parse_obstacle(text: str) -> Encounter:
     3000.0
     """
     words = [word.strip() for word in text.split(",")]
-    kind = Knock if any(word.partition("=")[0].strip() == "force" for word in words) else Obstacle
+    kind = (
+        ImpactSpecification
+        if any(word.partition("=")[0].strip() == "force" for word in words)
+        else Obstacle
+    )
     keys = _KEYS[kind]
     values: dict[str, float] = {}
     for word in words:
@@ -156,8 +166,8 @@ def parse_obstacle(text: str) -> Encounter:
     for name, key in keys.items():
         if key.needed and key.field not in values:
             raise _complaint(text, f"'{name}' is missing; give {name}=…, {key.says}")
-    if kind is Knock:
-        return Knock(**values)
+    if kind is ImpactSpecification:
+        return ImpactSpecification(**values)
     side = int(values.pop("side", _side_of(values["angle_rad"])))
     obstacle = Obstacle(**values, side=side)
     if obstacle.until_s <= obstacle.from_s:
@@ -166,29 +176,30 @@ def parse_obstacle(text: str) -> Encounter:
 
 
 def check_obstacles(
-    encounters: Iterable[Encounter], beam: Beam, simulated: Mapping[str, float | None]
+    disturbances: Iterable[Disturbance], beam: Beam, simulated: Mapping[str, float | None]
 ) -> None:
     """Refuse obstacles that cannot be simulated on a rig.
 
     Parameters
     ----------
-    encounters
+    disturbances
         Obstacles and knocks.
     beam
         The beam, on which they have to be.
     simulated
-        What else is simulated, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: it is not.
+        Other simulated effects, by the keys of `NOT_BESIDE_OBSTACLES`; 0 or None: none
+        of that kind.
 
     Raises
     ------
     ObstacleError
-        Saying why, and what to change.
+        If one cannot be simulated; the message states reason and remedy.
     """
-    for encounter in encounters:
-        if encounter.x_m > beam.length_m:
+    for disturbance in disturbances:
+        if disturbance.x_m > beam.length_m:
             raise ObstacleError(
-                f"Obstacle '{describe_obstacle(encounter)}': x={encounter.x_m:g} m lies beyond the "
-                f"tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
+                f"Obstacle '{describe_obstacle(disturbance)}': x={disturbance.x_m:g} m lies beyond "
+                f"the tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
             )
         for name, value in simulated.items():
             if value:
@@ -199,7 +210,7 @@ def check_obstacles(
 
 
 def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
-    """Put obstacles in the way of a rig's simulated beam, beside those of its profile.
+    """Add obstacles to those of a rig's simulated beam.
 
     Parameters
     ----------
@@ -211,7 +222,7 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
     Raises
     ------
     ObstacleError
-        If one is not written as it should be, or cannot be simulated on this rig.
+        If one has a syntax error, or cannot be simulated on this rig.
     """
     simulation = rig.simulation
     if simulation is None:
@@ -220,26 +231,26 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
             "obstacle; copy it from that of rigd profiles show sim."
         )
     texts = tuple(texts)
-    beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
-    check_obstacles(map(parse_obstacle, texts), rig.beam, beside)
+    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    check_obstacles(map(parse_obstacle, texts), rig.beam, simulated)
     return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
 
 
-def describe_obstacle(encounter: Encounter) -> str:
+def describe_obstacle(disturbance: Disturbance) -> str:
     """Write an obstacle or a knock so that `parse_obstacle` reads it back.
 
     Parameters
     ----------
-    encounter
-        What is written.
+    disturbance
+        Obstacle or impact.
     """
-    default = {each.name: each.default for each in fields(encounter)}
-    if isinstance(encounter, Obstacle):
-        default["side"] = _side_of(encounter.angle_rad)
+    default = {each.name: each.default for each in fields(disturbance)}
+    if isinstance(disturbance, Obstacle):
+        default["side"] = _side_of(disturbance.angle_rad)
     return ",".join(
         f"{name}={value:g}" if float(f"{value:g}") == value else f"{name}={value!r}"
-        for name, key in _KEYS[type(encounter)].items()
-        if (value := getattr(encounter, key.field)) != default[key.field]
+        for name, key in _KEYS[type(disturbance)].items()
+        if (value := getattr(disturbance, key.field)) != default[key.field]
     )
 
 

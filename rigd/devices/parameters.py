@@ -63,8 +63,8 @@ class WrenchSensor:
     delay_s: NonNegative = 0.0
     """Age of the wrench at the tick that asks for it."""
     filter_hz: NonNegative = field(default=0.0, metadata=OPTIONAL)
-    """Corner of the sensor's own low-pass filter, which the analysis is told of; 0: none is known.
-    Its delay is not part of `delay_s`."""
+    """Corner of the sensor's own low-pass filter, as used by the analysis; 0: none is known. Its
+    delay is not part of `delay_s`."""
     filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
     """Order of that filter: 1, or 2 (Butterworth)."""
     shear_projection: tuple[float, float, float, float, float, float] = field(
@@ -118,14 +118,13 @@ class Simulation:
     stiffness_drift_per_s: Annotated[float, Ge(-1e-3), Le(1e-3)] = field(
         default=0.0, metadata=OPTIONAL
     )
-    """By what share of itself the beam's bending stiffness grows each second, from the first
-    enabling of the drive until it has changed by 5 %; below 0, as of a beam that warms, it
-    falls."""
+    """Relative growth of the beam's bending stiffness per second, from the first enabling of the
+    drive until it has changed by 5 %; below 0, as of a beam that warms, it falls."""
     air_drag_m: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Drag coefficient times diameter of the beam, C_D d, in air of 1.2 kg/m³; 0: no drag."""
     crosstalk_percent: Annotated[float, Ge(0), Le(20)] = field(default=0.0, metadata=OPTIONAL)
-    """Error of the sensor's calibration: the largest share of its range that an axis shows of the
-    full range of another."""
+    """Error of the sensor's calibration: the largest reading of an axis, as a fraction of its
+    range, at the full range of another."""
     zeta_scatter_percent: Annotated[float, Ge(0), Le(50)] = field(default=0.0, metadata=OPTIONAL)
     """Standard deviation between sessions of the logarithm of zeta."""
     gamma_scatter_percent: Annotated[float, Ge(0), Le(50)] = field(default=0.0, metadata=OPTIONAL)
@@ -150,7 +149,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class CanBus:
-    """The CAN bus that the devices share, as python-can names it."""
+    """CAN bus of the devices, as python-can names it."""
 
     interface: Annotated[str, MinLen(1)]
     """"socketcan", or another interface of python-can."""
@@ -226,8 +225,8 @@ class ServoDrive:
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
     sync_gaps: bool = field(default=False, metadata=OPTIONAL)
     """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late: for
-    drives that tolerate a missing SYNC. False: no SYNC is ever left out, and replies are told
-    apart by counting alone."""
+    drives that tolerate a missing SYNC. False: no SYNC is ever left out, and replies are
+    distinguished by counting alone."""
     torque_response_s: Annotated[float, Ge(0), Le(1)] = field(default=0.0, metadata=OPTIONAL)
     """Time constant with which the actual torque (6077) follows the commanded one; 0: at once."""
     follows_target_bit: bool = field(default=True, metadata=OPTIONAL)
@@ -237,8 +236,8 @@ class ServoDrive:
     def watchdog_s(self) -> float:
         """The longest time for which the torque may stay on after this computer fell silent.
 
-        As far as the profile tells: which watchdog stands is known once the drive is connected.
-        Infinite where the profile accepts a drive without any.
+        By the profile alone: the active watchdog is known once the drive is connected. Infinite
+        where the profile accepts a drive without any.
         """
         if self.own_watchdog_s > 0:
             return max(self.heartbeat_timeout_s, self.own_watchdog_s)
@@ -327,7 +326,7 @@ class RigParameters:
     simulation: Simulation | None = field(default=None)
     """Noise of the simulated rig; None: it cannot be simulated in the process."""
     name: str = "rig"
-    """Name of the profile: by it a driver finds the simulated rig that stands in for this one."""
+    """Name of the profile, by which a driver finds the simulated rig that replaces this one."""
     can: CanBus | None = field(default=None)
     """CAN bus. None: the rig has none."""
     acquisition: Acquisition | None = field(default=None)

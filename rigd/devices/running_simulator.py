@@ -1,7 +1,7 @@
 """Address of a running ``rigd simulate``: one small file for each simulated rig.
 
-The simulated rig stands in for the hardware of one profile. Whoever opens that profile's devices
-looks here first, so that a motor never moves where a simulation was meant.
+A simulated rig replaces the hardware of one profile. Code that opens the devices of a profile
+checks here first, so that a motor never moves where a simulation was meant.
 """
 
 import json
@@ -72,7 +72,7 @@ def announce(rig_name: str, address: SimulatorAddress) -> Path:
     Parameters
     ----------
     rig_name
-        Name of the profile that it stands in for.
+        Name of the profile that it replaces.
     address
         Where it is.
     """
@@ -130,8 +130,8 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
 def unreachable_simulators(rig_name: str) -> list[Path]:
     """Return the control sockets on which any simulator of a rig listens on this computer.
 
-    The kernel lists them whoever runs the simulator, and wherever its runtime folder is. Ask only
-    if `find_simulator` finds none: those that are listed then cannot be reached from here.
+    The kernel lists them for every user who runs the simulator, and wherever its runtime folder is.
+    Ask only if `find_simulator` finds none: those that are listed then cannot be reached from here.
     """
     try:
         return [path for path in listening_sockets() if path.name == f"{rig_name}.control"]

@@ -5,7 +5,7 @@ from math import floor, inf, log10
 from typing import Any
 
 from rigd.control import ControlDesignError, check_stability, close_loop
-from rigd.identification.estimate import MotorEstimate, Quantity
+from rigd.identification.estimate import MotorEstimate, MotorQuantity
 from rigd.profile import Profile
 from rigd.units import unit_of
 
@@ -73,11 +73,11 @@ _HIGH_MISFIT = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """A number of the profile beside what was measured."""
+class ProposalRow:
+    """A number of the profile and its measured value."""
 
     key: str
-    measured: Quantity
+    measured: MotorQuantity
     profile_value: float
     source: str
     """Source of the profile's value."""
@@ -91,7 +91,7 @@ class Row:
 
     @property
     def is_below_least(self) -> bool:
-        """Whether the measured value is smaller than can be, by more than its scatter."""
+        """Whether the measured value is below its lower bound by more than its scatter."""
         lowest = self.least - _DIFFERS * (self.measured.std or 0.0)
         return self.least > 0.0 and self.measured.value < lowest
 
@@ -103,7 +103,7 @@ class Row:
         return abs(self.measured.value - self.profile_value) > _DIFFERS * self.measured.std
 
     def toml(self) -> str:
-        """Return the line to paste: within its scatter no value is smaller than it can be."""
+        """Return the line to paste; a value below its bound by less than its scatter is raised."""
         std = self.measured.std or 0.0
         value, deviation = _rounded(self.measured.value, std)
         if not self.is_below_least and float(value) < self.least:
@@ -114,12 +114,12 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """An estimate beside the profile it is to improve."""
+    """Comparison of an estimate with the profile that it is to improve."""
 
     estimate: MotorEstimate
     """Estimate of the motor."""
-    rows: tuple[Row, ...]
-    """Quantity by quantity, the estimate beside the profile."""
+    rows: tuple[ProposalRow, ...]
+    """Comparison of estimate and profile, one row a quantity."""
     notes: tuple[str, ...]
     """Sentences for the operator."""
 
@@ -200,7 +200,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     """
     rig = profile.rig
     motor = rig.motor
-    found: list[tuple[str, Quantity, float]] = [
+    found: list[tuple[str, MotorQuantity, float]] = [
         ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
@@ -228,7 +228,8 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     waits = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     least = {"actuation.delay_s": 1 / rig.rate_hz} if waits else {}
     rows = tuple(
-        Row(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0)) for row in found
+        ProposalRow(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0))
+        for row in found
     )
     notes = _notes(estimate, profile, unusable)
     if any(row.is_below_least for row in rows if row.key in least):
@@ -239,9 +240,9 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     return Proposal(estimate, rows, tuple(notes))
 
 
-def _times(factor: float, quantity: Quantity) -> Quantity:
+def _times(factor: float, quantity: MotorQuantity) -> MotorQuantity:
     std = None if quantity.std is None else factor * quantity.std
-    return Quantity(factor * quantity.value, std)
+    return MotorQuantity(factor * quantity.value, std)
 
 
 def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str]:
@@ -285,7 +286,7 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
 
 
 def _rounded(value: float, std: float) -> tuple[str, str]:
-    """Write a value and its deviation to two figures of the deviation."""
+    """Format a value and its deviation to two digits of the deviation."""
     if std <= 0.0:
         return f"{value:.6g}", "0"
     exponent = floor(log10(max(abs(value), std)))

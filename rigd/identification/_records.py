@@ -1,4 +1,4 @@
-"""Windows of motion from recorded sessions, as the estimate takes them."""
+"""Windows of motion from recorded sessions, as input of the estimate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.identification.estimate import EstimateError, Timing, Window
+from rigd.identification.estimate import MotorEstimateError, PassReadings, Timing
 from rigd.identification.experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
 from rigd.session import Session, read_session, sample_digests
 from rigd.session.layout import Status
@@ -14,14 +14,14 @@ from rigd.session.layout import Status
 _USELESS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
 )
-"""A held or clipped reading does not belong to the torque of its tick."""
+"""Status bits of held or clipped readings, which do not belong to the torque of their tick."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
     """Data of some sessions of one rig for the estimate."""
 
-    windows: list[Window]
+    windows: list[PassReadings]
     timing: Timing
     tool_inertia_kg_m2: float
     unusable: int
@@ -42,11 +42,11 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     ------
     SessionError
         If a file cannot be read.
-    EstimateError
+    MotorEstimateError
         If a file is of another excitation, its rate or delays are not those of the first, or two
         files have samples in common.
     """
-    windows: list[Window] = []
+    windows: list[PassReadings] = []
     unusable = 0
     first: tuple[Timing, float] | None = None
     digests: dict[Path, frozenset[bytes]] = {}
@@ -56,7 +56,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         own = sample_digests(samples["angle_rad"], samples["coupling_torque_nm"])
         for other, theirs in digests.items():
             if own & theirs:
-                raise EstimateError(
+                raise MotorEstimateError(
                     f"{path}: it has samples of {other}, noise included, which would count twice; "
                     "give each session once."
                 )
@@ -73,7 +73,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         if first is None:
             first = found
         if found != first:
-            raise EstimateError(
+            raise MotorEstimateError(
                 f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
                 "sessions of one rig."
             )
@@ -81,20 +81,20 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         windows += usable
         unusable += expected - len(usable)
     if first is None:
-        raise EstimateError("No session file is given.")
+        raise MotorEstimateError("No session file is given.")
     if all(window.top_hz == TOP_HZ[SPEEDS] for window in windows):
-        raise EstimateError(
+        raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."
         )
     return Recording(windows, *first, unusable)
 
 
-def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[Window], int]:
+def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[PassReadings], int]:
     """Return the usable windows of a session, and how many there should be."""
     layout = read_layout(session.metadata)
     if layout is None:
-        raise EstimateError(
+        raise MotorEstimateError(
             f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
             "give the files that it wrote."
         )
@@ -110,7 +110,7 @@ def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[Window]
             continue
         part = samples[first:end]
         windows.append(
-            Window(
+            PassReadings(
                 angle_rad=part["angle_rad"],
                 torque_command_nm=part["torque_command_nm"],
                 coupling_torque_nm=part["coupling_torque_nm"],

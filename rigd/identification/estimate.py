@@ -6,13 +6,13 @@ between commands,
     ``s u(t - D) = J θ'' + B θ' + C sign(θ') + z + τ_c``,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
-reading is differentiated; frequency by frequency this gives linear rows, _moments of the readings
+reading is differentiated; frequency by frequency this gives linear rows, moments of the readings
 (`_moments`). All integrals are exact for a command that changes at any moment of a period. The
-measured coupling torque τ_c stands alone on its side because it carries the noise.
+measured coupling torque τ_c is alone on its side because it carries the noise.
 
 The rows are fitted by weighted least squares (`_fit`). The mean of repeats is fitted, because the
 loop feeds the noise of a reading back into the command and so biases a fit of single ones; their
-scatter gives the weights, what is left of that bias, and the standard deviations.
+scatter gives the weights, the remainder of that bias, and the standard deviations.
 """
 
 from collections.abc import Hashable, Sequence
@@ -34,7 +34,7 @@ SCALE, INERTIA, VISCOUS, COULOMB, DELAY, ZERO = range(6)
 """Indices of the unknowns; from the last on, one zero of the torque for each session."""
 
 _FLANK = 0.15
-"""Part of a window in which the test functions rise, and fall."""
+"""Part of a window over which the test functions rise, and fall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class _Stack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
+class _StackMoments:
     """Moments of a stack: ``y = x p``, a row a repeat and frequency."""
 
     y: Complex
@@ -73,7 +73,9 @@ class _Rows:
     """(r, m, p), of what belongs to each unknown."""
 
 
-def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int) -> _Rows:
+def _moments(
+    stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int
+) -> _StackMoments:
     """Integrate a stack with the test functions; times count from the window's first angle."""
     period_s = 1.0 / timing.rate_hz
     repeats, n = stack.angle_rad.shape
@@ -97,7 +99,7 @@ def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknow
     age_s = timing.angle_delay_s - timing.torque_delay_s
     y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
 
-    # A command stands for a period: its middle, and the integral over the period around it.
+    # A command lasts a period: its middle, and the integral over the period around it.
     middle_s = delay_s + 0.5 * period_s
     w, w1, _ = _test_window(tick_s + middle_s, length_s)
     held = np.sinc(omega * period_s / (2.0 * pi))
@@ -111,7 +113,7 @@ def _moments(stack: _Stack, timing: Timing, delay_s: float, scale: float, unknow
     x[..., COULOMB] = -stack.direction * constant
     x[..., DELAY] = scale * slope
     x[..., ZERO + stack.session] = -constant
-    return _Rows(y, x)
+    return _StackMoments(y, x)
 
 
 def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
@@ -130,7 +132,7 @@ def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
 
 _MARGIN = 1.25
 """On all deviations: they are themselves known to some 15 %, and the filter of the readings and the
-beam's share in a jump of torque are not in the model."""
+beam's part in a jump of torque are not in the model."""
 _MAX_ITERATIONS = 30
 _CONVERGED_S = 1e-9
 _LONGEST_DELAY_S = 0.05
@@ -139,7 +141,7 @@ _SMOOTHED_BINS = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """The unknowns in the order of `_moments`, and the fit's own diagnostics."""
+    """Solution in the order of `_moments`, with diagnostics."""
 
     values: Real
     """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""
@@ -149,7 +151,7 @@ class _Fit:
 
 
 def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit | None:
-    """_Fit by least squares, iterated for delay and weights; None if it does not settle.
+    """Fit by least squares, iterated for delay and weights; None if it does not converge.
 
     Parameters
     ----------
@@ -158,7 +160,7 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
     timing
         Timing of the readings; the search for the delay starts at its value.
     hold_scale
-        Take the commanded torque for the true one.
+        Whether the commanded torque counts as the true one.
     """
     unknowns = ZERO + 1 + max(stack.session for stack in stacks)
     free = np.arange(unknowns) != SCALE if hold_scale else np.full(unknowns, fill_value=True)
@@ -172,8 +174,8 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
         change_s = float(solution[DELAY])
         if abs(change_s) < _CONVERGED_S:
             try:
-                return _judge(rows, weights, residuals, free, solution, delay_s)
-            except np.linalg.LinAlgError:  # something is not in the record at all
+                return _with_uncertainty(rows, weights, residuals, free, solution, delay_s)
+            except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
         delay_s, scale = delay_s + change_s, float(solution[SCALE])
         if not (abs(delay_s) < _LONGEST_DELAY_S and scale > 0.0):
@@ -182,8 +184,8 @@ def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit 
     return None
 
 
-def _solve(rows: Sequence[_Rows], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
-    """_Fit the means of the repeats; the scale, where it is not free, is 1."""
+def _solve(rows: Sequence[_StackMoments], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
+    """Fit the means of the repeats; the scale, if it is not free, is 1."""
     solution = np.zeros(free.size)
     solution[SCALE] = 1.0
     matrix, side = [], []
@@ -221,8 +223,8 @@ def _weights(residuals: Sequence[Complex], stacks: Sequence[_Stack]) -> list[Rea
     ]
 
 
-def _judge(
-    rows: Sequence[_Rows],
+def _with_uncertainty(
+    rows: Sequence[_StackMoments],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
     free: NDArray[np.bool_],
@@ -239,8 +241,8 @@ def _judge(
         mean = x.mean(axis=0)
         normal += np.einsum("mp,m,mq->pq", mean.conj(), weight, mean).real
         apart = x - mean
-        share = weight / (repeats * (repeats - 1))
-        bias += np.einsum("rmp,m,rm->p", apart.conj(), share, residual).real
+        part = weight / (repeats * (repeats - 1))
+        bias += np.einsum("rmp,m,rm->p", apart.conj(), part, residual).real
     inverse = np.linalg.inv(normal)
 
     # Each stack's part in the variance, from the scatter of what its repeats pull at the solution.
@@ -258,9 +260,9 @@ def _judge(
         terms += rest.size
         constant = abs(row.x[0, 0, COULOMB])
         departure_nm = max(departure_nm, abs(float(rest[0].real)) / float(constant))
-    shares = np.array(parts)
-    variance = shares.sum(axis=0)
-    freedom = variance**2 / np.sum(shares**2 / np.array(degrees)[:, None], axis=0)
+    parts_of_variance = np.array(parts)
+    variance = parts_of_variance.sum(axis=0)
+    freedom = variance**2 / np.sum(parts_of_variance**2 / np.array(degrees)[:, None], axis=0)
     misfit = left / max(1.0, terms - 0.5 * chosen.size)
     widening = _MARGIN * _coverage(freedom) * sqrt(max(1.0, misfit))
 
@@ -272,17 +274,17 @@ def _judge(
 
 
 def _coverage(freedom: Real) -> Real:
-    """Three quantiles' worth: Student's t over the normal's at 3, to second order in 1/freedom."""
+    """Return Student's t over the normal quantile at 3 deviations, to second order in 1/freedom."""
     return 1.0 + (7.5 / freedom + 17.25 / freedom**2) / 3.0
 
 
 # Estimate of a motor
 
 LEAST_REPEATS = 4
-"""Fewer tell too little of the scatter."""
+"""Fewer repeats do not determine the scatter."""
 
 _LEAST_SPEED_PART = 0.1
-"""Share of the nominal speed below which a window may contain a standstill."""
+"""Fraction of the nominal speed below which a window may contain a standstill."""
 _SPEED_S = 0.01
 """Half the time over which that speed is taken."""
 _MAX_SCALE_STD = 0.05
@@ -292,12 +294,12 @@ _SCALES = (0.5, 2.0)
 torque constant."""
 
 
-class EstimateError(FailureError, ValueError):
+class MotorEstimateError(FailureError, ValueError):
     """The windows do not determine the motor's data; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class PassReadings:
     """Readings during one pass at constant nominal speed, each of shape (n,)."""
 
     angle_rad: Real
@@ -309,7 +311,7 @@ class Window:
     speed_rad_s: float
     """Nominal, signed."""
     top_hz: float
-    """Up to where there is something to see."""
+    """Highest frequency of the motion."""
     session: int
     """Each session has its own zero of the torque."""
     key: Hashable
@@ -317,7 +319,7 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class MotorQuantity:
     """An estimate and its standard deviation; None: it was not estimated."""
 
     value: float
@@ -330,31 +332,31 @@ class Quantity:
 class MotorEstimate:
     """Estimate of the motor, at its output shaft."""
 
-    inertia_kg_m2: Quantity
+    inertia_kg_m2: MotorQuantity
     """Inertia of the motor without the tool."""
-    viscous_nm_s_per_rad: Quantity
+    viscous_nm_s_per_rad: MotorQuantity
     """Viscous friction."""
-    coulomb_nm: Quantity
+    coulomb_nm: MotorQuantity
     """Coulomb friction."""
-    torque_scale: Quantity
+    torque_scale: MotorQuantity
     """True torque over commanded torque; without a standard deviation it is held at 1, and the
     other quantities count in the drive's own torque."""
-    actuation_delay_s: Quantity
+    actuation_delay_s: MotorQuantity
     """From the command to the torque."""
     windows: int
     """Windows of the records that count."""
     dropped: int
     """Windows in which the shaft may have stood still."""
     misfit: float
-    """Mean square of what the equation leaves, over what scatter explains: 1 if it holds."""
+    """Mean square of the residual over that expected from scatter: 1 if the equation holds."""
     friction_departure_nm: float
     """Largest departure of a pass's mean torque from viscous and Coulomb friction."""
 
 
 def estimate_motor(
-    windows: Sequence[Window], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
+    windows: Sequence[PassReadings], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
 ) -> MotorEstimate:
-    """_Fit the motor's equation to windows in which its speed keeps its sign.
+    """Fit the motor's equation to windows in which its speed does not change sign.
 
     Parameters
     ----------
@@ -375,10 +377,10 @@ def estimate_motor(
 
     Raises
     ------
-    EstimateError
-        If there are too few windows, or the fit does not settle.
+    MotorEstimateError
+        If there are too few windows, or the fit does not converge.
     """
-    moving = [window for window in windows if _keeps_moving(window, timing.rate_hz)]
+    moving = [window for window in windows if _never_stops(window, timing.rate_hz)]
     stacks = _stack(moving, len(windows))
     found = _fit(stacks, timing, hold_scale=False)
     scale_known = (
@@ -389,7 +391,7 @@ def estimate_motor(
     if not scale_known:
         found = _fit(stacks, timing, hold_scale=True)
     if found is None:
-        raise EstimateError(
+        raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
@@ -397,18 +399,20 @@ def estimate_motor(
     values, stds = found.values, found.stds
     inertia = float(values[INERTIA])
     if inertia <= 0.0:
-        raise EstimateError(
+        raise MotorEstimateError(
             f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
     jump = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
     sampled_s = jump / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
-        inertia_kg_m2=Quantity(inertia, float(stds[INERTIA])),
-        viscous_nm_s_per_rad=Quantity(float(values[VISCOUS]), float(stds[VISCOUS])),
-        coulomb_nm=Quantity(float(values[COULOMB]), float(stds[COULOMB])),
-        torque_scale=Quantity(float(values[SCALE]), float(stds[SCALE]) if scale_known else None),
-        actuation_delay_s=Quantity(
+        inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA])),
+        viscous_nm_s_per_rad=MotorQuantity(float(values[VISCOUS]), float(stds[VISCOUS])),
+        coulomb_nm=MotorQuantity(float(values[COULOMB]), float(stds[COULOMB])),
+        torque_scale=MotorQuantity(
+            float(values[SCALE]), float(stds[SCALE]) if scale_known else None
+        ),
+        actuation_delay_s=MotorQuantity(
             float(values[DELAY]) - timing.angle_delay_s,
             sqrt(float(stds[DELAY]) ** 2 + sampled_s**2),
         ),
@@ -419,7 +423,7 @@ def estimate_motor(
     )
 
 
-def _keeps_moving(window: Window, rate_hz: float) -> bool:
+def _never_stops(window: PassReadings, rate_hz: float) -> bool:
     half = max(1, round(_SPEED_S * rate_hz))
     angle = window.angle_rad
     speed = (angle[2 * half :] - angle[: -2 * half]) * rate_hz / (2 * half)
@@ -427,18 +431,18 @@ def _keeps_moving(window: Window, rate_hz: float) -> bool:
     return bool(np.min(along) > _LEAST_SPEED_PART * abs(window.speed_rad_s))
 
 
-def _stack(windows: Sequence[Window], given: int) -> list[_Stack]:
-    groups: dict[Hashable, list[Window]] = {}
+def _stack(windows: Sequence[PassReadings], given: int) -> list[_Stack]:
+    groups: dict[Hashable, list[PassReadings]] = {}
     for window in windows:
         groups.setdefault(window.key, []).append(window)
     full = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
     if {np.sign(group[0].speed_rad_s) for group in full} != {1.0, -1.0}:
-        raise EstimateError(
+        raise MotorEstimateError(
             f"Of {given} passes {len(windows)} can be used, and that is too few: it takes at least "
             f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
             "standstill."
         )
-    sessions = {number: place for place, number in enumerate(sorted({g[0].session for g in full}))}
+    sessions = {number: index for index, number in enumerate(sorted({g[0].session for g in full}))}
     return [
         _Stack(
             np.array([window.angle_rad for window in group]),

@@ -1,10 +1,10 @@
 """The sessions that identify a motor: a multisine on passes at constant speed, and slow passes.
 
 Friction jumps where a motor turns round, and nobody knows how: sticking, wind-up, backlash. So the
-shaft sweeps to and fro at constant speed, with smooth turns, and what is looked at is the inside of
-each pass, where the speed keeps its sign and Coulomb friction is a constant. The multisine rides on
-fast passes and moves the speed by at most half of it. Every cycle of passes is the same, but for an
-offset of some encoder steps, so that cycles can be averaged and tell how much they scatter.
+shaft sweeps to and fro at constant speed, with smooth turns, and the estimate uses the inside of
+each pass, where the speed does not change sign and Coulomb friction is a constant. The multisine
+rides on fast passes and moves the speed by at most half of it. Every cycle of passes is the same,
+but for an offset of some encoder steps, so that cycles can be averaged and their scatter estimated.
 """
 
 from collections.abc import Mapping
@@ -26,13 +26,14 @@ SPEEDS = "motor-speeds"
 """Kinds of the sessions."""
 
 TOP_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
-"""Up to where the passes of each kind move the shaft, or the beam swings from a turn."""
+"""Highest frequency in Hz of the shaft's motion, or of the beam's swing after a turn, by kind."""
 
 _MAX_SPEED_RAD_S = 1.0
-_LIMIT_SHARE = 0.5
-"""Share of the profile's speed limit: the rest is for multisine and a motor unlike its data."""
-_STROKE_SHARE = 0.93
-"""Share of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
+_LIMIT_FRACTION = 0.5
+"""Fraction of the profile's speed limit: the rest is for multisine and errors of the motor's
+data."""
+_STROKE_FRACTION = 0.93
+"""Fraction of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
 _SPEED_PARTS = (0.1, 0.3, 0.6, 1.0)
 _MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
 """Part of the speed that the multisine modulates. The trial knows little of the motor: a quarter of
@@ -48,10 +49,10 @@ _GOLDEN = 0.618033988749895
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """When the shaft goes how: all of a session's passes follow from it.
+class PassSchedule:
+    """Schedule of the shaft's motion, which defines all passes of a session.
 
-    Each pass is a turn, a time to settle, and the window that is looked at.
+    Each pass is a turn, a time to settle, and the window that is evaluated.
     """
 
     speeds_rad_s: tuple[float, ...]
@@ -73,7 +74,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True)
-class Pass:
+class SpeedPass:
     """A window of constant nominal speed."""
 
     first: int
@@ -86,7 +87,7 @@ class Pass:
     """Number of its cycle, from 0 on."""
 
 
-def lay_out_passes(layout: Layout, rate_hz: float) -> list[Pass]:
+def lay_out_passes(layout: PassSchedule, rate_hz: float) -> list[SpeedPass]:
     """Return the passes of a session in their order.
 
     Parameters
@@ -105,7 +106,7 @@ def lay_out_passes(layout: Layout, rate_hz: float) -> list[Pass]:
         for speed in layout.speeds_rad_s:
             for signed in (speed, -speed):
                 tick += turn + settle
-                passes.append(Pass(tick, tick + window, signed, cycle))
+                passes.append(SpeedPass(tick, tick + window, signed, cycle))
                 tick += window
     return passes
 
@@ -158,11 +159,11 @@ def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float)
     ride = _multisine(layout, loop, _MODULATION[kind])
     alone_nm = _peak_torque(loop, carrier)
     together_nm = _peak_torque(loop, carrier + ride)
-    share = 1.0
+    fraction = 1.0
     if together_nm > limit_nm:
-        # The peak is convex in the share: on the straight line between the two it is lower yet.
-        share = (limit_nm - alone_nm) / (together_nm - alone_nm)
-    if share < _LEAST_MULTISINE:
+        # The peak is convex in the fraction: below the straight line between the two.
+        fraction = (limit_nm - alone_nm) / (together_nm - alone_nm)
+    if fraction < _LEAST_MULTISINE:
         needed_nm = alone_nm + _LEAST_MULTISINE * (together_nm - alone_nm)
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: of {limit_nm:.3g} N·m the passes alone take "
@@ -170,7 +171,7 @@ def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float)
             f"{_percent(profile, needed_nm)} % or a shorter --stroke-rad."
         )
     return _excitation(
-        kind, layout, profile, loop, carrier + share * ride, torque_percent, stroke_rad
+        kind, layout, profile, loop, carrier + fraction * ride, torque_percent, stroke_rad
     )
 
 
@@ -200,14 +201,14 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     return _excitation(SPEEDS, layout, profile, loop, reference, torque_percent, stroke_rad)
 
 
-def read_layout(metadata: Mapping[str, str]) -> Layout | None:
+def read_layout(metadata: Mapping[str, str]) -> PassSchedule | None:
     """Return the layout stated in the metadata of a session; None for any other session."""
     if metadata.get("excitation") not in TOP_HZ:
         return None
     try:
         speeds = tuple(float(text) for text in metadata["speeds_rad_s"].split())
         times = {name: float(metadata[name]) for name in _TIMES}
-        return Layout(speeds, int(metadata["cycles"]), **times)
+        return PassSchedule(speeds, int(metadata["cycles"]), **times)
     except (KeyError, ValueError):
         return None
 
@@ -228,7 +229,7 @@ def _percent(profile: Profile, torque_nm: float) -> int:
     return ceil(101 * torque_nm / profile.rig.motor.rated_torque_nm)
 
 
-def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: float) -> Layout:
+def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: float) -> PassSchedule:
     """Choose the speed so that the passes fit into the stroke, and the speed into its limit."""
     limits = profile.limits
     if not 0.0 < stroke_rad <= limits.angle_rad:
@@ -237,34 +238,34 @@ def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: floa
             f"{limits.angle_rad:g} rad."
         )
     cycles = _CYCLES[kind]
-    travel_s = float(np.ptp(_path(Layout(parts, 1), profile.rig.rate_hz)))
+    travel_s = float(np.ptp(_path(PassSchedule(parts, 1), profile.rig.rate_hz)))
     speed = min(
         _MAX_SPEED_RAD_S,
-        _LIMIT_SHARE * limits.velocity_rad_s,
-        2 * _STROKE_SHARE * stroke_rad / travel_s,
+        _LIMIT_FRACTION * limits.velocity_rad_s,
+        2 * _STROKE_FRACTION * stroke_rad / travel_s,
     )
-    return Layout(tuple(part * speed for part in parts), cycles)
+    return PassSchedule(tuple(part * speed for part in parts), cycles)
 
 
-def _path(layout: Layout, rate_hz: float) -> Real:
+def _path(layout: PassSchedule, rate_hz: float) -> Real:
     """Angle of the passes from the end of the approach on, beginning at 0."""
     turn, settle, window = (
         round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
     )
     change = _smooth(np.arange(turn) / turn)
-    pieces: list[Real] = []
+    segments: list[Real] = []
     before = 0.0
     for speed in [s for v in layout.speeds_rad_s for s in (v, -v)] * layout.cycles:
-        pieces.append(before + (speed - before) * change)
-        pieces.append(np.full(settle + window, speed))
+        segments.append(before + (speed - before) * change)
+        segments.append(np.full(settle + window, speed))
         before = speed
-    pieces.append(before * (1.0 - change))
-    speeds = np.concatenate(pieces)
+    segments.append(before * (1.0 - change))
+    speeds = np.concatenate(segments)
     path: Real = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]))]) / rate_hz
     return path
 
 
-def _carrier(layout: Layout, profile: Profile) -> Real:
+def _carrier(layout: PassSchedule, profile: Profile) -> Real:
     """Return the reference without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
     path = _path(layout, rate_hz)
@@ -278,7 +279,7 @@ def _carrier(layout: Layout, profile: Profile) -> Real:
     return reference
 
 
-def _add_offsets(reference: Real, layout: Layout, profile: Profile) -> None:
+def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> None:
     """Move each cycle by its own fraction of some encoder steps, in the turn before it."""
     rate_hz = profile.rig.rate_hz
     turn = round(layout.turn_s * rate_hz)
@@ -298,8 +299,8 @@ def _add_offsets(reference: Real, layout: Layout, profile: Profile) -> None:
         offset = following
 
 
-def _multisine(layout: Layout, loop: ClosedLoop, modulation: float) -> Real:
-    """Return the reference whose answer moves the speed by a part of that of the passes."""
+def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+    """Return the reference whose response modulates the speed of the passes by a fraction."""
     rate_hz = loop.model.rate_hz
     window = round(layout.window_s * rate_hz)
     step_hz = rate_hz / window
@@ -339,7 +340,7 @@ def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
 
 def _excitation(
     kind: str,
-    layout: Layout,
+    layout: PassSchedule,
     profile: Profile,
     loop: ClosedLoop,
     reference: Real,

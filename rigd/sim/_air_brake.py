@@ -93,13 +93,13 @@ class AirBrake:
         self._forces = np.zeros((3, _POINTS))
         self._magnitude = np.zeros(_POINTS)
         self._newest = 0
-        # The forces stand in a ring: one set of weights for each place of the newest.
+        # The forces are in a ring buffer: one set of weights for each position of the newest.
         backwards = (newest - np.arange(3) for newest in range(3))
         self._weights = [np.array(_MEAN_OF_PARABOLA)[back % 3] for back in backwards]
         self._per_square = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
     def attached(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Extend motor and beam by what the force does to the modes.
+        """Extend motor and beam by the effect of the force on the modes.
 
         Returns
         -------
@@ -140,12 +140,12 @@ class AirBrake:
         return extended, of_force
 
     def feel(self, speed_m_s: Real) -> tuple[float, float]:
-        """Take the speeds at an instant, shape (points,).
+        """Set the speeds at an instant, shape (points,), and return their immediate effect.
 
         Returns
         -------
         torque_nm, shear_n : float
-            What the force adds at once to what the beam takes, its modes held still.
+            Immediate effect of the force on the beam's torque and shear, with the modes unchanged.
         """
         self._newest = (self._newest + 1) % 3
         force = self._forces[self._newest]

@@ -1,4 +1,4 @@
-"""Drive and sensor of the simulated rig: what the plant does, as the devices would show it.
+"""Drive and sensor of the simulated rig: the plant as the devices measure it.
 
 The drive's latch, which comes first in a tick, moves the rig on to it; periods that the loop
 missed pass with the last torque held, as they do on a real rig.
@@ -20,7 +20,7 @@ import numpy as np
 from rigd.beam import check_order
 from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
-from rigd.devices.obstacles import Encounter, ObstacleError, describe_obstacle, with_obstacles
+from rigd.devices.obstacles import Disturbance, ObstacleError, describe_obstacle, with_obstacles
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim._plant import SimulatedPlant
 from rigd.sim._session_scatter import scatters_between_sessions, session_parameters
@@ -50,7 +50,7 @@ class Stuck:
         self._value: object = None
 
     def __call__(self, value: T) -> T:
-        """Return what is shown in place of a reading."""
+        """Return the reading that replaces a given one."""
         if self._count == 0 or (self._every and self._count % self._every == 0):
             self._value = value
         self._count += 1
@@ -92,7 +92,7 @@ class SimulatedRig:
     records_per_period : int
         Readings of the sensor in one period.
     stuck_encoder : Stuck or None
-        What an encoder shows that has failed; None: it works.
+        Readings of a failed encoder; None: it works.
     """
 
     def __init__(self, rig: RigParameters) -> None:
@@ -112,8 +112,8 @@ class SimulatedRig:
         rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
         assert rig.simulation is not None
         self._parameters = rig
-        self._met: list[Encounter] = []
-        self._ended: list[Encounter] = []
+        self._met: list[Disturbance] = []
+        self._ended: list[Disturbance] = []
         self._preparing: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
         self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
@@ -121,7 +121,7 @@ class SimulatedRig:
         self.stuck_encoder: Stuck | None = None
 
     def begin_session(self, seed: int) -> None:
-        """Begin the noise anew, and take the beam of this session where it differs between them.
+        """Restart the noise, and use the beam of this session if beams differ between sessions.
 
         The drive is off. A beam takes a tenth of a second to make.
 
@@ -137,7 +137,7 @@ class SimulatedRig:
     def advance(self, n_periods: int) -> None:
         """Move on by whole periods, the torque held."""
         if self._preparing is not None:
-            self._look()
+            self._poll_preparation()
         if self.records_per_period == 1:
             self.plant.advance(n_periods)
             self.sensor.elapse(n_periods)
@@ -147,15 +147,15 @@ class SimulatedRig:
             self.sensor.elapse(1)
             self.sensor.sample()
 
-    def check(self, encounter: Encounter) -> None:
-        """Refuse what the beam cannot meet beside what it meets already.
+    def check(self, disturbance: Disturbance) -> None:
+        """Raise if a disturbance cannot be simulated in addition to the present ones.
 
         Raises
         ------
         ObstacleError, RealisationError
             Saying why.
         """
-        with_obstacles(self._parameters, [describe_obstacle(encounter)])
+        with_obstacles(self._parameters, [describe_obstacle(disturbance)])
         check_order(self._parameters.damping)
         if len(self._met) == _MOST_MET:
             raise ObstacleError(
@@ -163,35 +163,35 @@ class SimulatedRig:
                 "more would take too long a tick; start it again."
             )
 
-    def meet(self, encounter: Encounter, *, wait: bool) -> None:
-        """Put an obstacle or a knock in the beam's way.
+    def meet(self, disturbance: Disturbance, *, wait: bool) -> None:
+        """Add an obstacle or a knock.
 
         Parameters
         ----------
-        encounter
+        disturbance
             Its times count from the first enabling of the drive.
         wait
-            Let it take effect before the next period, for which the caller waits a tenth of a
-            second. Otherwise another process makes ready for it, and the rig goes on meanwhile.
+            Whether it takes effect before the next period; the caller then waits a tenth of a
+            second. Otherwise another process prepares it, and the rig continues meanwhile.
         """
-        self._met.append(encounter)
+        self._met.append(disturbance)
         if wait:
             self._take_over(self._prepared()[1])
         elif self._preparing is None:
             self._prepare()
 
-    def end(self, encounter: Encounter) -> None:
-        """Take an obstacle away that `meet` put there."""
-        self._ended.append(encounter)
-        self.plant.end_obstacle(encounter)
+    def end(self, disturbance: Disturbance) -> None:
+        """Remove an obstacle that `meet` added."""
+        self._ended.append(disturbance)
+        self.plant.end_obstacle(disturbance)
 
     def _prepared(self) -> tuple[int, SimulatedPlant]:
-        """Make a plant that meets all that was added so far, and their number."""
-        texts = [describe_obstacle(encounter) for encounter in self._met]
+        """Return a plant with all disturbances added so far, and their number."""
+        texts = [describe_obstacle(disturbance) for disturbance in self._met]
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _prepare(self) -> None:
-        """Make it in a process of its own: a thread would hold the interpreter's lock."""
+        """Start the preparation in a process: a thread would hold the interpreter's lock."""
         import tempfile  # late: no session needs it
 
         file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
@@ -207,8 +207,8 @@ class SimulatedRig:
             os._exit(failed)
         self._preparing = process, file
 
-    def _look(self) -> None:
-        """Take over what was prepared, once it is; what came meanwhile is prepared next."""
+    def _poll_preparation(self) -> None:
+        """Use the prepared plant if it is ready; then prepare disturbances added meanwhile."""
         assert self._preparing is not None
         process, file = self._preparing
         ended, status = os.waitpid(process, os.WNOHANG)
@@ -226,8 +226,8 @@ class SimulatedRig:
 
     def _take_over(self, plant: SimulatedPlant) -> None:
         self.plant.meet(plant)
-        for encounter in self._ended:
-            self.plant.end_obstacle(encounter)
+        for disturbance in self._ended:
+            self.plant.end_obstacle(disturbance)
 
     def read_angle(self) -> float:
         """Return the angle in whole encoder steps, in rad."""
@@ -254,7 +254,7 @@ class SimulatedDrive:
 
     @property
     def stuck_encoder(self) -> Stuck | None:
-        """What an encoder shows that has failed; it may be set."""
+        """Readings of a failed encoder; None: it works. Can be set."""
         return self._rig.stuck_encoder
 
     @stuck_encoder.setter
@@ -265,7 +265,7 @@ class SimulatedDrive:
         """Nothing to connect to."""
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
-        """Let commands through."""
+        """Enable the drive."""
         if self._sto_dropped:
             raise wired_stop_dropped(_NAME)
         self._plant.enable()
@@ -285,7 +285,7 @@ class SimulatedDrive:
         return LineHealth()
 
     def disable(self) -> None:
-        """Zero the torque, and let no command through."""
+        """Zero the torque, and ignore further commands."""
         self._plant.disable()
         self.read_angle = self._rig.read_angle
 
@@ -323,13 +323,13 @@ class SimulatedSensor:
     rate_hz
         Rate of the readings, by which the hum goes on.
     weights
-        Weights of the last readings in the value, oldest first; one weight: a reading is taken when
-        it is asked for.
+        Weights of the last readings in the value, oldest first; one weight: a reading is taken on
+        request.
 
     Attributes
     ----------
     stuck : Stuck or None
-        What a sensor shows that has failed; None: it works.
+        Readings of a failed sensor; None: it works.
     """
 
     def __init__(
@@ -396,7 +396,7 @@ class SimulatedSensor:
         return LineHealth(status=0)
 
     def renew_noise(self, seed: int) -> None:
-        """Begin the noise anew from a seed."""
+        """Restart the noise from a seed."""
         self._rows = chain.from_iterable(self._noise(seed))
         self.records.clear()
 
@@ -406,7 +406,7 @@ class SimulatedSensor:
         self._saturated |= self.wrench_saturated
 
     def elapse(self, readings: int) -> None:
-        """Let the time of some readings pass, taken or not."""
+        """Advance the time by some readings."""
         if self._hum_nm:
             # Whole turns are left out, for the phase to stay exact.
             self._hum_turns = (self._hum_turns + readings * self._hum_turn) % 1.0
@@ -458,7 +458,8 @@ _CROSSTALK = (
     (-0.88, -0.33, 0.46, 0.54, 0.0, 0.79),
     (0.41, -0.97, 0.68, -0.75, 0.29, 0.0),
 )
-"""Share of its range that each axis (row) shows of the full range of another, over the largest."""
+"""Crosstalk of each axis (row) at the full range of another, over its range and the largest
+entry."""
 
 
 def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[float], list[float]]:
@@ -470,7 +471,7 @@ def _wrenches(sensor: WrenchSensor, crosstalk_percent: float) -> tuple[list[floa
     wrenches[:, known] = rows.T @ np.linalg.inv(rows @ rows.T)
     if crosstalk_percent:
         full = np.array(sensor.range)
-        shares = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
-        wrenches += shares * full[:, None] / full @ wrenches
+        crosstalk = 0.01 * crosstalk_percent * np.array(_CROSSTALK)
+        wrenches += crosstalk * full[:, None] / full @ wrenches
     per_torque, per_shear = wrenches.T.tolist()
     return per_torque, per_shear

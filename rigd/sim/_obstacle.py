@@ -1,10 +1,10 @@
 """Obstacles in the way of the simulated beam, and knocks on it, tick by tick.
 
-A force on the beam drives states of its own beside those of the plant (`realise_force`): they tell
-what it does to the beam, and by their torque it acts on the shaft. Where the beam touches nothing,
-plant and these states go on by whole periods. Near an obstacle a period is divided into substeps,
-over each of which the force is constant; all that the rest of the plant does meanwhile is linear
-and known exactly, so the force of each substep is the root of one scalar equation.
+A force on the beam drives additional states (`realise_force`): they describe its effect on the
+beam, and their torque acts on the shaft. Where the beam touches nothing, plant and these states go
+on by whole periods. Near an obstacle a period is divided into substeps, over each of which the
+force is constant; all that the rest of the plant does meanwhile is linear and known exactly, so the
+force of each substep is the root of one scalar equation.
 
 Within a substep the penetration goes from a to q. The mean of the obstacle's elastic force over it
 is taken so that the work done on the obstacle is the energy it then holds, or has given back: no
@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid, realise_force
 from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
-from rigd.devices.obstacles import Encounter, Knock, Obstacle
+from rigd.devices.obstacles import Disturbance, ImpactSpecification, Obstacle
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _RIGID_N_PER_M = 1e9
-"""What stands for an obstacle that does not yield: it yields a nanometre for a newton."""
+"""Stiffness of a rigid obstacle: it yields a nanometre for a newton."""
 _STIFFEST_N_PER_M = 1e5
 """Stiffest obstacle whose touch the substeps resolve."""
 _PER_CONTACT_TIME = 6
@@ -39,16 +39,16 @@ _FEWEST_SUBSTEPS = 8
 _FREE_END = 4.0
 """By how much a beam gives way more readily at its tip than far from it."""
 _NEAR_M = 1e-3
-"""Distance within which the beam may touch between the ends of a period, beside what it moves."""
+"""Distance, in addition to the beam's motion, within which it may touch during a period."""
 _SMALL = 0.01
-"""Displacement, as a share of the rigid beam's, below which the absolute error counts: there the
+"""Displacement, as a fraction of the rigid beam's, below which the absolute error counts: there the
 beam hardly follows the motor."""
 _SWEEPS = 3
 """Over several obstacles that the beam touches in one substep."""
 
 
-class Contact:
-    """What the beam meets, attached to the plant.
+class AttachedObstacles:
+    """Obstacles and knocks, attached to the plant.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Contact:
         Force on the beam over each substep of the last period, positive towards a positive angle.
     substeps : int
         Substeps of a period.
-    bodies : tuple of Encounter
+    bodies : tuple of Disturbance
         The obstacles and knocks.
     """
 
@@ -74,7 +74,7 @@ class Contact:
         beam: Beam,
         damping: Damping,
         realisation: Realisation,
-        bodies: tuple[Encounter, ...],
+        bodies: tuple[Disturbance, ...],
         period_s: float,
     ) -> None:
         self.bodies = bodies
@@ -105,28 +105,30 @@ class Contact:
             for index, body in enumerate(bodies)
             if isinstance(body, Obstacle)
         ]
-        self._knocks = [(i, body) for i, body in enumerate(bodies) if isinstance(body, Knock)]
+        self._knocks = [
+            (i, body) for i, body in enumerate(bodies) if isinstance(body, ImpactSpecification)
+        ]
         self._none: Real = np.zeros((self.substeps, len(bodies)))
         self.forces_n = self._none
         # Displacement at each body at the end of the last period, and at its start.
-        self._place_m: Real = np.zeros(len(bodies))
-        self._start_m = self._place_m
+        self._displacement_m: Real = np.zeros(len(bodies))
+        self._start_m = self._displacement_m
         self._penetration_m = self._ends_m = dict.fromkeys(range(len(bodies)), -inf)
 
     @property
-    def place(self) -> Real:
+    def displacement_rows(self) -> Real:
         """Displacement of the beam at each body by the state of `attached`, (bodies, n)."""
         return np.column_stack([self._turned, self._own[:-2]])
 
     def attached(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Extend motor and beam by what the forces do to the beam.
+        """Extend motor and beam by the effect of the forces on the beam.
 
         Returns
         -------
         model
             With more states for each force, whose torque acts on the shaft.
         of_force
-            What each force adds to the state's derivative, (n, bodies).
+            Effect of each force on the state's derivative, (n, bodies).
         """
         bodies, own_states = self._at_m.size, self._b.size
         n, more = model.b.size, bodies * own_states
@@ -179,11 +181,12 @@ class Contact:
         steps, step_s, bodies = self.substeps, self._step_s, self._at_m.size
         n = model.b.size
         phi, whole = propagator(model, step_s)
-        place = self.place
+        displacement_rows = self.displacement_rows
 
-        # Without a force: the states' share, row by row, and that of the torques column by column.
+        # Without a force: contribution of the states, row by row, and of the torques, column by
+        # column.
         rows = np.empty((steps, bodies, n))
-        row = place
+        row = displacement_rows
         for j in range(steps):
             rows[j] = row = row @ phi
         torques = np.empty((steps, bodies, 2))
@@ -193,25 +196,25 @@ class Contact:
             after = propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else whole
             after = after * (before_s < step_s)
             state = phi @ state + np.column_stack([whole - after, after])
-            torques[j] = place @ state
+            torques[j] = displacement_rows @ state
         free = np.column_stack([rows.reshape(-1, n), torques.reshape(-1, 2)])
         free = np.column_stack([free, free[:, :n] @ friction])
 
-        # What a force of 1 N over one substep leaves of the state after j more.
+        # State that remains of a force of 1 N over one substep, j substeps later.
         left = np.empty((steps, n, bodies))
         left[0] = held_inputs(model, of_force, step_s)
         for j in range(1, steps):
             left[j] = phi @ left[j - 1]
-        kernel = place @ left
+        kernel = displacement_rows @ left
         kernel[0] += self._direct[:-2]
 
-        def told(row: Real, direct: Real, instant_s: float) -> Real:
-            """Return what each substep's force adds to an output at an instant."""
+        def effect_on(row: Real, direct: Real, instant_s: float) -> Real:
+            """Return the effect of each substep's force on an output at an instant."""
             at = instant_s / step_s
             number = min(int(at), steps - 1)
-            share = at - number
+            fraction = at - number
             effect = np.zeros((steps, bodies))
-            for node, weight in ((number, 1 - share), (number + 1, share)):
+            for node, weight in ((number, 1 - fraction), (number + 1, fraction)):
                 effect[:node] += weight * (row @ left[:node])[::-1]
             effect[number] += direct
             return effect.ravel()
@@ -222,14 +225,14 @@ class Contact:
         effect = np.vstack(
             [
                 left[::-1].transpose(1, 0, 2).reshape(n, -1),
-                told(model.angle, none, period_s),
-                told(model.velocity, none, period_s),
-                told(model.sensor_torque, at_sensor, period_s),
-                told(holding_torque, self._direct[-2], period_s),
-                told(model.shear, shear, period_s),
-                told(model.angle, none, angle_instant_s),
-                told(model.sensor_torque, at_sensor, torque_instant_s),
-                told(model.shear, shear, torque_instant_s),
+                effect_on(model.angle, none, period_s),
+                effect_on(model.velocity, none, period_s),
+                effect_on(model.sensor_torque, at_sensor, period_s),
+                effect_on(holding_torque, self._direct[-2], period_s),
+                effect_on(model.shear, shear, period_s),
+                effect_on(model.angle, none, angle_instant_s),
+                effect_on(model.sensor_torque, at_sensor, torque_instant_s),
+                effect_on(model.shear, shear, torque_instant_s),
             ]
         )
         return March(
@@ -241,19 +244,19 @@ class Contact:
             velocity_row=n + 1,
         )
 
-    def nothing(self, place_m: Real, time_s: float) -> bool:
-        """Tell whether the beam can have touched nothing over a period without a force.
+    def nothing(self, displacement_m: Real, time_s: float) -> bool:
+        """Return whether the beam cannot have touched anything over a period without a force.
 
         Parameters
         ----------
-        place_m
+        displacement_m
             Displacement at each body at its end, shape (bodies,).
         time_s
             Time at its start.
         """
         end_s = time_s + self._period_s
-        before_m = self._start_m = self._place_m
-        self._place_m = place_m.copy()
+        before_m = self._start_m = self._displacement_m
+        self._displacement_m = displacement_m.copy()
         for _, knock in self._knocks:
             if time_s < knock.at_s + knock.duration_s and knock.at_s < end_s:
                 return False
@@ -261,7 +264,7 @@ class Contact:
             if body.from_s < end_s and time_s < body.until_s:
                 if self._penetration_m[index] > 0:
                     return False
-                old, new = before_m.item(index), place_m.item(index)
+                old, new = before_m.item(index), displacement_m.item(index)
                 moves = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
                 if body.side * (new - _surface(body, end_s)) > -(moves + _NEAR_M):
                     return False
@@ -332,7 +335,7 @@ class Contact:
         return forces
 
     def _meet(self, march: "March", walls: "list[_Wall]") -> None:
-        """March through a period; what the walls push is written into their forces.
+        """Compute the walls' forces, substep by substep, through a period.
 
         Forces of the substeps to come are zero, so that whole rows may be summed.
         """
@@ -377,15 +380,15 @@ class Contact:
                 wall.start_m = wall.end_m
             j += 1
 
-    def take_over(self, state: Real, other: "Contact | None") -> Real:
-        """Go on where another contact of the same beam is, whose bodies are the first of these.
+    def take_over(self, state: Real, other: "AttachedObstacles | None") -> Real:
+        """Continue from another contact of the beam, whose bodies are the first of these.
 
         Parameters
         ----------
         state
             State of the plant with the other contact.
         other
-            None: the beam met nothing yet.
+            None: there was no contact before.
 
         Returns
         -------
@@ -409,21 +412,21 @@ class Contact:
                     other._oscillating : other._oscillating + real
                 ]
             self._penetration_m.update(other._penetration_m)
-        self._place_m = self.place @ whole
+        self._displacement_m = self.displacement_rows @ whole
         return whole
 
-    def end(self, body: Encounter, time_s: float) -> None:
-        """Take an obstacle away."""
+    def end(self, body: Disturbance, time_s: float) -> None:
+        """Remove an obstacle."""
         self._obstacles = [
             (index, replace(each, until_s=min(each.until_s, time_s)) if each == body else each, k)
             for index, each, k in self._obstacles
         ]
 
     def take(self, march: "March", forces_n: Real, free_m: Real) -> None:
-        """Go on from what `forces` found last."""
+        """Continue from the last result of `forces`."""
         self.forces_n = forces_n
         self._penetration_m = self._ends_m
-        self._place_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)
+        self._displacement_m = free_m[-1] + np.einsum("jab,jb->a", march.kernel[::-1], forces_n)
 
 
 @dataclass(slots=True, eq=False)
@@ -511,7 +514,7 @@ def _surface(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or 
     return body.x_m * (body.angle_rad + body.rate_rad_s * (time_s - body.from_s))
 
 
-def _substeps(beam: Beam, bodies: tuple[Encounter, ...], period_s: float) -> int:
+def _substeps(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
     """Substeps of a period, fine enough for the stiffest obstacle."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
     unit = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25

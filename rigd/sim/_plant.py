@@ -1,8 +1,8 @@
 """Physics of the simulated rig: motor, clamp and beam between two ticks.
 
 Motor and beam are one linear model, stepped exactly for torques that are constant between the
-instants at which commands arrive. Coulomb friction, saturation and delays stand around it. Nothing
-here quantises or adds noise: that is what the simulated devices do with the values at a tick.
+instants at which commands arrive. Coulomb friction, saturation and delays are added to it.
+Quantisation and noise are those of the simulated devices, not of the plant.
 """
 
 from collections import deque
@@ -12,10 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam.realisation import Realisation
-from rigd.devices.obstacles import NOT_BESIDE_OBSTACLES, Encounter, check_obstacles, parse_obstacle
+from rigd.devices.obstacles import (
+    NOT_BESIDE_OBSTACLES,
+    Disturbance,
+    check_obstacles,
+    parse_obstacle,
+)
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim._air_brake import AirBrake
-from rigd.sim._obstacle import Contact, March
+from rigd.sim._obstacle import AttachedObstacles, March
 from rigd.sim._step import OUTPUTS, arrays_at, held_of, models_of, split_delay, steps_of
 from rigd.sim._stiffness_drift import StiffnessDrift
 
@@ -28,7 +33,7 @@ _OF_OBSTACLES = (
 
 _FRICTION_SWEEPS = 4
 _SAME_FRICTION = 1e-3
-"""Change of the Coulomb friction, as a share of the whole, that an obstacle is not told of."""
+"""Change of the Coulomb friction, as a fraction of the whole, that the contact may neglect."""
 
 _STENCIL = 4
 """Readings through which the value between two of them is taken."""
@@ -68,7 +73,7 @@ class SimulatedPlant:
     RealisationError
         If the beam's damping cannot be realised, at the stiffness that it drifts to included.
     ObstacleError
-        If an obstacle is not written as it should be, or lies beyond the beam's tip.
+        If an obstacle has a syntax error, or lies beyond the beam's tip.
 
     Notes
     -----
@@ -81,11 +86,12 @@ class SimulatedPlant:
         "_air",
         "_contact",
         "_coulomb_nm",
+        "_direct_fraction",
         "_direct_nm",
-        "_direct_share",
+        "_direct_shear_fraction",
         "_direct_shear_n",
-        "_direct_shear_share",
         "_drift",
+        "_fraction_before_switch",
         "_free",
         "_free_march",
         "_friction_effects",
@@ -106,11 +112,10 @@ class SimulatedPlant:
         "_sensed_shear_jump_gain",
         "_sensed_shears",
         "_sensed_torques",
-        "_share_before_switch",
         "_shear_jump_gain",
         "_states",
         "_stuck",
-        "_torque_instant_share",
+        "_torque_instant_fraction",
         "_torque_nm",
         "_torques",
         "_vectors",
@@ -163,11 +168,11 @@ class SimulatedPlant:
             )
             self._friction_speed = self._air.speed @ friction[:n]
             self._direct_nm = self._direct_shear_n = 0.0
-            self._direct_share = 1 - free.sensor_torque_per_torque
-            self._direct_shear_share = -free.shear_per_torque
-            self._torque_instant_share = 1 - torque_age / period
+            self._direct_fraction = 1 - free.sensor_torque_per_torque
+            self._direct_shear_fraction = -free.shear_per_torque
+            self._torque_instant_fraction = 1 - torque_age / period
         if self._contact is not None:
-            points = len(self._contact.place)
+            points = len(self._contact.displacement_rows)
             self._free_march, self._locked_march = (
                 self._contact.march(
                     model, of_force, locked.sensor_torque, *instants, friction=friction[:n]
@@ -175,7 +180,8 @@ class SimulatedPlant:
                 for model, of_force in ((free, on_free), (locked, on_locked))
             )
             step, locked_step = (
-                np.vstack([whole, self._contact.place @ whole[:n]]) for whole in (step, locked_step)
+                np.vstack([whole, self._contact.displacement_rows @ whole[:n]])
+                for whole in (step, locked_step)
             )
         self._drift: StiffnessDrift | None = None
         if simulation.stiffness_drift_per_s:
@@ -183,7 +189,9 @@ class SimulatedPlant:
                 simulation.stiffness_drift_per_s,
                 period,
                 np.abs(beam.poles_rad_s).max(initial=0.0, where=beam.poles_rad_s.imag > 0),
-                lambda share: arrays_at(share, parameters, simulation, beam, period, instants),
+                lambda fraction: arrays_at(
+                    fraction, parameters, simulation, beam, period, instants
+                ),
             )
             step, locked_step = self._drift.arrays[:2]
         # A bound method of a matrix in column order: the quickest product of this size in numpy.
@@ -201,7 +209,7 @@ class SimulatedPlant:
         self._friction_nm = 0.0
         self._stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
-        self._share_before_switch = switch / period
+        self._fraction_before_switch = switch / period
         self._next_is_known = switch == 0 and periods > 0
         self._jump_is_sensed = torque_age == 0 and not filtered
         self._set_jump_gains(free.sensor_torque_per_torque, free.shear_per_torque)
@@ -252,7 +260,7 @@ class SimulatedPlant:
         return max(self._periods, 0) * self._period_s
 
     def become(self, other: "SimulatedPlant") -> None:
-        """Become another plant, at rest at the angle of this one, the drive off.
+        """Adopt another plant's parameters, at rest at the present angle, with the drive off.
 
         Parameters
         ----------
@@ -268,7 +276,7 @@ class SimulatedPlant:
         self.angle_rad = self.sensed_angle_rad = angle_rad
 
     def meet(self, prepared: "SimulatedPlant") -> None:
-        """Meet the obstacles of another plant from here on, in the state of this one.
+        """Use the obstacles of another plant from now on, in the present state.
 
         Parameters
         ----------
@@ -284,13 +292,13 @@ class SimulatedPlant:
         self._vectors = _vectors(state.size, len(contact.bodies), felt=0)
         self._vectors[0][0][: state.size] = state
 
-    def end_obstacle(self, obstacle: Encounter) -> None:
-        """Take an obstacle away, if there is such a one."""
+    def end_obstacle(self, obstacle: Disturbance) -> None:
+        """Remove an obstacle, if there is one like this."""
         if self._contact is not None:
             self._contact.end(obstacle, self.elapsed_s)
 
     def command(self, torque_nm: float) -> float:
-        """Set the torque to exert from this tick on, after the actuation delay.
+        """Set the torque from this tick on, after the actuation delay; return it.
 
         Returns
         -------
@@ -307,7 +315,7 @@ class SimulatedPlant:
         return torque_nm
 
     def advance(self, n_periods: int = 1) -> None:
-        """Go to the tick `n_periods` from here, with the last command repeated at those between."""
+        """Advance by `n_periods` ticks, with the last command repeated at those between."""
         n = self._states
         torques = self._torques
         for _ in range(n_periods):
@@ -323,8 +331,8 @@ class SimulatedPlant:
             if self._air is not None:
                 self._air.hold(input_[n + 3 :])
 
-            share = self._share_before_switch
-            load = share * before + (1 - share) * after - self._holding_beam_nm
+            fraction = self._fraction_before_switch
+            load = fraction * before + (1 - fraction) * after - self._holding_beam_nm
             if self._stuck and abs(load) <= self._coulomb_nm:
                 self._locked(input_, output)
                 if self._contact is not None:
@@ -386,21 +394,21 @@ class SimulatedPlant:
             self.sensed_shear_n = self._sensed_shears[0]
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
-        """Set what is told of half a jump of the motor's torque at a tick."""
+        """Set the effect of half a jump of the motor's torque on the outputs at a tick."""
         self._jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
         self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
         self._sensed_jump_gain = self._jump_gain if self._jump_is_sensed else 0.0
         self._sensed_shear_jump_gain = self._shear_jump_gain if self._jump_is_sensed else 0.0
 
     def _take_stiffness(self, drift: StiffnessDrift) -> None:
-        """Take what is not in the matrices of a step, which have changed by themselves."""
+        """Update the quantities that depend on the stiffness and are not in the step matrices."""
         self._friction_effects = drift.arrays[2].tolist()
         self._set_jump_gains(*drift.arrays[3].tolist())
 
     def _touch(self, march: March, input_: Real, output: Real, *, turns: bool) -> None:
-        """Add what the obstacles do to a step that was made without them.
+        """Add the effect of the obstacles to a step computed without them.
 
-        Friction acts on the touch and the touch on friction: they are found in turn, from the
+        Friction and contact depend on each other: they are computed in turn, beginning with the
         friction of the period before.
         """
         contact = self._contact
@@ -436,22 +444,24 @@ class SimulatedPlant:
         sensed_torque: float,
         sensed_shear: float,
     ) -> tuple[float, float, float, float, float]:
-        """Add what the force of the air does at once to the outputs at the end of a step."""
+        """Add the immediate effect of the air's force to the outputs at the end of a step."""
         assert self._air is not None
         speed_m_s = output[self._states + OUTPUTS :]
         if free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
         before_nm, before_n = self._direct_nm, self._direct_shear_n
         now_nm, now_n = self._air.feel(speed_m_s)
-        share, shear_share = (self._direct_share, self._direct_shear_share) if free else (1.0, 0.0)
-        now_n += shear_share * now_nm
+        fraction, shear_fraction = (
+            (self._direct_fraction, self._direct_shear_fraction) if free else (1.0, 0.0)
+        )
+        now_n += shear_fraction * now_nm
         self._direct_nm, self._direct_shear_n = now_nm, now_n
-        at = self._torque_instant_share
+        at = self._torque_instant_fraction
         return (
-            torque + share * now_nm,
+            torque + fraction * now_nm,
             holding + now_nm,
             shear + now_n,
-            sensed_torque + share * (before_nm + at * (now_nm - before_nm)),
+            sensed_torque + fraction * (before_nm + at * (now_nm - before_nm)),
             sensed_shear + before_n + at * (now_n - before_n),
         )
 
@@ -463,14 +473,16 @@ def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
     return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
 
 
-def _contact(parameters: RigParameters, beam: Realisation, period_s: float) -> Contact | None:
+def _contact(
+    parameters: RigParameters, beam: Realisation, period_s: float
+) -> AttachedObstacles | None:
     simulation = parameters.simulation
     if simulation is None or not simulation.obstacles:
         return None
     bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
-    beside = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
-    check_obstacles(bodies, parameters.beam, beside)
-    return Contact(parameters.beam, parameters.damping, beam, bodies, period_s)
+    simulated = {name: getattr(simulation, name) for name in NOT_BESIDE_OBSTACLES}
+    check_obstacles(bodies, parameters.beam, simulated)
+    return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
 
 
 def _vectors(states: int, points: int, *, felt: int) -> tuple[tuple[Real, Real, Real], ...]:
@@ -513,9 +525,9 @@ class OtherClock:
         """Return the reading that is as old as the first has come to be (`index` 0)."""
         assert index == 0
         readings = self._readings
-        place = len(readings) - 1 - self._age
-        first = min(max(int(place) - 1, 0), len(readings) - _STENCIL)
-        x = place - first
+        position = len(readings) - 1 - self._age
+        first = min(max(int(position) - 1, 0), len(readings) - _STENCIL)
+        x = position - first
         a, b, c, d = readings[first : first + _STENCIL]
         return (
             -a * (x - 1) * (x - 2) * (x - 3) / 6

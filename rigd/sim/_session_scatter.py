@@ -7,7 +7,7 @@ import numpy as np
 from rigd.devices.parameters import RigParameters
 
 _STREAM = 1
-"""Tells these draws from those of the noise, which has the same seed."""
+"""Separates these draws from those of the noise, which has the same seed."""
 
 
 def scatters_between_sessions(rig: RigParameters) -> bool:

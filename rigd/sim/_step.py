@@ -1,7 +1,7 @@
 """One period of the simulated rig as matrices: motor and beam, on a free and on a locked shaft.
 
-From the state, the motor's torque before and after it changes, and the friction, to the state at
-the period's end and all that sensors and friction are to be told of it.
+The input is the state, the motor's torque before and after it changes, and the friction; the output
+is the state at the period's end and the quantities for sensors and friction.
 """
 
 from dataclasses import replace
@@ -111,18 +111,18 @@ def steps_of(
 
 
 def arrays_at(
-    share: float,
+    stiffness_ratio: float,
     parameters: RigParameters,
     simulation: Simulation,
     at_start: Realisation,
     period_s: float,
     instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real, Real]:
-    """Compute what depends on the stiffness of a beam that drifts.
+    """Compute the arrays of a step for a beam whose stiffness has drifted.
 
     Parameters
     ----------
-    share
+    stiffness_ratio
         The stiffness over that at the start.
     parameters, simulation
         As for `models_of`, at the start.
@@ -136,7 +136,7 @@ def arrays_at(
     step, locked_step : (n + 8, n + 3)
     friction_effects : (8,)
     per_torque : (2,)
-        What the motor's torque adds at once to torque and shear of the sensor.
+        Immediate effect of the motor's torque on torque and shear of the sensor.
 
     Raises
     ------
@@ -144,13 +144,14 @@ def arrays_at(
         If the beam cannot be realised at that stiffness.
     """
     own = parameters.beam
-    drifted = replace(own, bending_stiffness_n_m2=share * own.bending_stiffness_n_m2)
+    drifted = replace(own, bending_stiffness_n_m2=stiffness_ratio * own.bending_stiffness_n_m2)
     try:
         beam, *models = models_of(replace(parameters, beam=drifted), simulation, own)
     except RealisationError as error:
         raise RealisationError(
             "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
-            f"{share:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
+            f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
+            f"{error}"
         ) from error
     free, locked = (in_displacements(model, beam, at_start) for model in models)
     step, locked_step, friction = steps_of(free, locked, period_s, instants)
@@ -159,7 +160,7 @@ def arrays_at(
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Return the whole periods in a delay, and what is left of it in seconds.
+    """Return the whole periods in a delay, and the remainder in seconds.
 
     Parameters
     ----------
@@ -212,20 +213,20 @@ def _step(
         return at_once(model.shear, model.shear_per_torque, instant_s)
 
     def at_once(of_state: Real, per_torque: float, instant_s: float) -> Real:
-        """Row of what follows the torque at once."""
+        """Return the row of the immediate effect of the torque."""
         row: Real = of_state @ state_at(instant_s)
         apart_s = instant_s - switch_s
         if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
-            share_after = 0.5
+            fraction_after = 0.5
         else:
-            share_after = 1.0 if apart_s > 0 else 0.0
-        row[-2:] += per_torque * np.array([1 - share_after, share_after])
+            fraction_after = 1.0 if apart_s > 0 else 0.0
+        row[-2:] += per_torque * np.array([1 - fraction_after, fraction_after])
         return row
 
     end = state_at(period_s)
     return np.vstack(
         [
-            *_told(model, end, torque_at(period_s), holding_torque),
+            *_output_rows(model, end, torque_at(period_s), holding_torque),
             shear_at(period_s),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
@@ -238,8 +239,10 @@ def _step(
     )
 
 
-def _told(model: CoupledModel, end: Real, torque: Real, holding_torque: Real) -> tuple[Real, ...]:
-    """Rows of the state at a period's end, and of what is told of it beside the sensors."""
+def _output_rows(
+    model: CoupledModel, end: Real, torque: Real, holding_torque: Real
+) -> tuple[Real, ...]:
+    """Return the rows of the state at a period's end, and of outputs other than the sensors'."""
     return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
 
 
@@ -251,7 +254,7 @@ def held_of(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """One period under a held force of the air: what it adds to [next state, outputs].
+    """Return the effect of a constant force of the air over a period on [next state, outputs].
 
     Parameters
     ----------
@@ -273,7 +276,7 @@ def held_of(
     end = state_at(period_s)
     return np.vstack(
         [
-            *_told(model, end, model.sensor_torque @ end, holding_torque),
+            *_output_rows(model, end, model.sensor_torque @ end, holding_torque),
             model.shear @ end,
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),

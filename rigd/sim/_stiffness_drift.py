@@ -38,7 +38,7 @@ class StiffnessDrift:
     fastest_rad_s
         Largest natural frequency in the arrays.
     arrays_at
-        Gives them for a stiffness over that at the start.
+        Returns the arrays for a ratio of the stiffness to that at the start.
 
     Attributes
     ----------
@@ -60,13 +60,13 @@ class StiffnessDrift:
         points = 3
         while 2 * (0.5 * half_rad) ** points / math.factorial(points) > _ERROR:
             points += 1
-        places = -np.cos(np.pi * np.arange(points) / (points - 1))
+        positions = -np.cos(np.pi * np.arange(points) / (points - 1))
         end = math.copysign(MOST_DRIFT, rate_per_s)
-        found = [arrays_at(1 + end * 0.5 * (1 + place)) for place in places.tolist()]
+        found = [arrays_at(1 + end * 0.5 * (1 + position)) for position in positions.tolist()]
         shapes = [array.shape for array in found[0]]
         values = np.stack([np.concatenate([a.ravel("F") for a in arrays]) for arrays in found])
         self._coefficients = np.linalg.solve(
-            np.polynomial.chebyshev.chebvander(places, points - 1), values
+            np.polynomial.chebyshev.chebvander(positions, points - 1), values
         )
         self._all = values[0].copy()
         sizes = [math.prod(shape) for shape in shapes]
@@ -78,24 +78,24 @@ class StiffnessDrift:
         self._per_period = abs(rate_per_s) * period_s / MOST_DRIFT
 
     def renew(self, periods: int) -> bool:
-        """Write the arrays as they are to be for the coming periods, if it is time to.
+        """Update the arrays for the coming periods, if it is time to.
 
         Parameters
         ----------
         periods
-            Periods since the drift began, each of which is to be asked for.
+            Periods since the drift began; call it for every period.
 
         Returns
         -------
         bool
-            Whether they are others now.
+            Whether the arrays have changed.
         """
         if periods < 0 or periods % self._block:
             return False
-        share = (periods + 0.5 * self._block) * self._per_period
-        if share - self._block * self._per_period > 1:
+        fraction = (periods + 0.5 * self._block) * self._per_period
+        if fraction - self._block * self._per_period > 1:
             return False  # it stays as it is
-        angle = math.acos(1 - 2 * min(share, 1.0))
+        angle = math.acos(1 - 2 * min(fraction, 1.0))
         # The k-th polynomial is cos(k arccos x); x runs from -1 to 1.
         weights = np.cos((math.pi - angle) * np.arange(len(self._coefficients)))
         weights.dot(self._coefficients, self._all)

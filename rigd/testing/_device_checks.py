@@ -1,4 +1,4 @@
-"""What the loop relies on, of every drive with its sensor."""
+"""Behaviour of drive and sensor that the loop relies on."""
 
 import json
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from rigd.devices.contracts import Devices, Wrench
 _PERIOD_NS = 1_000_000
 _TORQUE_NM = 0.3
 _ROUNDED = 0.1
-"""Share of a torque by which a drive may round it."""
+"""Fraction of a torque by which a drive may round it."""
 
 
 def _must(condition: bool, message: str) -> None:
@@ -68,21 +68,21 @@ def _torque_is_what_was_commanded_from_enabling_to_disabling(devices: Devices) -
     _must(speeds[-1] < 0.2 * max(speeds), "it does not coast to a stop once it is disabled")
 
 
-def _what_torque_was_sent_is_told(devices: Devices) -> None:
-    def told_nm(first: int) -> float:
+def _sent_torque_is_reported(devices: Devices) -> None:
+    def reported_nm(first: int) -> float:
         _run(devices, first, 10)
         return devices.drive.command(_TORQUE_NM)
 
     _connect(devices)
-    _must(told_nm(0) == 0.0, "a torque is said to be sent before it is enabled")
+    _must(reported_nm(0) == 0.0, "a torque is reported as sent before it is enabled")
     devices.drive.enable()
-    sent_nm = told_nm(10)
+    sent_nm = reported_nm(10)
     devices.drive.disable()
     _must(
         abs(sent_nm - _TORQUE_NM) <= _ROUNDED * _TORQUE_NM,
-        f"the torque sent is said to be {sent_nm:g} N·m instead of {_TORQUE_NM:g} N·m",
+        f"the torque sent is reported as {sent_nm:g} N·m instead of {_TORQUE_NM:g} N·m",
     )
-    _must(told_nm(20) == 0.0, "a torque is said to be sent after it was disabled")
+    _must(reported_nm(20) == 0.0, "a torque is reported as sent after it was disabled")
 
 
 def _disabling_and_closing_work_in_every_state(devices: Devices) -> None:
@@ -96,7 +96,7 @@ def _disabling_and_closing_work_in_every_state(devices: Devices) -> None:
     devices.sensor.close()
 
 
-def _the_lines_tell_how_they_are(devices: Devices) -> None:
+def _lines_report_their_state(devices: Devices) -> None:
     _must(devices.drive.health().bits in (None, 0), "there were bits on the line before")
     _connect(devices)
     before = devices.drive.health(), devices.sensor.health()
@@ -115,9 +115,9 @@ def _the_lines_tell_how_they_are(devices: Devices) -> None:
 DEVICE_CHECKS: tuple[Callable[[Devices], None], ...] = (
     _until_it_is_enabled_the_rig_is_read_and_nothing_moves,
     _torque_is_what_was_commanded_from_enabling_to_disabling,
-    _what_torque_was_sent_is_told,
+    _sent_torque_is_reported,
     _disabling_and_closing_work_in_every_state,
-    _the_lines_tell_how_they_are,
+    _lines_report_their_state,
 )
 """What the loop relies on: each takes devices that are opened but not connected, and raises
 AssertionError with what is wrong. The second and the third let the motor turn. None of them knows

@@ -44,13 +44,13 @@ class Signals:
     rate_hz: float = 1000.0
     metadata: dict[str, str] = field(default_factory=dict)
 
-    def part(self, kept: slice | NDArray[np.generic]) -> "Signals":
+    def part(self, selected: slice | NDArray[np.generic]) -> "Signals":
         """Return some of the samples, by numpy's indexing; segments and rate stay as they are."""
         return replace(
             self,
-            reference_rad=self.reference_rad[kept],
-            angle_rad=self.angle_rad[kept],
-            torque_nm=self.torque_nm[kept],
+            reference_rad=self.reference_rad[selected],
+            angle_rad=self.angle_rad[selected],
+            torque_nm=self.torque_nm[selected],
         )
 
 
@@ -84,8 +84,8 @@ def beam_torque(
 
     Notes
     -----
-    Eq. 25 on a line ``s = sigma + j omega``, whose ``exp(-sigma t)`` keeps the record's end, where
-    the beam still rings, from leaking into its beginning.
+    Eq. 25 on a line ``s = sigma + j omega``, whose ``exp(-sigma t)`` preserves the record's end,
+    where the beam still rings, from leaking into its beginning.
 
     Examples
     --------
@@ -208,7 +208,7 @@ def write_session(
     metadata : mapping of str to str, optional
         Further metadata, or other values of them.
     segments : mapping, optional
-        In place of those of the signals.
+        Used instead of those of the signals.
     ticks, t_ns, status : array (n,), optional
         Ticks, times in ns, and status bits; by default no tick is missing, and nothing is amiss.
     outcome : str

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from analysis.campaigns import (
     RecordEstimate,
-    SessionResult,
+    SessionAnalysis,
     WelchFit,
     analyse_session,
     campaign,
@@ -183,7 +183,7 @@ def session_result(
     name="a.mcap", fits=(), estimates=(), peaks=(), response=(1 + 0j, 2 + 0j), verdict=None
 ):
     response = np.array(response)
-    return SessionResult(
+    return SessionAnalysis(
         path=Path(name),
         experiment=experiment(name),
         beam=LINK,

@@ -6,7 +6,7 @@ import pytest
 
 from rigd.checks.devices import inspect_devices
 from rigd.checks.rows import Verdict, overall
-from rigd.devices.cia402 import Outfit
+from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
@@ -126,7 +126,7 @@ def test_a_watchdog_that_is_missing_or_unproven_is_a_warning(
     can_profile, stand_ins, watchdog, verdict
 ):
     after_s = float("inf") if watchdog is Watchdog.NONE else 0.05
-    stand_ins.drive.outfit = lambda: Outfit({}, watchdog, after_s, (), ())
+    stand_ins.drive.capabilities = lambda: DriveCapabilities({}, watchdog, after_s, (), ())
     row = by_name(inspect_devices(can_profile))["drive", "watchdog"]
     assert row.verdict is verdict
     if watchdog is Watchdog.NONE:

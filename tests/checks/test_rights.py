@@ -45,7 +45,7 @@ def test_what_is_refused_is_a_warning_with_a_remedy(asked):
 
 def test_an_ordinary_scheduler_may_be_wanted(asked):
     rows = {row.what: row for row in rights_rows(replace(asked, priority=0))}
-    assert rows["scheduling"].found == "not asked for"
+    assert rows["scheduling"].found == "not requested"
     assert rows["scheduling"].verdict is Verdict.OK
 
 

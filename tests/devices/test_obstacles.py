@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.devices.obstacles import (
-    Knock,
+    ImpactSpecification,
     Obstacle,
     ObstacleError,
     describe_obstacle,
@@ -30,7 +30,7 @@ OBSTACLES = st.builds(
     until_s=st.one_of(st.just(inf), TIMES),
 ).filter(lambda obstacle: obstacle.until_s > obstacle.from_s)
 KNOCKS = st.builds(
-    Knock,
+    ImpactSpecification,
     x_m=st.floats(0, 100, exclude_min=True),
     force_n=st.floats(-1e3, 1e3),
     duration_s=st.floats(1e-4, 100),
@@ -39,8 +39,8 @@ KNOCKS = st.builds(
 
 
 @given(st.one_of(OBSTACLES, KNOCKS))
-def test_what_is_written_is_read_back(encounter):
-    assert parse_obstacle(describe_obstacle(encounter)) == encounter
+def test_what_is_written_is_read_back(disturbance):
+    assert parse_obstacle(describe_obstacle(disturbance)) == disturbance
 
 
 def test_what_is_left_out():
@@ -49,7 +49,9 @@ def test_what_is_left_out():
     assert parse_obstacle("x=0.62,angle=-0.6").side == -1
     assert parse_obstacle("x=0.62,angle=-0.6,side=1").side == 1
     assert describe_obstacle(Obstacle(0.62, 0.6, 3000.0)) == "x=0.62,angle=0.6,stiffness=3000"
-    assert parse_obstacle("at=3,x=0.5,force=-2,duration=0.02") == Knock(0.5, -2.0, 0.02, 3.0)
+    assert parse_obstacle("at=3,x=0.5,force=-2,duration=0.02") == ImpactSpecification(
+        0.5, -2.0, 0.02, 3.0
+    )
 
 
 @given(st.text(max_size=60))
@@ -80,10 +82,10 @@ NAMES = [
 def test_any_keys_are_an_obstacle_or_refused(words):
     text = ",".join(f"{name}={value}" for name, value in words)
     try:
-        encounter = parse_obstacle(text)
+        disturbance = parse_obstacle(text)
     except ObstacleError:
         return
-    assert parse_obstacle(describe_obstacle(encounter)) == encounter
+    assert parse_obstacle(describe_obstacle(disturbance)) == disturbance
 
 
 @pytest.mark.parametrize(

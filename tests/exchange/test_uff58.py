@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from analysis.exchange import ExchangeError
-from analysis.exchange._table import Column, Table
+from analysis.exchange._table import ExportColumn, ExportTable
 from analysis.exchange._uff_format import write_uff58
 
 NUMBERS = arrays(np.float64, st.integers(1, 17), elements=st.floats(-1e99, 1e99))
@@ -28,7 +28,9 @@ def pyuff():
 
 def table(axis, *columns, unit="s"):
     title = "Time" if unit == "s" else "Frequency"
-    return Table("s.mcap", Column("x", title, unit, axis), columns, {"exported_by": "rigd 1"})
+    return ExportTable(
+        "s.mcap", ExportColumn("x", title, unit, axis), columns, {"exported_by": "rigd 1"}
+    )
 
 
 def written(content, *, binary):
@@ -55,8 +57,8 @@ def test_every_length_is_read_back(pyuff, path, binary, even, real, imaginary):
     if not even and length > 2:
         axis[-1] += 0.125
     columns = (
-        Column("a_nm", "A", "N.m", real),
-        Column("g_nm_per_rad", "A / B", "N.m/rad", real + 1j * imaginary),
+        ExportColumn("a_nm", "A", "N.m", real),
+        ExportColumn("g_nm_per_rad", "A / B", "N.m/rad", real + 1j * imaginary),
     )
     one, other = read_back(pyuff, path, written(table(axis, *columns), binary=binary))
     tolerance = 0.0 if binary else 5e-13
@@ -73,7 +75,7 @@ def test_every_length_is_read_back(pyuff, path, binary, even, real, imaginary):
 def test_a_binary_body_has_the_bytes_that_its_header_states(length, complex_, even):
     axis = np.arange(length) + (0 if even else 0.3 * (np.arange(length) == length - 1))
     values = np.full(length, np.pi) * (1j if complex_ else 1)
-    data = written(table(axis, Column("a", "A", "N.m", values)), binary=True)
+    data = written(table(axis, ExportColumn("a", "A", "N.m", values)), binary=True)
     function = data[data.index(b"    58b") :]
     lines = function.split(b"\n", 12)
     order, form, text_lines, size = (int(field) for field in lines[0][7:43].split())
@@ -87,7 +89,7 @@ def test_a_binary_body_has_the_bytes_that_its_header_states(length, complex_, ev
 def test_the_text_is_that_of_the_definition():
     """By hand from the SDRL's definition of data set 58: fields, columns and codes."""
     values = np.array([1.0, complex(0.0, -2.5), 3.25])
-    column = Column("g_nm_per_rad", "Torque / Angle", "N.m/rad", values)
+    column = ExportColumn("g_nm_per_rad", "Torque / Angle", "N.m/rad", values)
     text = written(table(np.array([0.5, 0.75, 1.0]), column, unit="Hz"), binary=False).decode()
     function = text[text.index("    58") :].split("\n")
     assert [line.rstrip() for line in function[1:6]] == [
@@ -109,7 +111,7 @@ def test_the_text_is_that_of_the_definition():
 
 def test_times_that_six_digits_cannot_give_are_refused_in_text_only(pyuff, path):
     axis = 1000.0 + np.delete(np.arange(40), 7) * 1e-3
-    content = table(axis, Column("a", "A", "N", np.arange(39.0)))
+    content = table(axis, ExportColumn("a", "A", "N", np.arange(39.0)))
     with pytest.raises(ExchangeError, match="--binary"):
         written(content, binary=False)
     (function,) = read_back(pyuff, path, written(content, binary=True))
@@ -118,18 +120,18 @@ def test_times_that_six_digits_cannot_give_are_refused_in_text_only(pyuff, path)
 
 def test_an_increment_of_more_than_six_digits_is_not_rounded(pyuff, path):
     axis = np.arange(5000) / 1024
-    content = table(axis, Column("a", "A", "N", axis))
+    content = table(axis, ExportColumn("a", "A", "N", axis))
     (function,) = read_back(pyuff, path, written(content, binary=True))
     np.testing.assert_allclose(function["x"], axis, atol=1e-5)
 
 
 def test_integers_have_no_place_and_names_are_tamed(pyuff, path):
     columns = (
-        Column("status", "Bits", "", np.arange(3)),
-        Column("coherence\r\n    -1", "Coherence", "", np.arange(3.0)),
+        ExportColumn("status", "Bits", "", np.arange(3)),
+        ExportColumn("coherence\r\n    -1", "Coherence", "", np.arange(3.0)),
     )
     content = table(np.arange(3.0), *columns, unit="Hz")
-    content = Table("ä" * 100, content.axis, content.columns, content.information)
+    content = ExportTable("ä" * 100, content.axis, content.columns, content.information)
     (function,) = read_back(pyuff, path, written(content, binary=False))
     assert function["id1"] == "coherence??    -1"
     assert function["id2"] == "?" * 80

@@ -9,9 +9,9 @@ import pytest
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
 from rigd.identification import _records, read_recording
-from rigd.identification.estimate import EstimateError
+from rigd.identification.estimate import MotorEstimateError
 from rigd.identification.experiments import (
-    Pass,
+    SpeedPass,
     lay_out_passes,
     multisine_session,
     read_layout,
@@ -69,7 +69,7 @@ def test_the_multisine_moves_all_of_its_band_alike(profile):
 @pytest.mark.parametrize("make", SESSIONS)
 def test_cycles_are_equal_but_for_a_small_offset(profile, make):
     excitation = make(profile, torque_percent=40.0, stroke_rad=0.8)
-    by_speed: dict[float, list[Pass]] = {}
+    by_speed: dict[float, list[SpeedPass]] = {}
     for run in passes_of(excitation):
         by_speed.setdefault(run.speed_rad_s, []).append(run)
     for runs in by_speed.values():
@@ -127,5 +127,5 @@ def test_a_session_counts_once(short_chirps, tmp_path, monkeypatch):
     copied = tmp_path / "copied.mcap"
     shutil.copy(short_chirps[0], copied)
     named = rf"copied\.mcap: it has samples of .*{short_chirps[0].name}"
-    with pytest.raises(EstimateError, match=named):
+    with pytest.raises(MotorEstimateError, match=named):
         read_recording([short_chirps[0], short_chirps[1], copied], 0.0)

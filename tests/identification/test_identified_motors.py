@@ -14,7 +14,7 @@ from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine.cycle import Cycle, make_observers, make_watch
 from rigd.identification import cautious, tuned
-from rigd.identification.estimate import Timing, Window, estimate_motor
+from rigd.identification.estimate import PassReadings, Timing, estimate_motor
 from rigd.identification.experiments import (
     TOP_HZ,
     lay_out_passes,
@@ -116,7 +116,7 @@ def as_text(excitation):
 def windows_of(excitation, signals, session):
     layout = read_layout(as_text(excitation))
     return [
-        Window(
+        PassReadings(
             *(signal[run.first : run.end] for signal in signals),
             run.speed_rad_s,
             TOP_HZ[excitation.kind],

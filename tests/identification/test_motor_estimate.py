@@ -8,7 +8,13 @@ import pytest
 import scipy  # whose parts come on first use
 from cases import further
 
-from rigd.identification.estimate import EstimateError, Timing, Window, _coverage, estimate_motor
+from rigd.identification.estimate import (
+    MotorEstimateError,
+    PassReadings,
+    Timing,
+    _coverage,
+    estimate_motor,
+)
 
 RATE_HZ = 1000.0
 STEPS = 5
@@ -98,7 +104,7 @@ def windows_for(truth):
     amplitudes = np.where(np.abs(speeds) > 0.5, 0.006, 0.0)
     signals = np.moveaxis(simulate(truth, speeds, amplitudes)[..., 100:], 0, 1)
     return tuple(
-        Window(*three, speed, 28.0 if waves else 3.0, 0 if waves else 1, speed)
+        PassReadings(*three, speed, 28.0 if waves else 3.0, 0 if waves else 1, speed)
         for three, speed, waves in zip(signals, speeds.tolist(), amplitudes > 0, strict=True)
     )
 
@@ -179,7 +185,7 @@ def test_too_few_passes_are_refused():
     windows = windows_for(Truth())
     one_way = [window for window in windows if window.speed_rad_s > 0]
     for few in ((), one_way, windows[:3] + windows[8:11]):
-        with pytest.raises(EstimateError, match="too few"):
+        with pytest.raises(MotorEstimateError, match="too few"):
             estimate_motor(few, timing_for(Truth()))
 
 
@@ -188,7 +194,7 @@ def test_a_record_without_torque_tells_nothing():
         replace(window, torque_command_nm=np.zeros_like(window.torque_command_nm))
         for window in windows_for(Truth())
     ]
-    with pytest.raises(EstimateError):
+    with pytest.raises(MotorEstimateError):
         estimate_motor(still, timing_for(Truth()))
 
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 
 from rigd.identification import propose
-from rigd.identification.estimate import MotorEstimate, Quantity
+from rigd.identification.estimate import MotorEstimate, MotorQuantity
 from rigd.profile import load_profile
 
 ESTIMATE = MotorEstimate(
-    inertia_kg_m2=Quantity(2.0123e-3, 2.1e-6),
-    viscous_nm_s_per_rad=Quantity(0.02004, 6e-5),
-    coulomb_nm=Quantity(-1e-5, 4e-5),
-    torque_scale=Quantity(1.1, 5e-4),
-    actuation_delay_s=Quantity(9.96e-4, 8e-6),
+    inertia_kg_m2=MotorQuantity(2.0123e-3, 2.1e-6),
+    viscous_nm_s_per_rad=MotorQuantity(0.02004, 6e-5),
+    coulomb_nm=MotorQuantity(-1e-5, 4e-5),
+    torque_scale=MotorQuantity(1.1, 5e-4),
+    actuation_delay_s=MotorQuantity(9.96e-4, 8e-6),
     windows=72,
     dropped=0,
     misfit=1.0,
@@ -49,7 +49,7 @@ def test_what_cannot_be_negative_is_proposed_as_zero(profile):
 
 
 def test_a_scale_that_is_not_told_is_not_proposed(profile):
-    proposal = propose(replace(ESTIMATE, torque_scale=Quantity(1.0, None)), profile)
+    proposal = propose(replace(ESTIMATE, torque_scale=MotorQuantity(1.0, None)), profile)
     assert "rated_torque_nm" not in "\n".join(proposal.toml())
     assert any("not identifiable" in line for line in proposal.table())
     assert "is not identifiable" in proposal.notes[0]
@@ -76,7 +76,7 @@ def test_misfit_and_missing_passes_are_told(profile):
     ],
 )
 def test_numbers_show_two_figures_of_their_deviation(profile, value, std, expected):
-    estimate = replace(ESTIMATE, viscous_nm_s_per_rad=Quantity(value, std))
+    estimate = replace(ESTIMATE, viscous_nm_s_per_rad=MotorQuantity(value, std))
     (line,) = [row for row in propose(estimate, profile).table() if "motor.viscous" in row]
     cells = re.split(r"  +", line)
     assert (cells[1].partition(" ")[0], cells[2]) == expected
@@ -84,7 +84,7 @@ def test_numbers_show_two_figures_of_their_deviation(profile, value, std, expect
 
 @pytest.mark.parametrize(("delay_s", "pasted"), [(9.96e-4, 1e-3), (1.004e-3, 1.004e-3)])
 def test_a_delay_just_below_what_the_protocol_takes_is_pasted_as_that(delay_s, pasted):
-    estimate = replace(ESTIMATE, actuation_delay_s=Quantity(delay_s, 8e-6))
+    estimate = replace(ESTIMATE, actuation_delay_s=MotorQuantity(delay_s, 8e-6))
     proposal = propose(estimate, load_profile("antenna_can"))
     toml = tomllib.loads("\n".join(proposal.toml()))
     assert toml["actuation"]["delay_s"]["value"] == pytest.approx(pasted)
@@ -92,7 +92,7 @@ def test_a_delay_just_below_what_the_protocol_takes_is_pasted_as_that(delay_s, p
 
 
 def test_a_drive_that_takes_its_torque_on_arrival_is_recognised():
-    estimate = replace(ESTIMATE, actuation_delay_s=Quantity(6.0e-4, 8e-6))
+    estimate = replace(ESTIMATE, actuation_delay_s=MotorQuantity(6.0e-4, 8e-6))
     proposal = propose(estimate, load_profile("antenna_can"))
     assert any('torque_delivery = "on_arrival"' in note for note in proposal.notes)
     toml = tomllib.loads("\n".join(proposal.toml()))

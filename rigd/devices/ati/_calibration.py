@@ -1,8 +1,8 @@
 """Calibration of an ATI sensor, from gauge counts to a wrench, and its status words.
 
 A force (N after the unit's factor) is ``F_i = unit · Σ_j M_ij g_j / counts_per_force``, a torque
-(N·m) the same with its own unit and counts. NETCANOEM tells the matrix row by row, Digital F/T in
-a block of registers.
+(N·m) the same with its own unit and counts. NETCANOEM sends the matrix row by row, Digital F/T in a
+block of registers.
 
 The status words of both sensors are put into words, and some of their bits forbid measuring.
 Sources: the manuals of NETCANOEM and of Digital F/T. They differ in bits 9, 10 and 13.
@@ -18,7 +18,7 @@ import numpy as np
 from rigd.devices.contracts import Wrench
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""Gauge at each place of a reading, on CAN and on the serial line."""
+"""Gauge at each position of a reading, on CAN and on the serial line."""
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -47,7 +47,8 @@ _LARGEST, _SMALLEST = 1e6, 1e-6
 """N or N·m of one gauge at its full scale: no sensor is built for more or for less (the largest has
 40 kN, the smallest resolves 1 mN)."""
 _LEAST_RANK = 1e-6
-"""Ratio of the singular values below which some loads cannot be told apart, in single precision."""
+"""Ratio of the singular values below which some loads are not distinguishable in single
+precision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ class Calibration:
     ratings: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what gives no wrench."""
+        """Raise if no wrench can be computed with the calibration."""
         if self.force_unit not in _FORCE_UNITS or self.torque_unit not in _TORQUE_UNITS:
             raise ValueError(
                 f"its calibration has the unit codes {self.force_unit} (force) and "
@@ -165,7 +166,7 @@ class Calibration:
         return tuple(tuple(row[gauge] for gauge in WIRE_ORDER) for row in self.wrench_per_count())
 
     def as_dict(self) -> dict[str, object]:
-        """Return all of it for the session file; ranges in N and N·m."""
+        """Return the calibration for the session file; ranges in N and N·m."""
         ranges: list[float] | str = "not stated by the sensor"
         if self.ratings is not None and all(map(isfinite, self.ratings)):
             ranges = [
@@ -214,12 +215,12 @@ def wrench_function(rows: Rows) -> Callable[[float, float, float, float, float, 
 
 
 def same_serial_number(wanted: str, found: str) -> bool:
-    """Say whether a sensor is the one that a profile names; an empty name accepts any."""
+    """Return whether a sensor has the serial number of the profile; an empty one accepts any."""
     return not wanted or wanted.strip().upper() == found.strip().upper()
 
 
 def text_of(raw: Sequence[int]) -> str:
-    """Return bytes as text without padding, or in hexadecimal where they are none."""
+    """Return bytes as text without padding, or in hexadecimal if they are not text."""
     data = bytes(raw).rstrip(b"\0\xff ")
     text = data.decode("latin-1").strip()
     return text if text.isascii() and (text.isprintable() or not text) else data.hex(" ")
@@ -322,13 +323,13 @@ SERIAL_CRITICAL = 0x3EBE
 
 
 def can_status(word: int) -> list[str]:
-    """Return what the status word of a NETCANOEM box says, one clause a bit."""
-    # Bit 15 only sums up the others.
+    """Describe the status word of a NETCANOEM box, one clause per bit."""
+    # Bit 15 summarises the others.
     return _words(word & 0x7FFF, _CAN_WORDS)
 
 
 def serial_status(word: int) -> list[str]:
-    """Return what the status word of a Digital F/T sensor says, one clause a bit."""
+    """Describe the status word of a Digital F/T sensor, one clause per bit."""
     return _words(word, _SERIAL_WORDS)
 
 

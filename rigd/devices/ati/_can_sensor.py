@@ -1,4 +1,4 @@
-"""An ATI sensor behind a NETCANOEM box on CAN: set up once, then polled once a tick."""
+"""ATI sensor with a NETCANOEM box on CAN: set up once, then polled once a tick."""
 
 import time
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
 _TRIES = 3
-# What was asked for again may be answered twice, and no reply says which row of the matrix it is.
+# A repeated request may be answered twice, and no reply states which row of the matrix it holds.
 _LATE_REPLY_S = 0.5
 _LOST_POLL_S = 0.02
 # A box that was silent for this long may have restarted; no box starts faster.
@@ -39,7 +39,7 @@ _ASSUMED = (
 
 
 class AtiCanSensor:
-    """The sensor of a profile with a section ``ati_can``.
+    """Sensor of a profile with a section ``ati_can``.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class AtiCanSensor:
         Raises
         ------
         DeviceError
-            If the sensor is absent, not the profile's or not sound.
+            If the sensor is absent, is not the one of the profile, or reports a fault.
         """
         self.close()
         exchange = self._link.open()
@@ -158,13 +158,13 @@ class AtiCanSensor:
             **self._calibration.as_dict(),
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
-            **({} if self._tells_scale else {"assumed": _ASSUMED}),
+            **({} if self._reports_scale else {"assumed": _ASSUMED}),
             "status": self._status,
             "base_id": self._settings.base_id,
         }
 
     def request(self, due_ns: int) -> None:  # noqa: ARG002
-        """Poll the sensor, unless it is in doubt which reply is whose, or what it measures with.
+        """Poll the sensor, unless the pairing of replies or the sensor's calibration is uncertain.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class AtiCanSensor:
         """
         polls = self.polls
         if self._lock_step and not self._waits:
-            # No time passes between two ticks: the reply to the last poll is still being made.
+            # No time passes between two ticks: the reply to the last poll is still in preparation.
             polls.wait(time.monotonic_ns() + self._deadline_ns)
         polls.drain()
         if not self._waits:
@@ -204,7 +204,7 @@ class AtiCanSensor:
             self._unanswered += 1
             return self._wrench
         if self._unanswered >= self._restart_ticks:
-            # It answers again: before a reading counts, it has to show its calibration.
+            # It answers again: its calibration is verified before a reading counts.
             self._in_doubt = True
             self._shown = b""
             self._inbox.clear()
@@ -257,7 +257,7 @@ class AtiCanSensor:
         }
 
     def close(self) -> None:
-        """Give the bus up. Never raises."""
+        """Release the bus. Never raises."""
         if self._connected:
             self._connected = False
             self.polls.close()
@@ -282,7 +282,7 @@ class AtiCanSensor:
         g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
         before, self._status_word = self._status_word, status
         if status:
-            self._judge(status, before)
+            self._check_status(status, before)
         limit = self._limit
         self.wrench_saturated = (
             max(g0, g2, g4, g1, g3, g5) >= limit or min(g0, g2, g4, g1, g3, g5) <= -limit
@@ -291,7 +291,7 @@ class AtiCanSensor:
         self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _judge(self, status: int, before: int) -> None:
+    def _check_status(self, status: int, before: int) -> None:
         if status & CAN_BUS_ERROR:
             self.bus_errors += 1
         if status & ~before & CAN_WATCHDOG_RESET:
@@ -316,9 +316,9 @@ class AtiCanSensor:
         )
 
     def _is_the_same(self) -> bool:
-        """Whether a box that was silent has shown the calibration that was read from it.
+        """Whether a box that was silent still has the calibration that was read from it.
 
-        One that was without power for a moment does not say so: bit 0 of its status is for the
+        A box that was without power for a moment does not report it: bit 0 of its status is for the
         watchdog only.
         """
         inbox, calibration = self._inbox, self._calibration
@@ -332,7 +332,7 @@ class AtiCanSensor:
                 raise self._restarted(
                     "it was silent for a moment and answers with another calibration matrix since"
                 )
-            # Once may be a reply that was damaged, as at connecting.
+            # A single mismatch may be a damaged reply, as at connecting.
             self._shown = shown
             inbox.clear()
         base = self._settings.base_id
@@ -340,7 +340,7 @@ class AtiCanSensor:
         return False
 
     def _poll(self, timeout_s: float) -> Answer | None:
-        """Poll outside the cycle."""
+        """Poll the sensor outside the cycle."""
         polls = self.polls
         polls.drain()
         polls.forget()
@@ -356,7 +356,7 @@ class AtiCanSensor:
         raise self._no_reply("a reading")
 
     def _ask(self, what: str, opcode: int, *arguments: int, replies: Sequence[int] = ()) -> bytes:
-        """Return the reply to a request, several frames end to end."""
+        """Return the reply to a request, its frames concatenated."""
         exchange, inbox = self.polls.exchange, self._inbox
         wanted = replies or (opcode,)
         frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
@@ -399,7 +399,7 @@ class AtiCanSensor:
         return found
 
     @property
-    def _tells_scale(self) -> bool:
+    def _reports_scale(self) -> bool:
         return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
 
     def _select_calibration(self) -> None:
@@ -411,10 +411,10 @@ class AtiCanSensor:
                 f"{self._name}: asked for calibration {wanted}, it selected {selected}. Choose "
                 "one that it has (ati_can.calibration)."
             )
-        # Its status tells whether the selected one is any good.
+        # The status shows whether the selected calibration is valid.
         status = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
         if status & CAN_BAD_CALIBRATION:
-            self._judge(status, status)
+            self._check_status(status, status)
 
     def _read_matrix(self) -> Rows:
         return tuple(
@@ -432,7 +432,7 @@ class AtiCanSensor:
     def _read_scale(self, serial_number: str, matrix: Rows) -> Calibration:
         force = torque = netcanoem.COUNTS_BEFORE_SCALE
         force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
-        if self._tells_scale:
+        if self._reports_scale:
             force, torque = netcanoem.counts_per_unit(
                 self._ask("its counts per unit", netcanoem.COUNTS_PER_UNIT)
             )

@@ -40,11 +40,11 @@ REPLY_LENGTHS = {
 """Bytes in the reply of each opcode that the driver uses."""
 
 FIRST_FIRMWARE_WITH_SCALE = (3, 7)
-"""Firmware (major, minor) from which on a box can be asked for counts per unit and unit codes."""
+"""First firmware (major, minor) that reports counts per unit and unit codes."""
 COUNTS_BEFORE_SCALE = 1_000_000
-"""Counts per unit of force and of torque of older firmware."""
+"""Counts per unit of force and of torque with older firmware."""
 NEWTON, NEWTON_METRE = 2, 3
-"""Unit codes that are assumed of older firmware, which has no request for them either."""
+"""Unit codes assumed for older firmware, which does not report them."""
 
 read_gauges = Struct(">Hhhh").unpack
 """Status word and gauges 0, 2, 4 from the first reply to GAUGES."""
@@ -63,7 +63,7 @@ def request(base: int, opcode: int, *arguments: int) -> bytes:
 
 
 def matrix_row(replies: bytes) -> tuple[float, ...]:
-    """Return the six entries that three replies, end to end, hold two by two."""
+    """Return the six entries of three concatenated replies, two in each."""
     return unpack(">6f", replies)
 
 
@@ -91,7 +91,7 @@ Answer = tuple[bytes, bytes]
 
 
 class _Frames:
-    """One of the two frames of the replies: the last that came, and how many did."""
+    """One of the two frames of a reply: the last one received, and the count."""
 
     __slots__ = ("_length", "data", "replies")
 
@@ -101,7 +101,7 @@ class _Frames:
         self.replies = 0
 
     def take(self, data: bytes) -> None:
-        """Take a frame; one of the wrong length is empty."""
+        """Store a frame; one of the wrong length counts as empty."""
         self.replies += 1
         self.data = data if len(data) == self._length else b""
 
@@ -150,7 +150,7 @@ class GaugePolls:
         self.answer: Answer | None = None
 
     def open(self, exchange: CanExchange) -> None:
-        """Use this exchange from now on."""
+        """Start to use an exchange."""
         self._exchange = exchange
         self.forget()
 
@@ -174,16 +174,16 @@ class GaugePolls:
 
     @property
     def lost(self) -> int:
-        """Replies that have been lost, as far as it is known."""
+        """Number of replies known to be lost."""
         return max(self._firsts.lost, self._seconds.lost)
 
     def subscribe(self, first_id: int, second_id: int) -> None:
-        """Have the frames of these identifiers delivered here."""
+        """Subscribe to the frames of these identifiers."""
         self.exchange.subscribe(first_id, self._first.take)
         self.exchange.subscribe(second_id, self._second.take)
 
     def drain(self) -> None:
-        """Take all that has come."""
+        """Deliver everything that has arrived."""
         self.exchange.drain()
 
     def send(self) -> None:
@@ -195,7 +195,7 @@ class GaugePolls:
         self.exchange.send(self._frame)
 
     def send_or_pause(self) -> None:
-        """Poll as every tick does, but for one that is left out to see which reply is whose."""
+        """Poll, or leave the poll out for one tick to restore the pairing of replies."""
         firsts, seconds = self._firsts, self._seconds
         if (firsts.owed or seconds.owed) and firsts.wants_pause() | seconds.wants_pause():
             self.pause()
@@ -225,7 +225,7 @@ class GaugePolls:
         return self.answer
 
     def forget(self) -> None:
-        """Start over: nothing is on its way any more."""
+        """Reset the pairing: no reply is outstanding."""
         self._firsts.start()
         self._seconds.start()
         self.answer = None

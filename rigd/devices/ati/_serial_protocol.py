@@ -19,7 +19,7 @@ from struct import pack, unpack
 ADDRESS = 0x0A
 """Modbus address of every such sensor."""
 MAX_REGISTERS = 64
-"""Most that are asked for at once."""
+"""Largest number of registers in one request."""
 
 STATUS_WORD = 0x001D
 ACTIVE_GAINS = 0x0000
@@ -45,11 +45,11 @@ _EXCEPTIONS = {
 
 
 class BadReply(ValueError):
-    """A reply is missing, cut, disturbed or not the one to the request: asking again may help."""
+    """The reply is missing, damaged or that to another request; repeat it."""
 
 
-class Refused(ValueError):
-    """The sensor understood and declined: asking again will not help."""
+class ExceptionResponse(ValueError):
+    """Modbus exception response: the sensor declines the request; a repetition does not help."""
 
 
 # Modbus RTU frames
@@ -95,7 +95,7 @@ def write_registers(first: int, values: Sequence[int]) -> bytes:
 
 
 def reply_length(request: bytes) -> int:
-    """Return how many bytes the reply to a request has, unless it is a refusal."""
+    """Return the length of the reply to a request in bytes, unless it is an exception response."""
     function = request[1]
     if function == _READ:
         (count,) = unpack(">H", request[4:6])
@@ -107,19 +107,19 @@ REFUSAL_LENGTH = 5
 
 
 def is_refusal(reply: bytes) -> bool:
-    """Say whether what has come so far begins a refusal."""
+    """Return whether the bytes received so far begin an exception response."""
     return len(reply) > 1 and bool(reply[1] & _EXCEPTION_FLAG)
 
 
 def content_of(request: bytes, reply: bytes) -> bytes:
-    """Return what a reply holds, once address, function, length, checksum and echo agree.
+    """Return the content of a reply; verify address, function, length, checksum and echo.
 
     Raises
     ------
     BadReply
-        If it is not a sound reply to this request.
-    Refused
-        If it is sound and declines.
+        If it is not a valid reply to this request.
+    ExceptionResponse
+        If it is valid and declines the request.
     """
     if not reply:
         raise BadReply("no reply came")
@@ -133,14 +133,14 @@ def content_of(request: bytes, reply: bytes) -> bytes:
     content = reply[2:-2]
     if is_refusal(reply):
         code = content[0]
-        raise Refused(_EXCEPTIONS.get(code, f"it declined with code {code}"))
+        raise ExceptionResponse(_EXCEPTIONS.get(code, f"it declined with code {code}"))
     function = request[1]
     if function == _READ and content[0] != wanted - 5:
         raise BadReply(f"{content[0]} bytes of registers came instead of {wanted - 5}")
     if function == _WRITE and content != request[2:6]:
         raise BadReply("it confirmed other registers than were written")
     if function in (_LOCK, _START) and content[0] != _ACCEPTED:
-        raise Refused(f"it declined with code {content[0]}")
+        raise ExceptionResponse(f"it declined with code {content[0]}")
     return content[1:] if function == _READ else content
 
 
@@ -166,12 +166,12 @@ _SYNC_SIZE = SYNC_RECORDS * RECORD_SIZE
 
 
 class RecordStream:
-    """Cuts what arrives, in whatever pieces, into records.
+    """Splits the received bytes, in chunks of any length, into records.
 
     Attributes
     ----------
     synchronised : bool
-        It is known where the next record begins.
+        Whether the beginning of the next record is known.
     records : int
         Delivered so far.
     checksum_errors : int
@@ -191,12 +191,12 @@ class RecordStream:
         self.start(aligned=False)
 
     def start(self, *, aligned: bool) -> None:
-        """Begin afresh.
+        """Restart the stream.
 
         Parameters
         ----------
         aligned
-            The next byte is the first of a record, as far as one can tell.
+            Whether the next byte is probably the first of a record.
         """
         self._held = b""
         self._phase = 0 if aligned else None
@@ -208,7 +208,7 @@ class RecordStream:
         return len(self._held)
 
     def feed(self, chunk: bytes) -> bytes:
-        """Take what has arrived; return the records in it, end to end, oldest first."""
+        """Return the records in the received bytes, concatenated, oldest first."""
         data = self._held + chunk if self._held else chunk
         found = b""
         while True:
@@ -233,7 +233,7 @@ class RecordStream:
         return found
 
     def _search(self, data: bytes) -> int | None:
-        """Return where the records begin; or None, having kept what may still tell."""
+        """Return the offset of the first record; None if more bytes are needed to find it."""
         last = len(data) - _SYNC_SIZE
         undecided = max(0, last + 1)
         for begin in range(last + 1):
@@ -242,7 +242,7 @@ class RecordStream:
             if self._phase is not None and (begin - self._phase) % RECORD_SIZE == 0:
                 return begin
             if begin + _SUM_AT > last:
-                # Its rivals are not all here yet.
+                # Not all candidate offsets have arrived yet.
                 undecided = min(undecided, begin)
             elif not any(_fits(data, begin + shift) for shift in range(1, RECORD_SIZE)):
                 return begin
@@ -254,7 +254,7 @@ class RecordStream:
 
 
 def _length_of_good(data: bytes, whole: int) -> int:
-    """Return how many bytes of ``data[:whole]`` are sound records, up to the first that is not."""
+    """Return how many bytes of ``data[:whole]`` are valid records, up to the first invalid one."""
     for begin in range(0, whole, RECORD_SIZE):
         if (sum(data[begin : begin + _SUM_AT]) ^ data[begin + _SUM_AT]) & _SUM_MASK:
             return begin

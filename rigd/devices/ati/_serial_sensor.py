@@ -28,7 +28,7 @@ _GAP_PERIODS = 2.5
 """Periods without a byte that are a gap: the stream brings several records in each."""
 _GAPS, _FEWEST_GAPS = 8, 4
 _EVEN = 1.5
-"""Ratio of a gap to the middle one up to which they are even."""
+"""Largest ratio of a gap to the median gap for gaps to count as even."""
 _RECENT_NS = 500_000_000
 _STEADY_TICKS = 3
 """Ticks that bring their own records after which what is still missing counts as lost."""
@@ -45,7 +45,7 @@ class AtiSerialSensor:
     rig
         Parameters with sections ``ati_serial`` and ``acquisition``.
     simulator
-        Address of the simulated rig that stands in for it, or None.
+        Address of the simulated rig that replaces it, or None.
 
     Attributes
     ----------
@@ -55,8 +55,8 @@ class AtiSerialSensor:
     stream : RecordStream
         Stream, with the counts of records and checksum errors.
     status : list of str
-        What the sensor's status word said last, in words; it can only be asked while the sensor
-        does not stream, that is in `connect` and `close`.
+        Last status word of the sensor, in words; it can be read only while the sensor does not
+        stream, that is in `connect` and `close`.
 
     Raises
     ------
@@ -108,8 +108,8 @@ class AtiSerialSensor:
         self._steady_ticks = 0
         self._damages = 0
         self._missing_records = 0
-        self._asked_ns = 0
-        self._looked_ns = 0
+        self._requested_ns = 0
+        self._last_read_ns = 0
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
@@ -168,13 +168,13 @@ class AtiSerialSensor:
 
     def request(self, due_ns: int) -> None:
         """Begin the tick; the sensor streams, so nothing is sent."""
-        now_ns = self._asked_ns = time.monotonic_ns()
+        now_ns = self._requested_ns = time.monotonic_ns()
         periods = 1
         if self._tick_ns is not None and not self._lock_step:
             periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
         self._due += periods * self._bytes_per_tick
-        if now_ns - self._looked_ns > _IDLE_NS and not self._lock_step:
+        if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
             # What has piled up is old, and perhaps full of holes: only what comes now counts.
             self._take(self._open_line().read())
             self._history = b""
@@ -193,12 +193,12 @@ class AtiSerialSensor:
         while self._arrived < self._due:
             lacks_one = self._due - self._arrived <= RECORD_SIZE
             patience_ns = self._patience_ns if lacks_one else self._deadline_ns
-            left_ns = self._asked_ns + patience_ns - time.monotonic_ns()
+            left_ns = self._requested_ns + patience_ns - time.monotonic_ns()
             if left_ns <= 0:
                 break
             line.wait(left_ns * 1e-9)
             new += self._take(line.read())
-        self._looked_ns = time.monotonic_ns()
+        self._last_read_ns = time.monotonic_ns()
         self.wrench_stale = self._lags(len(new)) or not new
         if self.wrench_stale:
             return self._wrench
@@ -208,11 +208,11 @@ class AtiSerialSensor:
         return self._filter()
 
     def _lags(self, new: int) -> bool:
-        """Whether the newest record is a tick or more behind, with `new` bytes of records now.
+        """Return whether the newest record is a tick or more late, given `new` bytes of records.
 
         Records that are late catch up. Lost ones do not: where each of some ticks brings its own
-        and the gap stays, they count as lost. But nothing counts records: unless what was lost
-        has left a torn one behind, they may all be late by as much from then on, and that is said.
+        and the gap stays, they count as lost. But nothing counts records: unless what was lost left
+        an incomplete one, all later records may be late by as much, and that doubt is reported.
         Less than a tick is the drift between two clocks, or the sensor's phase.
         """
         complete = self._arrived - self.stream.pending
@@ -261,7 +261,7 @@ class AtiSerialSensor:
         )
 
     def _cause(self) -> str:
-        """Say that the adapter holds records back, where the latest came in even blocks."""
+        """Report that the adapter holds records back if the latest arrived in even blocks."""
         now_ns = time.monotonic_ns()
         gaps_ns = sorted(gap for came_ns, gap in self._gaps if now_ns - came_ns < _RECENT_NS)
         if len(gaps_ns) < _FEWEST_GAPS:
@@ -289,7 +289,7 @@ class AtiSerialSensor:
         line, stream = self._open_line(), self.stream
         self._take(line.read())
         records, errors, dropped = stream.records, stream.checksum_errors, stream.dropped_bytes
-        begin_ns = heard_ns = now_ns = time.monotonic_ns()
+        begin_ns = last_received_ns = now_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         longest_ns = 0
         while now_ns < end_ns:
@@ -297,10 +297,10 @@ class AtiSerialSensor:
             data = line.read()
             now_ns = time.monotonic_ns()
             if data or now_ns >= end_ns:
-                longest_ns = max(longest_ns, now_ns - heard_ns)
-                heard_ns = now_ns
+                longest_ns = max(longest_ns, now_ns - last_received_ns)
+                last_received_ns = now_ns
                 self._take(data)
-        self._looked_ns = now_ns
+        self._last_read_ns = now_ns
         return {
             "records_hz": (stream.records - records) / ((now_ns - begin_ns) * 1e-9),
             "checksum_errors": float(stream.checksum_errors - errors),
@@ -328,7 +328,7 @@ class AtiSerialSensor:
         return self._line
 
     def _take(self, data: bytes) -> bytes:
-        """Sort what has arrived into records; return the new ones."""
+        """Split the received bytes into records; return the new ones."""
         if not data:
             return data
         now_ns = time.monotonic_ns()
@@ -343,7 +343,7 @@ class AtiSerialSensor:
                 self._count_errors(new)
             else:
                 self._errors_in_a_row = 0
-            # Before the first tick's worth the oldest record stands for those before it.
+            # Before a tick's worth of records has arrived, the oldest one is repeated.
             history = self._history or new[:RECORD_SIZE] * len(self._weights)
             self._history = (history + new)[-self._history_size :]
         return new
@@ -411,7 +411,7 @@ class AtiSerialSensor:
         while not self._lock_step and self.stream.records - first < len(self._weights):
             if time.monotonic_ns() > end_ns:
                 raise DeviceError(
-                    f"{self._name}: it was told to stream, but of the "
+                    f"{self._name}: it was commanded to stream, but of the "
                     f"{self._arrived - before} bytes that came in {_FIRST_RECORDS_TIMEOUT_S} s "
                     f"only {self.stream.records - first} were sound records. Check cable, "
                     "ati_serial.baud and ati_serial.stream_hz."
@@ -419,9 +419,9 @@ class AtiSerialSensor:
             line.wait(SILENCE_S)
             self._take(line.read())
         if self._history:
-            # What stands where the first tick finds no new records.
+            # Value that is used if the first tick finds no new records.
             self._filter()
-        self._looked_ns = time.monotonic_ns()
+        self._last_read_ns = time.monotonic_ns()
         self._due = self._arrived - self.stream.pending
         self._tick_ns = None
         self._steady_ticks = 0

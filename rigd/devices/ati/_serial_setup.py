@@ -29,7 +29,7 @@ _READ_SIZE = 65_536
 
 
 def held_back(gap_s: float, port: str) -> str:
-    """Say that an adapter holds records back, and the remedy.
+    """Describe that an adapter holds records back, and the remedy.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class SerialLine:
     def __init__(self, port: str, baud: int, device: str) -> None:
         self._device = device
         try:
-            # vmin = 1 (by inter_byte_timeout): an empty line is then told from a dead one.
+            # vmin = 1 (by inter_byte_timeout): distinguishes an empty line from a dead one.
             self._serial = serial.Serial(
                 port,
                 baud,
@@ -108,16 +108,16 @@ class SerialLine:
             If the line is gone.
         """
         data = b""
-        while True:  # a short piece need not be the last: the kernel moves bytes on as it is asked
+        while True:  # a short chunk need not be the last: the kernel moves bytes on with each read
             try:
-                piece = os.read(self._fd, _READ_SIZE)
+                chunk = os.read(self._fd, _READ_SIZE)
             except BlockingIOError:
                 return data
             except OSError as error:
                 raise self._gone(error.strerror) from None
-            if not piece:
+            if not chunk:
                 raise self._gone("hung up")
-            data = data + piece if data else piece
+            data = data + chunk if data else chunk
 
     def write(self, data: bytes) -> None:
         """Send some bytes; so few that they always fit into the kernel's buffer.
@@ -148,9 +148,9 @@ class SerialLine:
             raise self._gone(str(error)) from None
 
     def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
-        """Send a request and return what comes: `length` bytes or more, or fewer if no more come.
+        """Send a request and return the reply: `length` bytes or more, fewer if no more arrive.
 
-        What arrived before it is dropped.
+        Earlier bytes are discarded.
         """
         self.read()
         self.write(request)
@@ -162,19 +162,19 @@ class SerialLine:
         return reply
 
     def drain(self, quiet_s: float, limit_s: float) -> bool:
-        """Drop what comes until nothing has come for a while.
+        """Discard received bytes until the line is silent.
 
         Returns
         -------
         bool
-            Whether it fell silent within the limit.
+            Whether the line was silent within the limit.
         """
         now = time.monotonic()
-        heard, end = now, now + limit_s
+        last_received_s, end = now, now + limit_s
         while now < end:
             if self.read():
-                heard = now
-            elif now - heard >= quiet_s:
+                last_received_s = now
+            elif now - last_received_s >= quiet_s:
                 return True
             self.wait(quiet_s)
             now = time.monotonic()
@@ -226,15 +226,15 @@ _QUIET_S = 0.05
 _DRAIN_LIMIT_S = 0.5
 _REPLY_TIMEOUT_S = 0.3
 _TRIES = 3
-# What was asked for again may be answered twice, and no reply says which registers it holds.
+# A repeated request may be answered twice, and no reply states which registers it holds.
 _LATE_REPLY_S = 0.5
 
 
 class SerialSetup:
-    """The sensor, as it is spoken to before and after the stream.
+    """Requests to the sensor before and after the stream.
 
-    Every method raises `DeviceError` if the line is gone, or if the sensor does not answer, or not
-    as it should.
+    Every method raises `DeviceError` if the line is gone, or the sensor does not answer or answers
+    wrongly.
 
     Parameters
     ----------
@@ -252,22 +252,22 @@ class SerialSetup:
         self._name = name
 
     def stop_streaming(self) -> None:
-        """Silence the sensor, whatever it was doing."""
+        """Stop the stream, in whatever state the sensor is."""
         for _ in range(_JAM_TRIES):
             self._line.write(_JAM)
             if self._line.drain(_QUIET_S, _DRAIN_LIMIT_S):
                 return
         raise DeviceError(
-            f"{self._name}: it goes on sending although it was told to stop; switch it off and on, "
-            "and check that no other device is on this line."
+            f"{self._name}: it continues to send although it was commanded to stop; switch it off "
+            "and on, and check that no other device is on this line."
         )
 
     def read_status(self) -> int:
-        """Return its status word."""
-        return self._read(modbus.STATUS_WORD, 1, "tell its status")[0]
+        """Return the status word."""
+        return self._read(modbus.STATUS_WORD, 1, "report its status")[0]
 
     def read_block(self) -> CalibrationBlock:
-        """Return the calibration that the profile chooses, of the sensor that it names."""
+        """Return the calibration that the profile selects; verify the serial number."""
         number, wanted = self._settings.calibration, self._settings.serial_number
         what = f"read out calibration {number}"
         registers = self._read(first_register(number), BLOCK_REGISTERS, what)
@@ -284,7 +284,7 @@ class SerialSetup:
         return block
 
     def load_amplifiers(self, block: CalibrationBlock) -> None:
-        """Make the amplifiers' settings those that the calibration was done with."""
+        """Set the amplifiers as for the calibration."""
         self._ask(modbus.UNLOCK, "unlock its memory")
         try:
             for first, values in (
@@ -295,7 +295,7 @@ class SerialSetup:
         finally:
             self._ask(modbus.LOCK, "lock its memory")
         written = tuple(chain(block.gains, block.offsets))
-        active = self._read(modbus.ACTIVE_GAINS, len(written), "tell its gains and offsets")
+        active = self._read(modbus.ACTIVE_GAINS, len(written), "report its gains and offsets")
         if active != written:
             raise DeviceError(
                 f"{self._name}: gains and offsets read back as {active}, where {written} were "
@@ -303,7 +303,7 @@ class SerialSetup:
             )
 
     def start_streaming(self) -> bytes:
-        """Have it stream; return what has come behind its reply already."""
+        """Start the stream; return the bytes that arrived after the reply."""
         request = modbus.START_STREAMING
         time.sleep(SILENCE_S)
         length = modbus.reply_length(request)
@@ -315,7 +315,7 @@ class SerialSetup:
         return reply[length:]
 
     def _ask(self, request: bytes, what: str) -> bytes:
-        """Return what the reply to a request holds; disturbed ones are asked for again."""
+        """Return the content of the reply to a request; repeat a request that failed."""
         problem = ""
         for tries in range(_TRIES):
             time.sleep(SILENCE_S)
@@ -325,7 +325,7 @@ class SerialSetup:
                 self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
                 return modbus.content_of(request, reply)
-            except modbus.Refused as error:
+            except modbus.ExceptionResponse as error:
                 raise DeviceError(
                     f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
                     "Digital F/T sensor, and ati_serial.calibration."
@@ -340,7 +340,7 @@ class SerialSetup:
     def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
         registers: tuple[int, ...] = ()
         while len(registers) < count:
-            piece = min(modbus.MAX_REGISTERS, count - len(registers))
-            request = modbus.read_registers(first + len(registers), piece)
+            chunk = min(modbus.MAX_REGISTERS, count - len(registers))
+            request = modbus.read_registers(first + len(registers), chunk)
             registers += modbus.registers_of(self._ask(request, what))
         return registers

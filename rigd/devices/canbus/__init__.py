@@ -3,8 +3,8 @@
 A port (`port.open_port`) carries frames of the kernel's ``struct can_frame`` without blocking.
 Where the kernel has CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket
 that carries the same 16 bytes; every other adapter goes through python-can. The drivers see no
-difference: `CanExchange` routes frames to them, `ReplyPairing` tells which request a reply answers,
-`bus_load` and `check_identifiers` judge a profile before anything is connected.
+difference: `CanExchange` routes frames to them, `ReplyPairing` assigns replies to requests,
+`bus_load` and `check_identifiers` check a profile before anything is connected.
 """
 
 import lazy_loader as lazy

@@ -42,13 +42,13 @@ _OF_A_NODE = {
 
 
 def sensor_identifiers(sensor: AtiCan) -> range:
-    """Return what an ATI sensor sends and listens to: its base and any of sixteen opcodes."""
+    """Return the identifiers that an ATI sensor uses: its base with any of sixteen opcodes."""
     first = sensor.base_id << 4
     return range(first, first + 16)
 
 
 def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
-    """Return what the drive uses, by identifier, and CANopen services that reach all nodes.
+    """Return the services of the drive by identifier, including those that address all nodes.
 
     The PDOs that are not configured count too: a drive may have them on from the factory.
     """
@@ -62,7 +62,7 @@ def check_identifiers(rig: RigParameters) -> list[str]:
     Returns
     -------
     list of str
-        One sentence a collision, with what to change; empty if all is well.
+        One sentence per collision, with the remedy; empty if there is none.
     """
     return list(_collisions(rig))
 
@@ -126,7 +126,7 @@ class Traffic:
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """All recurring frames of a bus, and the part of its time that they take."""
+    """All recurring frames of a bus, and the bus load."""
 
     traffic: tuple[Traffic, ...]
     """The frames."""

@@ -1,4 +1,4 @@
-"""The cyclic exchange on one port: who gets which frame, which reply answers which request.
+"""The cyclic exchange on one port: routing of frames, and pairing of replies with requests.
 
 `CanLink` opens a bus once for all its users, `CanExchange` routes each frame to its driver.
 
@@ -33,14 +33,14 @@ from rigd.runtime import HeldError, HeldFile
 # Pairing of replies
 
 _STEADY_PERIODS = 3
-"""Periods with one reply each after which what is missing is given up where there is no pause."""
+"""Periods with one reply each after which missing replies count as lost if no pause is possible."""
 
 
 class Counter(Protocol):
-    """Count of the replies that have come."""
+    """Counter of received replies."""
 
     replies: int
-    """Since somebody set this to zero, whatever was in them."""
+    """Replies since the last reset to zero, regardless of their content."""
 
 
 class ReplyPairing:
@@ -49,7 +49,7 @@ class ReplyPairing:
     Parameters
     ----------
     inbox
-        Counter of the replies that have come.
+        Counter of received replies.
     pauses
         A tick may be left without a request. Not so with a device whose time passes with the
         requests: there what is missing is taken for lost in the end, unproven.
@@ -66,10 +66,10 @@ class ReplyPairing:
 
     __slots__ = (
         "_alone",
-        "_asked",
-        "_heard",
         "_inbox",
         "_pauses",
+        "_received",
+        "_requested",
         "_steady",
         "lost",
         "owed",
@@ -84,39 +84,39 @@ class ReplyPairing:
         self.start()
 
     def start(self) -> None:
-        """Start over, with nothing on its way."""
+        """Reset the pairing: no reply is outstanding."""
         self._inbox.replies = 0
-        self._asked = self._alone = True
-        self._heard = 0
+        self._requested = self._alone = True
+        self._received = 0
         self._steady = 0
         self.owed = 0
 
     def wants_pause(self) -> bool:
-        """Whether the next tick is to make no request; all that has come has been delivered."""
+        """Return whether the next tick makes no request; call it when all frames are delivered."""
         if not (self.owed and self._pauses):
             return False
         self._take()
-        # A pause in which a reply came goes on until they have all come, or none does.
-        return self.owed > 0 and (self._heard == 1 if self._asked else self._heard > 0)
+        # A pause with a reply continues until all replies have arrived, or none does.
+        return self.owed > 0 and (self._received == 1 if self._requested else self._received > 0)
 
     def ask(self) -> None:
-        """Note a new request, right before it is made; all that has come has been delivered."""
+        """Count a new request, directly before it is sent; call after all frames are delivered."""
         self._close()
-        self._asked = True
+        self._requested = True
         self._alone = not self.owed
         self.owed += 1
 
     def pause(self) -> None:
-        """Note a tick without a request, right before its latch."""
+        """Count a tick without a request, directly before its latch."""
         self._close()
-        self._asked = self._alone = False
+        self._requested = self._alone = False
 
     def has_caught_up(self) -> bool:
         """Whether the last reply is the one to the last request."""
         return 0 < self.owed <= self._inbox.replies
 
     def settle(self) -> bool:
-        """Take what has come; return whether it is the reply to this tick's request.
+        """Count the received replies; return whether that to this tick's request is among them.
 
         Where older ones were owed as well the next tick is the first to count: what a fault on the
         line delays may come after what was sent later.
@@ -127,23 +127,23 @@ class ReplyPairing:
         """End the period of the last tick."""
         self._take()
         if self.owed:
-            if not self._asked:
-                if not self._heard:
+            if not self._requested:
+                if not self._received:
                     self.lost += self.owed
                     self.owed = 0
             elif not self._pauses:
-                self._steady = self._steady + 1 if self._heard == 1 else 0
+                self._steady = self._steady + 1 if self._received == 1 else 0
                 if self._steady >= _STEADY_PERIODS:
                     self.lost += self.owed
                     self.unproven += self.owed
                     self.owed = self._steady = 0
         else:
             self._steady = 0
-        self._heard = 0
+        self._received = 0
 
     def _take(self) -> int:
         replies, self._inbox.replies = self._inbox.replies, 0
-        self._heard += replies
+        self._received += replies
         self.owed = max(0, self.owed - replies)
         return replies
 
@@ -166,7 +166,7 @@ _FAILURE_PAUSE_S = 0.001
 
 
 class CanExchange:
-    """Routes the frames of a port to the drivers that share it.
+    """Routes the frames of a port to its drivers.
 
     Parameters
     ----------
@@ -219,14 +219,14 @@ class CanExchange:
         self._handlers[can_id] = handler
 
     def start(self) -> None:
-        """Drop what is queued, and have the port let in only what somebody subscribed to."""
+        """Discard queued frames, and let the port accept only subscribed identifiers."""
         self.port.accept(self._handlers)
         while self._receive() is not None:
             pass
 
     @contextmanager
     def regardless(self) -> Iterator[None]:
-        """Within this block receiving raises nothing, whatever bus and adapter have reported.
+        """Ignore errors of bus and adapter while receiving within this block.
 
         It is for switching a drive off. An error-passive controller goes on sending, and a frame
         that was not acknowledged is sent again; what the drive then answers has to be taken, and
@@ -272,12 +272,12 @@ class CanExchange:
                 self._note_error(can_id & ERROR_MASK, raw[8:16])
 
     def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
-        """Deliver frames until `ready` says yes, or until a time of ``time.monotonic_ns``.
+        """Deliver frames until `ready` returns True, or until a time of ``time.monotonic_ns``.
 
         Parameters
         ----------
         ready
-            Asked after every frame.
+            Called after every frame.
         deadline_ns
             Time of ``time.monotonic_ns``.
 
@@ -327,14 +327,14 @@ class CanExchange:
 
 
 class BusLock:
-    """Held from the opening of a bus to its closing.
+    """Lock held from opening a bus to closing it.
 
     Parameters
     ----------
     bus
         Channel of the bus, or socket of a simulated one.
     simulated
-        It is a simulated one: other users have others.
+        Whether the bus is simulated: each user has their own.
     """
 
     def __init__(self, bus: str, *, simulated: bool) -> None:
@@ -363,7 +363,7 @@ class BusLock:
             ) from None
 
     def release(self) -> None:
-        """Give the bus up; harmless when repeated."""
+        """Release the bus; harmless when repeated."""
         self._file.release()
 
 
@@ -375,7 +375,7 @@ class CanLink:
     settings
         Settings of the bus.
     simulator
-        Address of the simulated rig that stands in for it, or None.
+        Address of the simulated rig that replaces it, or None.
     """
 
     def __init__(self, settings: CanBus, simulator: SimulatorAddress | None) -> None:
@@ -418,7 +418,7 @@ class CanLink:
         return self._exchange
 
     def close(self) -> None:
-        """Give the bus up; the last of its users closes it."""
+        """Release the bus; the last of its users closes it."""
         self._users = max(0, self._users - 1)
         if self._users == 0 and self._exchange is not None:
             self._exchange.port.close()

@@ -19,7 +19,7 @@ from rigd.devices.canbus.port import (
 
 
 class SetupBus(can.BusABC):
-    """Send and receive through a port; shutting it down leaves the port open."""
+    """Bus of python-can on a port; shutting it down leaves the port open."""
 
     def __init__(self, port: CanPort) -> None:
         self._port = port
@@ -35,7 +35,7 @@ class SetupBus(can.BusABC):
         if raw is None:
             self._port.wait(1.0 if timeout is None else timeout)
             raw = self._port.receive()
-        # canopen does not look at the kind of a frame, only at its number.
+        # canopen ignores the kind of a frame and checks only its identifier.
         if raw is None or read_head(raw)[0] & (LONG_FLAG | REMOTE_FLAG):
             return None, False
         return to_message(raw), False

@@ -38,9 +38,9 @@ _FRAME = Struct("=IB3x8s")
 BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
 """Error frame with which the kernel reports bus-off."""
 DAMAGED_FRAME = _FRAME.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
-"""Frame that stands in for a damaged one; it is counted, and nothing else follows."""
+"""Frame that replaces a damaged one; it is counted, and has no other effect."""
 LENGTH_AT = 4
-"""Place of the number of data bytes in a raw frame."""
+"""Offset of the number of data bytes in a raw frame."""
 read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
 
@@ -85,9 +85,9 @@ def unpack_frame(raw: bytes) -> tuple[int, bytes]:
 
 # Ports
 
-# What the kernel keeps for a reader that is late: some 200 ms of a full bus.
+# Receive buffer for a late reader: some 200 ms of a full bus.
 _RECEIVE_BUFFER = 212_992
-# As much as the system allows: a simulated rig that stands still is told by its silence.
+# As large as the system allows: a stopped simulated rig is detected by its silence.
 _SIMULATOR_SEND_BUFFER = 4_194_304
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
 _DAMAGED_IN_A_ROW = 20
@@ -116,7 +116,7 @@ class CanPort(Protocol):
     def receive(self) -> bytes | None:
         """Return the next frame that has arrived, of 16 bytes, or None.
 
-        One that came damaged is returned as an error frame.
+        A damaged frame is returned as an error frame.
 
         Raises
         ------
@@ -134,9 +134,9 @@ class CanPort(Protocol):
         """
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Let in only these identifiers from now on, and what the controller says of itself.
+        """Accept only frames of these identifiers, and error frames of the controller.
 
-        None lets in everything again.
+        None accepts all frames again.
 
         Raises
         ------
@@ -202,7 +202,7 @@ class SocketPort:
             raise DeviceError(self._why("cannot be waited for", error)) from None
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Have the kernel drop all other identifiers; a simulated bus brings them all."""
+        """Let the kernel filter all other identifiers; a simulated bus delivers all."""
         if self._link.family == getattr(socket, "AF_CAN", None):
             exactly = SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
             wanted = [(0, 0)] if can_ids is None else [(i, exactly) for i in sorted(set(can_ids))]
@@ -236,7 +236,7 @@ class SocketPort:
 
 
 class PythonCanPort:
-    """Any adapter that python-can knows. It costs about three times what a socket costs.
+    """Adapter of python-can. It takes about three times the processor time of a socket.
 
     An adapter's driver says by `can.CanError` or OSError that the adapter has failed. Anything else
     that it raises while it receives is a frame that it could not read: the parser of slcan raises
@@ -286,7 +286,7 @@ class PythonCanPort:
             self._next = self._receive(timeout_s)
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
-        """Nothing: filters of python-can end a poll at each frame they drop, and drop reports."""
+        """Do nothing: python-can's filters end a poll at each dropped frame, and drop errors."""
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus that sends and receives through this port."""
@@ -329,14 +329,14 @@ def _words(error: Exception) -> str:
 
 
 def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
-    """Open the bus that a profile names, or the one of the simulated rig that stands in for it.
+    """Open the bus of a profile, or that of the simulated rig that replaces it.
 
     Parameters
     ----------
     settings
         The profile's ``[can]``.
     simulator
-        Simulated rig that stands in; None: the bus itself.
+        Simulated rig that replaces the hardware; None: the bus itself.
 
     Raises
     ------

@@ -1,9 +1,10 @@
 """A CiA 402 servo drive over CANopen, in cyclic synchronous torque mode.
 
-Offers the driver (`Cia402Drive`), the judgement of a drive's EDS file (`judge`), and the parser of
-a profile's own settings of objects (`parse_assignment`). Drives differ in what they support: what
-rigd needs of one is the table in `requirements`; `objects` has the indices. Which torque is
-commanded is not decided here.
+Offers the driver (`Cia402Drive`), the check of a drive's EDS file (`judge`), and
+the parser of a profile's own settings of objects (`parse_assignment`).
+
+Drives differ in what they support: the table in `requirements` lists what rigd needs; `objects` has
+the indices. Which torque is commanded is not decided here.
 """
 
 import lazy_loader as lazy

@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from rigd.devices.cia402.requirements import REQUIREMENTS, Access
+from rigd.devices.cia402.requirements import REQUIREMENTS, ObjectAccess
 
 KINDS: Final = {
     "u8": (0, 0xFF),
@@ -29,7 +29,7 @@ _STORED: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
 _SET_BY_RIGD: Final = {
     (each.index, each.sub)
     for each in REQUIREMENTS
-    if each.access & (Access.WRITE | Access.RECEIVED)
+    if each.access & (ObjectAccess.WRITE | ObjectAccess.RECEIVED)
 }
 
 
@@ -44,13 +44,13 @@ class Assignment:
     value: int
 
     @property
-    def place(self) -> str:
+    def address(self) -> str:
         """Index and sub-index as messages show them."""
         return f"{self.index:04X}:{self.sub:X}"
 
 
 def parse_assignment(text: str) -> Assignment:
-    """Return what a text of ``cia402.set_objects`` says.
+    """Parse a text of ``cia402.set_objects``.
 
     Parameters
     ----------

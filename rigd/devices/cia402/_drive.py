@@ -21,10 +21,10 @@ from rigd.devices.cia402._protocol import (
     NodeFrames,
     state_of,
 )
-from rigd.devices.cia402._setup import Outfit, set_up
+from rigd.devices.cia402._setup import DriveCapabilities, set_up
 from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.cia402._transitions import (
-    StopAskedError,
+    StopRequestedError,
     TorqueFollowing,
     left_operation,
     step_up,
@@ -89,14 +89,14 @@ class Cia402Drive:
         self._open = False
         self._subscribed: CanExchange | None = None
         self._node: Node | None = None
-        self._outfit: Outfit | None = None
+        self._capabilities: DriveCapabilities | None = None
         self._listens = True
-        self._keeps_deadline = False
+        self._has_rpdo_deadline = False
         self._enabled = False
         self._may_be_on = False
         self._inbox.guard(FAULT_BIT, 0)
         self._awaiting = False
-        self._heard_ns = 0
+        self._last_received_ns = 0
         self._position = 0
         self._counts = 0
         self.angle_rad = 0.0
@@ -112,7 +112,7 @@ class Cia402Drive:
         Raises
         ------
         DeviceError
-            If the drive is absent, in fault, not what the profile says, or does not take the
+            If the drive is absent, in fault, differs from the profile, or rejects the
             configuration.
         """
         if self._rig.encoder.resolution_rad == 0:
@@ -125,13 +125,13 @@ class Cia402Drive:
         self._enabled = self._may_be_on = False
         self._inbox.clear()
         self._inbox.guard(FAULT_BIT, 0)
-        outfit = self._outfit = set_up(exchange.port, self._rig, self._name)
-        has_torque = outfit.has(ACTUAL_TORQUE)
+        capabilities = self._capabilities = set_up(exchange.port, self._rig, self._name)
+        has_torque = capabilities.has(ACTUAL_TORQUE)
         self._inbox.with_torque = has_torque
         self._following.compares = has_torque
-        # Without its own heartbeat the drive is heard by its TPDOs alone.
-        self._listens = outfit.has(HEARTBEAT_PRODUCER_MS)
-        self._keeps_deadline = outfit.watchdog is Watchdog.RPDO_DEADLINE
+        # Without a heartbeat of its own the drive is monitored by its TPDOs alone.
+        self._listens = capabilities.has(HEARTBEAT_PRODUCER_MS)
+        self._has_rpdo_deadline = capabilities.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
         exchange.start()
         node = self._node = Node(self._rig, exchange, self._frames, self._inbox)
@@ -146,7 +146,7 @@ class Cia402Drive:
         node.resume()
 
     def identity(self) -> dict[str, object]:
-        """Return what the drive said of itself at :meth:`connect`, for reports.
+        """Return the identity that the drive reported at :meth:`connect`.
 
         Returns
         -------
@@ -157,11 +157,11 @@ class Cia402Drive:
             ``gear_ratio`` (6091) and ``encoder_step_rad`` (608F, 6092), None where it states none;
             ``quick_stop_option`` (605A) and ``fault_reaction_option`` (605E) where it has them.
         """
-        return {} if self._outfit is None else dict(self._outfit.identity)
+        return {} if self._capabilities is None else dict(self._capabilities.identity)
 
-    def outfit(self) -> Outfit | None:
-        """Return what the drive turned out to have at :meth:`connect`, or None before."""
-        return self._outfit
+    def capabilities(self) -> DriveCapabilities | None:
+        """Return the capabilities found at :meth:`connect`, or None before."""
+        return self._capabilities
 
     def statement(self) -> dict[str, str]:
         """Return the drive's own safeguards as metadata of a session file.
@@ -170,31 +170,32 @@ class Cia402Drive:
         -------
         dict
             ``drive_identity``, ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks
-            something that the profile accepts by name, ``drive_without``; where something stands
-            in for an object, ``drive_stand_ins``; objects that the profile has set,
-            ``drive_objects_set``.
+            something that the profile accepts by name, ``drive_without``; where something replaces
+            an object, ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
         """
-        outfit = self._outfit
-        if outfit is None:
+        capabilities = self._capabilities
+        if capabilities is None:
             return {}
         numbers = ("vendor_id", "product_code", "revision", "serial_number")
-        told = {
+        facts = {
             "drive_identity": " ".join(
-                f"0x{number:X}" if isinstance(number := outfit.identity.get(key), int) else "-"
+                f"0x{number:X}"
+                if isinstance(number := capabilities.identity.get(key), int)
+                else "-"
                 for key in numbers
             ),
-            "drive_watchdog": outfit.watchdog.value,
-            "drive_watchdog_s": repr(outfit.watchdog_s),
+            "drive_watchdog": capabilities.watchdog.value,
+            "drive_watchdog_s": repr(capabilities.watchdog_s),
         }
-        stand_ins = [f"{row.place}: {row.stand_in}" for row in outfit.lacks if row.stand_in]
+        stand_ins = [f"{row.address}: {row.stand_in}" for row in capabilities.lacks if row.stand_in]
         for key, texts in (
-            ("drive_without", outfit.accepted),
+            ("drive_without", capabilities.accepted),
             ("drive_stand_ins", stand_ins),
-            ("drive_objects_set", outfit.assigned),
+            ("drive_objects_set", capabilities.assigned),
         ):
             if texts:
-                told[key] = "; ".join(texts)
-        return told
+                facts[key] = "; ".join(texts)
+        return facts
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Bring the drive to operation enabled, at zero torque.
@@ -204,12 +205,12 @@ class Cia402Drive:
         Parameters
         ----------
         stop
-            Asked once a period: the drive is then disabled instead.
+            Called once a period; if it returns True, the drive is disabled instead.
 
         Raises
         ------
         DeviceError
-            If the drive does not get there; it is then disabled again.
+            If the drive does not reach that state; it is then disabled again.
         """
         node = self._connected()
         if self._enabled:
@@ -218,7 +219,7 @@ class Cia402Drive:
         self._may_be_on = True
         try:
             step_up(node, stop)
-        except StopAskedError:
+        except StopRequestedError:
             self.disable()
             return
         except DeviceError:
@@ -246,7 +247,7 @@ class Cia402Drive:
         node = self._connected()
         if not self._same_tick:
             self._settle_previous(node)
-        if self._keeps_deadline and not self._enabled:
+        if self._has_rpdo_deadline and not self._enabled:
             # The drive times the RPDOs from the first on, also while no torque is commanded.
             node.exchange.send(self._idle)
         node.send_sync_or_pause()
@@ -273,13 +274,13 @@ class Cia402Drive:
                 self._settle(node)
             node.send_heartbeat()
         inbox = self._inbox
-        if inbox.heard or not self._listens:
-            inbox.heard = False
-            self._heard_ns = node.now_ns
+        if inbox.received or not self._listens:
+            inbox.received = False
+            self._last_received_ns = node.now_ns
         if (
             inbox.alarm
             or inbox.strayed is not None
-            or node.now_ns - self._heard_ns > self._silence_ns
+            or node.now_ns - self._last_received_ns > self._silence_ns
         ):
             self._complain(node)
         return self.angle_rad
@@ -371,8 +372,8 @@ class Cia402Drive:
         Raises
         ------
         DeviceError
-            If the drive does not answer, does not show itself off within 0.2 s, the fault stands,
-            or it does not get ready.
+            If the drive does not answer, does not report that it is off within 0.2 s, the fault
+            persists, or it does not become ready.
         """
         self.disable()
         exchange = self._open_link()
@@ -389,20 +390,20 @@ class Cia402Drive:
         node, self._node = self._node, None
         if node is not None and not self._may_be_on:
             node.send_if_possible(self._frames.pre_operational)
-            if self._outfit is not None and self._outfit.watchdog is Watchdog.HEARTBEAT:
+            if self._capabilities is not None and self._capabilities.watchdog is Watchdog.HEARTBEAT:
                 node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
         if self._open:
             self._open = False
             self._link.close()
 
     def _own_end(self) -> str:
-        """Say what takes the torque off a drive that cannot be switched off."""
-        outfit = self._outfit
-        if outfit is None or outfit.watchdog is Watchdog.NONE:
+        """Describe what removes the torque of a drive that cannot be switched off."""
+        capabilities = self._capabilities
+        if capabilities is None or capabilities.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."
         return (
             "Without the loop it has to switch itself off within "
-            f"{outfit.watchdog_s:g} s, by its {outfit.watchdog.value}."
+            f"{capabilities.watchdog_s:g} s, by its {capabilities.watchdog.value}."
         )
 
     def _connected(self) -> Node:
@@ -426,7 +427,7 @@ class Cia402Drive:
         exchange.subscribe(self._frames.reply_id, self._inbox.take_reply)
 
     def _settle_previous(self, node: Node) -> None:
-        """Take the reply to the SYNC of the tick before, which should have come by now."""
+        """Process the reply to the previous tick's SYNC, which should have arrived."""
         if node.lock_step and node.pairing.owed:
             node.exchange.wait_until(node.pairing.has_caught_up, node.sync_ns + node.deadline_ns)
         else:
@@ -434,21 +435,21 @@ class Cia402Drive:
         self._settle(node)
 
     def _settle(self, node: Node) -> None:
-        """Take the position if it is the reply to the last SYNC."""
+        """Store the position if it is the reply to the last SYNC."""
         fresh = node.pairing.settle() and self._inbox.legible
         self.angle_stale = not fresh
         if self._enabled and fresh:
             self._following.compare(self._inbox.torque)
         if fresh:
             position = self._inbox.position
-            # The counter of 32 bits wraps around.
+            # The 32-bit counter wraps around.
             self._counts += (position - self._position + _HALF_TURN & _ALL_COUNTS) - _HALF_TURN
             self._position = position
             self.angle_rad = self._counts * self._rad_per_count
             self.angle_time_ns = node.sync_ns
 
     def _complain(self, node: Node) -> None:
-        """Say what is wrong with the drive."""
+        """Raise the error of the drive, if there is one."""
         node.refuse_alarm()
         statusword = self._inbox.strayed
         if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
@@ -461,7 +462,7 @@ class Cia402Drive:
                 f"0x{statusword:04X} is not set; check its own diagnosis, and if this drive has "
                 "no such bit: cia402.follows_target_bit = false."
             )
-        silence_s = (node.now_ns - self._heard_ns) * 1e-9
+        silence_s = (node.now_ns - self._last_received_ns) * 1e-9
         raise DeviceError(
             f"{self._name}: no heartbeat for {silence_s:.3g} s, more than "
             f"cia402.drive_heartbeat_timeout_s = {node.settings.drive_heartbeat_timeout_s:g} s; "

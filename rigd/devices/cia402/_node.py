@@ -31,7 +31,7 @@ _TOGGLE_BIT = 0x80
 
 
 class ReceivedFrames:
-    """The drive's last words. A frame of the wrong length changes nothing but counts.
+    """Latest content of the drive's frames. A frame of the wrong length only counts.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ class ReceivedFrames:
         First statusword that was not as :meth:`guard` asks, in whichever TPDO it came: the drive
         may be back in the next one.
     replies : int
-        TPDOs since somebody set this to zero, whatever was in them.
+        TPDOs since this was last set to zero, regardless of their content.
     legible : bool
         The last TPDO had the right length.
     nmt_state : int or None
         NMT state in the last heartbeat.
-    heard : bool
-        A heartbeat has come since somebody set this to False.
+    received : bool
+        Whether a heartbeat has arrived since this was last set to False.
     watching : bool
         The drive is meant to stay operational.
     alarm : str
@@ -67,7 +67,7 @@ class ReceivedFrames:
     malformed : int
         Frames of the wrong length.
     with_torque : bool
-        TPDOs end in the actual torque, which not every drive tells.
+        Whether TPDOs end in the actual torque, which not every drive reports.
     """
 
     __slots__ = (
@@ -75,12 +75,12 @@ class ReceivedFrames:
         "_value",
         "alarm",
         "emergency",
-        "heard",
         "legible",
         "malformed",
         "name",
         "nmt_state",
         "position",
+        "received",
         "replies",
         "reply",
         "statusword",
@@ -107,21 +107,21 @@ class ReceivedFrames:
         self.replies = 0
         self.legible = False
         self.nmt_state: int | None = None
-        self.heard = False
+        self.received = False
         self.watching = False
         self.alarm = ""
         self.emergency = False
         self.reply = b""
 
     def guard(self, mask: int, value: int) -> None:
-        """Have each statusword from the present one on looked at: `value` in the bits of `mask`."""
+        """Monitor every statusword from now on: it must have `value` in the bits of `mask`."""
         self._mask, self._value = mask, value
         self.strayed: int | None = None
         if self.statusword & mask != value:
             self.strayed = self.statusword
 
     def take_tpdo(self, data: bytes) -> None:
-        """Take statusword and position."""
+        """Store statusword and position of a TPDO."""
         self.replies += 1
         try:
             if self.with_torque:
@@ -136,7 +136,7 @@ class ReceivedFrames:
             self.malformed += 1
 
     def take_emergency(self, data: bytes) -> None:
-        """Take an emergency message; a code of zero only ends one."""
+        """Store an emergency message; code zero ends an earlier one."""
         message = read_emergency(data)
         if message is None:
             self.malformed += 1
@@ -161,7 +161,7 @@ class ReceivedFrames:
             return
         state = data[0] & ~_TOGGLE_BIT
         self.nmt_state = state
-        self.heard = True
+        self.received = True
         if self.watching and state != OPERATIONAL and not self.alarm:
             if state == BOOT_UP:
                 what = "it has restarted by itself; check its supply"
@@ -169,7 +169,7 @@ class ReceivedFrames:
                 words = NMT_STATES.get(state, f"state {state}")
                 what = (
                     f"it has left operational for {words}, as it does when it misses heartbeats, "
-                    "or when another master on the bus tells it to"
+                    "or when another master on the bus commands it to"
                 )
             self.alarm = f"{self.name}: {what}."
 
@@ -182,7 +182,7 @@ class ReceivedFrames:
 
 _LONG_AGO_NS = -(1 << 62)
 _START_PATIENCE_NS = 1_000_000_000
-"""Time to become operational, in addition to three periods of the drive's heartbeat."""
+"""Time limit to become operational, in addition to three periods of the drive's heartbeat."""
 _FIRST_REPLY_NS = 100_000_000
 _FIRST_REPLIES = 20
 """SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
@@ -206,7 +206,7 @@ class Node:
     Attributes
     ----------
     pairing : ReplyPairing
-        Tells whether the last TPDO answers the last SYNC.
+        Determines whether the last TPDO answers the last SYNC.
     lock_step : bool
         The drive is a simulated one whose time passes with the SYNCs: replies are waited for, and
         nothing is paced.
@@ -239,7 +239,7 @@ class Node:
         self._next_heartbeat_ns = _LONG_AGO_NS
 
     def go_operational(self, *, beats: bool = True) -> None:
-        """Start the node and wait for the heartbeat that says so.
+        """Start the node and wait for the heartbeat that confirms it.
 
         Parameters
         ----------
@@ -267,19 +267,19 @@ class Node:
             patience_ns = _START_PATIENCE_NS + round(3e9 * period_s)
             self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
         if not self._is_operational():
-            told = (
+            reported = (
                 "no heartbeat came"
                 if inbox.nmt_state is None
                 else f"its heartbeat says {inbox.nmt_state}"
             )
             raise DeviceError(
-                f"{self.name}: it does not become operational ({told}, {OPERATIONAL} was "
+                f"{self.name}: it does not become operational ({reported}, {OPERATIONAL} was "
                 "expected); check its own diagnosis."
             )
         inbox.watching = True
 
     def await_first_reply(self) -> None:
-        """Have SYNC answered, within a period.
+        """Send SYNC until it is answered within a period.
 
         Raises
         ------
@@ -331,7 +331,7 @@ class Node:
     def resume(self) -> None:
         """Resume the ticks after a gap: both heartbeats restart."""
         self._next_heartbeat_ns = _LONG_AGO_NS
-        self.inbox.heard = True
+        self.inbox.received = True
 
     def await_reply(self, patience_ns: int = 0) -> bool:
         """Wait for a TPDO: one period or as given, in lock-step for as long as it takes."""
@@ -383,13 +383,13 @@ class Node:
         return True
 
     def await_alarm(self) -> None:
-        """Wait briefly for the reason of a drive that has left operation."""
+        """Wait briefly for the emergency message of a drive that has left operation."""
         inbox = self.inbox
         if not inbox.alarm:
             self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
 
     def refuse_alarm(self) -> None:
-        """Refuse to go on with a drive that has reported something, or is in fault.
+        """Raise if the drive has sent an emergency message, or is in fault.
 
         Raises
         ------
@@ -409,7 +409,7 @@ class Node:
         if in_fault:
             reason += f" Remove the cause, then: {self._reset_command}"
         elif inbox.emergency:
-            # A drive that was off may only have spoken; one that was on tells its state later.
+            # The message may be from a drive that was off; one that was on reports its state later.
             reason += (
                 f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"
             )

@@ -77,7 +77,7 @@ OFF: Final = (
 
 
 def state_of(statusword: int) -> DriveState:
-    """Return the state that a statusword tells."""
+    """Return the state that a statusword encodes."""
     for mask, value, state in _TABLE:
         if statusword & mask == value:
             return state

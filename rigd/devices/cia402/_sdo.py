@@ -1,8 +1,8 @@
 """SDO access to the drive's objects, while no cycle runs.
 
-The canopen library does it, with a thread that receives; both are gone when the access is left.
-An object's type is taken from the drive's EDS file where the profile names one, else from
-``drive.eds`` beside this module.
+The canopen library does the transfers, with a thread that receives; both end with the context. An
+object's type is taken from the drive's EDS file where the profile names one, else from
+``drive.eds`` in this folder.
 """
 
 import logging
@@ -80,17 +80,17 @@ class SdoRefusal(DeviceError):
 
     @property
     def is_absent(self) -> bool:
-        """Whether the drive has no such object, as far as its code tells."""
+        """Whether the abort code means that the drive has no such object."""
         return self.code in _ABSENT
 
     @property
     def is_write_only(self) -> bool:
-        """Whether the drive has the object and never shows what it holds."""
+        """Whether the object exists and cannot be read."""
         return self.code == _WRITE_ONLY
 
 
-class NotKept(DeviceError):
-    """The drive took a value and reads back another one, which this carries."""
+class ValueNotStored(DeviceError):
+    """The drive accepted a value but reads back another one, which this error carries."""
 
     def __init__(self, message: str, got: int) -> None:
         super().__init__(message)
@@ -98,13 +98,13 @@ class NotKept(DeviceError):
 
 
 class _Receiver(MessageListener):
-    """Canopen's receiver; it keeps its thread quiet when the bus is cut.
+    """Receiver of canopen that reports no error from its thread when the bus is disconnected.
 
     The next request reports the failure.
     """
 
     def on_error(self, exc: Exception) -> None:  # noqa: ARG002
-        """Let the thread go on until the network ends it; it would ask again at once."""
+        """Let the thread continue until the network ends it."""
         time.sleep(_RECEIVER_POLL_S)
 
 
@@ -152,23 +152,23 @@ class SdoAccess:
             self._network.disconnect()
 
     def to_pre_operational(self) -> None:
-        """Have the drive leave operational, and make sure that it answers.
+        """Bring the drive to pre-operational, and verify that it answers.
 
         Raises
         ------
         DeviceError
             If it does not.
         """
-        self.tell_pre_operational()
+        self.request_pre_operational()
         try:
             self.read(objects.IDENTITY, 1)
         except SdoRefusal:
             return
         except DeviceError as error:
             others = sorted(set(self._network.scanner.nodes) - {self._node.id})
-            heard = f"; heard of node {', '.join(map(str, others))}" if others else ""
+            received = f"; frames came from node {', '.join(map(str, others))}" if others else ""
             raise DeviceError(
-                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{heard}."
+                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
             ) from None
 
     def use_eds(self, path: str) -> tuple[int, int]:
@@ -186,8 +186,8 @@ class SdoAccess:
         """
         return _take_types(self._node.object_dictionary, path, self._node_id)
 
-    def tell_pre_operational(self) -> None:
-        """Tell the drive to leave operational, which it may ignore, without waiting for it.
+    def request_pre_operational(self) -> None:
+        """Command the drive to pre-operational without waiting; the drive may ignore the command.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class SdoAccess:
 
     @contextmanager
     def hurried(self) -> Iterator[None]:
-        """Wait for each answer for 50 ms only, and ask once, as where torque is to be taken off."""
+        """Allow each transfer one attempt of 50 ms, as needed to switch the torque off."""
         client = self._node.sdo
         before = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
         client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
@@ -263,13 +263,13 @@ class SdoAccess:
         Raises
         ------
         DeviceError
-            If the drive does not answer, refuses (:class:`SdoRefusal`), or keeps another value in
-            the bits of `mask` (:class:`NotKept`).
+            If the drive does not answer, refuses (:class:`SdoRefusal`), or stores another value in
+            the bits of `mask` (:class:`ValueNotStored`).
         """
         self.write(index, sub, value)
         got = self.read(index, sub)
         if (got ^ value) & mask:
-            raise NotKept(
+            raise ValueNotStored(
                 f"{self._name}: {self._title(index, sub)} was set to {show_value(value)} and reads "
                 f"{show_value(got)}; check with the drive's own tool why it does not keep it.",
                 got,
@@ -283,7 +283,7 @@ class SdoAccess:
         self.configure(index, sub, assignment.value)
 
     def last_emergency(self) -> int:
-        """Return the code of the last emergency message heard, or 0."""
+        """Return the code of the last emergency message received, or 0."""
         log = self._node.emcy.log
         return log[-1].code if log else 0
 
@@ -331,12 +331,12 @@ class SdoAccess:
 
     def _title(self, index: int, sub: int) -> str:
         name = self._variable(index, sub).name
-        place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
-        return f"object {place}" + (f" ({name})" if name else "")
+        address = f"{index:04X}:{sub}" if sub else f"{index:04X}"
+        return f"object {address}" + (f" ({name})" if name else "")
 
 
 def _ask(client: SdoClient, variable: SdoVariable, value: int | None) -> object:
-    """Write a value or read one, past replies to requests that were given up before."""
+    """Read or write a value; skip late replies to abandoned requests."""
     for left in reversed(range(_LATE_REPLIES + 1)):
         try:
             if value is None:
@@ -352,7 +352,7 @@ def _ask(client: SdoClient, variable: SdoVariable, value: int | None) -> object:
 
 
 def _let_pass(client: SdoClient) -> None:
-    """Take replies until no more come."""
+    """Discard replies until no more arrive."""
     patience_s = min(_QUIET_S, client.RESPONSE_TIMEOUT)
     with suppress(queue.Empty):
         while True:
@@ -367,8 +367,8 @@ def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int
         raise DeviceError(
             f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
-    for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        entry, mine = theirs.get(*place), own.get_variable(*place)
+    for address in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
+        entry, mine = theirs.get(*address), own.get_variable(*address)
         if (
             entry is not None
             and mine is not None

@@ -1,8 +1,8 @@
 """Set-up of the drive, in pre-operational, before the cycle starts.
 
-What is asked of it stands in :mod:`rigd.devices.cia402.requirements`. An object that holds what is
-needed is left alone, for it may be read-only; one that is absent or cannot be changed is judged by
-its row there.
+The requirements are in :mod:`rigd.devices.cia402.requirements`. An object that holds the required
+value is not written, because it may be read-only; its row there decides what follows if it is
+absent or cannot be changed.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from math import tau
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
-from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
+from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
 from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
 from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
     WATCHDOG,
-    Access,
+    ObjectAccess,
     Requirement,
     Watchdog,
     requirement,
@@ -51,8 +51,8 @@ _DUPLICATE_WATCHES = 127
 
 
 @dataclass(frozen=True, slots=True)
-class Outfit:
-    """Equipment of a drive, as found when it was set up.
+class DriveCapabilities:
+    """Capabilities of a drive, as found during set-up.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Outfit:
         What takes the torque off when this computer falls silent, and after how long; infinite
         where nothing does.
     lacks
-        Rows of the objects that it has not, or that do not do what they are for.
+        Rows of the objects that are absent or not usable.
     assigned
         Manufacturer-specific objects that the profile has set.
     """
@@ -92,7 +92,7 @@ class Outfit:
         return tuple(names)
 
 
-def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
+def set_up(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
     """Verify and configure the drive; it stays pre-operational and disabled.
 
     Parameters
@@ -106,20 +106,20 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
 
     Returns
     -------
-    Outfit
-        Identity that the drive reports, and what it has.
+    DriveCapabilities
+        Identity and capabilities of the drive.
 
     Raises
     ------
     DeviceError
-        If it does not answer, is not the drive of the profile, is in fault, lacks what is needed,
-        or does not take the configuration.
+        If it does not answer, is not the drive of the profile, is in fault, lacks a required
+        object, or rejects the configuration.
     """
     settings = rig.cia402
     assert settings is not None
     wanted = wanted_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
-        # Before anything else, whoever it is: a session that was killed may have left it turning.
+        # First of all, before its identity is known: a killed session may have left it turning.
         command_off(sdo)
         sdo.to_pre_operational()
         command_off(sdo)
@@ -137,19 +137,19 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
         work.configure_torque()
         work.configure_speed()
         work.configure_sync()
-        stands = work.configure_guards()
-        work.configure_pdos(stands)
-        work.look_at_the_rest(identity)
+        active = work.configure_guards()
+        work.configure_pdos(active)
+        work.check_other_objects(identity)
         work.settle(requirement(objects.MODE))
-        # Some drives show it only once they are enabled: it is looked at again then.
+        # Some drives show the mode only when enabled: it is checked again then.
         wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
-    return Outfit(
+    return DriveCapabilities(
         identity,
-        stands,
+        active,
         {
             Watchdog.OWN: settings.own_watchdog_s,
             Watchdog.NONE: float("inf"),
-        }.get(stands, settings.heartbeat_timeout_s),
+        }.get(active, settings.heartbeat_timeout_s),
         tuple(work.lacks),
         settings.set_objects,
     )
@@ -177,9 +177,9 @@ def _check_identity(
     ):
         got = identity[key]
         if wanted and got != wanted:
-            told = "nothing" if got is None else f"0x{got:08X}"
+            got_text = "nothing" if got is None else f"0x{got:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {told}. "
+                f"{name}: it is another drive: {where} is 0x{wanted:08X}, it says {got_text}. "
                 "Check cia402.node_id, or write into the profile what is really there."
             )
     modes = identity["supported_modes"]
@@ -191,7 +191,7 @@ def _check_identity(
 
 
 class _SetUp:
-    """The work on one drive that is disabled; collects what it has not.
+    """Set-up of one drive that is disabled; collects the objects that it lacks.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class _SetUp:
         self.lacks: list[Requirement] = []
 
     def settle(self, row: Requirement, wanted: int | None = None) -> bool:
-        """Have an object hold a value, and return whether the drive has it.
+        """Set an object to a value, and return whether the drive has the object.
 
         A write-only one is written and not read back, where that may be.
 
@@ -229,7 +229,7 @@ class _SetUp:
         Raises
         ------
         DeviceError
-            If the drive cannot do without, or keeps another value that does not do.
+            If the object is indispensable, or the drive stores a value that is not acceptable.
         """
         if wanted is None:
             wanted = self._wanted[row.index, row.sub]
@@ -244,9 +244,9 @@ class _SetUp:
             return True
         try:
             self._sdo.configure(row.index, row.sub, wanted)
-        except NotKept as kept:
-            found = kept.got
-            why: DeviceError = kept
+        except ValueNotStored as not_stored:
+            found = not_stored.got
+            why: DeviceError = not_stored
         except SdoRefusal as refusal:
             if found is None and refusal.is_absent:
                 self._do_without(row)
@@ -254,8 +254,8 @@ class _SetUp:
             if found is None:
                 raise
             why = DeviceError(
-                f"{self._name}: object {row.place} ({row.name}) is {show_value(found)}, needed is "
-                f"{show_value(wanted)}, and it refuses to change it (abort code "
+                f"{self._name}: object {row.address} ({row.name}) is {show_value(found)}, needed "
+                f"is {show_value(wanted)}, and it refuses to change it (abort code "
                 f"0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
             )
         else:
@@ -276,7 +276,7 @@ class _SetUp:
                 raise DeviceError(f'{error} (cia402.set_objects: "{text}")') from None
 
     def check_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
-        """Compare the torque that 1000 per mille stand for with the profile's."""
+        """Compare the rated torque of the drive with that of the profile."""
         settings = self._settings
         counts = self._sdo.read_if_there(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
@@ -287,16 +287,16 @@ class _SetUp:
             return
         if counts is None:
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
-        told_nm = counts * settings.rated_torque_unit_nm * settings.gear_ratio
+        reported_nm = counts * settings.rated_torque_unit_nm * settings.gear_ratio
         wanted_nm = rig.motor.rated_torque_nm
-        identity["rated_torque_nm"] = told_nm
-        if abs(told_nm - wanted_nm) > _RATED_TORQUE_TOLERANCE * wanted_nm:
+        identity["rated_torque_nm"] = reported_nm
+        if abs(reported_nm - wanted_nm) > _RATED_TORQUE_TOLERANCE * wanted_nm:
             raise DeviceError(
-                f"{self._name}: its rated torque (object 6076 = {counts}) is {told_nm:.4g} N·m at "
-                f"the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every torque "
-                "would be wrong by that ratio. Correct the profile or the drive."
+                f"{self._name}: its rated torque (object 6076 = {counts}) is {reported_nm:.4g} N·m "
+                f"at the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every "
+                "torque would be wrong by that ratio. Correct the profile or the drive."
             )
 
     def check_scales(self, identity: dict[str, object], rig: RigParameters) -> None:
@@ -326,9 +326,9 @@ class _SetUp:
         step_rad = rig.encoder.resolution_rad
         if not turns or any(_is_near(tau / turn, step_rad) for turn in turns):
             return
-        objects_told = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
+        gear_objects = "6092" if units is not None else "608F" if gear is None else "608F and 6091"
         raise DeviceError(
-            f"{self._name}: its encoder step (object {objects_told}) is {tau / turns[0]:.4g} rad "
+            f"{self._name}: its encoder step (object {gear_objects}) is {tau / turns[0]:.4g} rad "
             f"at the output shaft ({turns[0]:.6g} steps a turn), encoder.resolution_rad says "
             f"{step_rad:.4g} rad; every angle, speed and limit would be wrong by the ratio "
             f"{tau / turns[0] / step_rad:.3g}. Correct the profile or the drive."
@@ -349,7 +349,7 @@ class _SetUp:
         return above / below
 
     def configure_torque(self) -> None:
-        """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
+        """Configure the torque limit, and clear offsets that add to the target torque."""
         self.settle(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
             if self._sdo.read_if_there(index) is not None:
@@ -358,17 +358,17 @@ class _SetUp:
         self._clear(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Limit the speed that a torque which is never withdrawn can lead to."""
+        """Configure the speed limit, which bounds the effect of a constant torque."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
         if not self.settle(row):
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
+                f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
 
     def configure_sync(self) -> None:
-        """Have the drive go by a SYNC of this period, of no window and without a counter."""
+        """Configure SYNC: its period, no window, no counter."""
         sdo = self._sdo
         cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
         row = requirement(objects.SYNC_COB_ID)
@@ -390,36 +390,36 @@ class _SetUp:
         Returns
         -------
         Watchdog
-            Which one stands.
+            Watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
         deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
         has_deadline = sdo.read_if_there(deadline.index, deadline.sub) is not None
-        stands = watchdog(
+        active = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
         row = requirement(objects.HEARTBEAT_CONSUMER, 1)
         if not heartbeat:
             self.lacks.append(row)
-        if stands is Watchdog.NONE and not self._accepts(row):
+        if active is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.missing()}")
-        if stands in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
+        if active in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The drive's own watchdog acts as its manufacturer defines, whatever is set here.
             self.settle(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
         if not self.settle(row) and settings.communication_error_option:
             raise DeviceError(
-                f"{self._name}: it has no object {row.place} ({row.name}), so that it goes "
+                f"{self._name}: it has no object {row.address} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
         self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
         row = requirement(objects.EMERGENCY_COB_ID)
         if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
             self.settle(row)
-        return stands
+        return active
 
-    def configure_pdos(self, stands: Watchdog) -> None:
+    def configure_pdos(self, active: Watchdog) -> None:
         """Map one PDO each way and switch all others off."""
         settings, sdo = self._settings, self._sdo
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
@@ -440,11 +440,11 @@ class _SetUp:
             objects.RPDO_COMMUNICATION,
             0,
             objects.RPDO_ENTRIES,
-            {objects.EVENT_TIMER: deadline_ms} if stands is Watchdog.RPDO_DEADLINE else {},
+            {objects.EVENT_TIMER: deadline_ms} if active is Watchdog.RPDO_DEADLINE else {},
         )
 
-    def look_at_the_rest(self, identity: dict[str, object]) -> None:
-        """Report what is only read."""
+    def check_other_objects(self, identity: dict[str, object]) -> None:
+        """Check the objects that are only read."""
         for key, index in (
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
@@ -457,12 +457,12 @@ class _SetUp:
         return row.accept in self._settings.accept_without
 
     def _do_without(self, row: Requirement) -> None:
-        """Note an object that is not there, if that may be.
+        """Record a missing object if it is dispensable.
 
         Raises
         ------
         DeviceError
-            If it may not.
+            If it is indispensable.
         """
         reason = row.missing(self._settings.accept_without)
         if reason:
@@ -470,19 +470,20 @@ class _SetUp:
         self.lacks.append(row)
 
     def _clear(self, row: Requirement) -> None:
-        """Have an object read 0 where the drive has it; one that rigd does not set, refuse."""
+        """Set an object to 0 if the drive has it; raise if rigd does not set it."""
         found = self._sdo.read_if_there(row.index, row.sub)
         if not found:
             return
-        if Access.WRITE in row.access:
+        if ObjectAccess.WRITE in row.access:
             self.settle(row, 0)
             return
         raise DeviceError(
-            f"{self._name}: object {row.place} ({row.name}) is 0x{found:02X}, not 0. {row.sentence}"
+            f"{self._name}: object {row.address} ({row.name}) is 0x{found:02X}, not 0. "
+            f"{row.sentence}"
         )
 
     def _configure_heartbeat_consumer(self) -> bool:
-        """Have the drive watch over this computer's heartbeat; return whether it can."""
+        """Configure the monitoring of this computer's heartbeat; return whether there is one."""
         settings, sdo = self._settings, self._sdo
         index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
         wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
@@ -508,7 +509,7 @@ class _SetUp:
         entries: tuple[int, ...],
         parameters: dict[int, int],
     ) -> None:
-        """Have a PDO carry these entries; one that does so already is left alone.
+        """Map entries into a PDO; one that has them already is not written.
 
         Parameters
         ----------
@@ -561,7 +562,7 @@ class _SetUp:
                 if refusal.is_absent:
                     raise DeviceError(f"{self._name}: {row.missing()}") from None
                 raise DeviceError(
-                    f"{self._name}: it does not take object {row.place} ({row.name}) into {what} "
+                    f"{self._name}: it does not take object {row.address} ({row.name}) into {what} "
                     f"(abort code 0x{refusal.code:08X}: {_words(refusal)}). {row.sentence}"
                 ) from None
         sdo.configure(mapping, 0, len(entries))

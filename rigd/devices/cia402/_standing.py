@@ -1,4 +1,4 @@
-"""The drive without the loop: switched off first of all, reset, and asked whether it could start.
+"""Fault reset without the loop: switch the drive off, reset it, and check that it becomes ready.
 
 Everything goes by SDO, which a drive answers in each NMT state but stopped. Whether the motor has
 torque is what the statusword says, never what was commanded.
@@ -61,8 +61,8 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     Raises
     ------
     DeviceError
-        If the drive does not answer, does not show itself off within 0.2 s, the fault stands, or
-        the drive is disabled and does not get ready.
+        If the drive does not answer, does not report that it is off within 0.2 s, the fault
+        persists, or the drive is disabled and does not become ready.
     """
     settings = rig.cia402
     assert settings is not None
@@ -79,14 +79,14 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
 
 
 def command_off(sdo: SdoAccess) -> None:
-    """Send controlword 0 and do not care for the answer; never raises."""
+    """Send controlword 0 and ignore the answer; never raises."""
     # An adapter's library may raise anything, and this is the way off.
     with suppress(Exception), sdo.hurried():
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
 def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
-    """Wait until a drive that was told to switch off is disabled.
+    """Wait until a drive that was commanded off is disabled.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
 
 
 def still_on(sdo: SdoAccess) -> str:
-    """Return a sentence on a drive that was told to switch off and does not show it, or nothing."""
+    """Describe a drive that was commanded off and does not report it; empty if it does."""
     try:
         statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
@@ -126,7 +126,7 @@ def still_on(sdo: SdoAccess) -> str:
 
 
 def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
-    """Ask again and again, at least twice, and return whether it was reached in time."""
+    """Poll a condition, at least twice, and return whether it became true in time."""
     deadline = time.monotonic() + patience_s
     while not reached():
         if time.monotonic() > deadline:
@@ -136,7 +136,7 @@ def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
 
 
 def _see_off(sdo: SdoAccess, name: str) -> None:
-    """Command the drive off until its statusword shows it, first of all and in whatever state.
+    """Command the drive off, from any state, until its statusword confirms it.
 
     Raises
     ------
@@ -145,15 +145,15 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
     """
     began = time.monotonic()
     statusword: int | None = None
-    told = False
+    requested = False
     with sdo.hurried():
         while True:
             command_off(sdo)
-            if not told:
+            if not requested:
                 # A drive whose node was stopped answers again; another may ignore it.
                 with suppress(Exception):
-                    sdo.tell_pre_operational()
-                    told = True
+                    sdo.request_pre_operational()
+                    requested = True
             with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
                 if state_of(statusword) in OFF:
@@ -168,15 +168,15 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
-            said = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
             raise DeviceError(
-                f"{said} It has not shown that it is off: keep clear of the beam, and press the "
+                f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
                 "wired stop (STO) if anything moves."
             ) from None
         if state_of(statusword) in OFF:
             return
     raise DeviceError(
-        f"{name}: it was told to switch off and has not done so within {_OFF_S:g} s: it is in "
+        f"{name}: it was commanded to switch off and has not done so within {_OFF_S:g} s: it is in "
         f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}); {_PRESS_STO}. Its watch '
         "over the heartbeat (object 1016) was left as it was."
     )
@@ -224,14 +224,14 @@ def _see_ready(
         )
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: {done}; when it was told to get ready it went to fault: {_fault(sdo)}. "
+            f"{name}: {done}; when it was commanded to get ready it went to fault: {_fault(sdo)}. "
             f"Remove the cause, then: {command}"
         )
     supplied = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {done}, and it is disabled, but it does not get ready: told to, it stays in "
-        f'"{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). STO '
-        f"is open or the motor supply is off; release or switch it on, then: {command}"
+        f"{name}: {done}, and it is disabled, but it does not get ready: on that command it stays "
+        f'in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply {supplied}). '
+        f"STO is open or the motor supply is off; release or switch it on, then: {command}"
     )
 
 

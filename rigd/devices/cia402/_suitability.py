@@ -1,7 +1,7 @@
-"""Suitability of a drive for torque control, judged by its EDS file before it is connected.
+"""Suitability of a drive for torque control, checked by its EDS file before it is connected.
 
 The file is compared with the table of :mod:`rigd.devices.cia402.requirements`, which the set-up
-goes by. What it does not state the drive is asked when it is connected.
+goes by. What it does not state is read from the drive when it is connected.
 """
 
 from collections.abc import Iterator
@@ -14,8 +14,8 @@ from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
     REQUIREMENTS,
     WATCHDOG,
-    Access,
-    Fit,
+    AllowedValue,
+    ObjectAccess,
     Requirement,
     Watchdog,
     fixed_values,
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 
 class Grade(Enum):
-    """Grade of what a file tells of one object."""
+    """Grade of an object by the file."""
 
     FITS = "as needed"
-    STANDS_IN = "something else does its work"
+    SUBSTITUTED = "something else does its work"
     ASK = "the drive will be asked"
     ACCEPTED = "the profile accepts that it is missing"
-    DOUBT = "a session can be run; somebody should look"
+    DOUBT = "a session can be run; somebody should check it"
     REFUSED = "no session with this drive"
 
 
@@ -85,11 +85,11 @@ _COB_IDS: Final = (
     (objects.RPDO_COMMUNICATION, 1),
 )
 _NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
-_TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
+_REPORTED_ELSEWHERE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
 def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
-    """Hold a drive's EDS against what rigd asks of a drive.
+    """Check a drive's EDS file against the requirements.
 
     Parameters
     ----------
@@ -99,10 +99,10 @@ def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
         Parameters of a profile with a section ``cia402``, whose values are compared too; None: the
         drive alone is judged, and what a profile may accept counts as accepted.
     """
-    return Judgement(tuple(_Judge(eds, rig).findings()))
+    return Judgement(tuple(_SuitabilityCheck(eds, rig).findings()))
 
 
-class _Judge:
+class _SuitabilityCheck:
     def __init__(self, eds: Eds, rig: "RigParameters | None") -> None:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
@@ -115,21 +115,21 @@ class _Judge:
         yield self._torque_mode()
         yield self._watchdog()
         for needed in REQUIREMENTS:
-            if needed.index in _TOLD_BEFORE or needed.accept == WATCHDOG:
+            if needed.index in _REPORTED_ELSEWHERE or needed.accept == WATCHDOG:
                 continue
             entry = self._eds.get(needed.index, needed.sub)
             yield self._absent(needed) if entry is None else self._present(needed, entry)
 
     def _identity(self) -> Iterator[Finding]:
-        for key, told, name in (
+        for key, stated, name in (
             ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
             ("product_code", self._eds.product_code, self._eds.product_name),
         ):
             what = key.replace("_", " ")
             wanted = getattr(self._settings, key) if self._settings else 0
-            shown = f"0x{told:08X}" if told else "not told"
+            shown = f"0x{stated:08X}" if stated else "not stated"
             found = f"{shown} ({name})" if name else shown
-            if not (told and wanted and told != wanted):
+            if not (stated and wanted and stated != wanted):
                 yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
                 continue
             sentence = (
@@ -141,7 +141,7 @@ class _Judge:
     def _bit_rates(self) -> Iterator[Finding]:
         rates = self._eds.bit_rates_bit_s
         found = ", ".join(f"{rate // 1000}" for rate in rates)
-        found = f"{found} kbit/s" if rates else "not told"
+        found = f"{found} kbit/s" if rates else "not stated"
         if self._rig is None or self._rig.can is None:
             yield Finding("bit rates", found, "", Grade.FITS)
             return
@@ -161,32 +161,34 @@ class _Judge:
             "bit 9 (cyclic torque)",
         )
         modes = self._eds.get(objects.SUPPORTED_MODES)
-        place = f"object {objects.SUPPORTED_MODES:04X}"
+        address = f"object {objects.SUPPORTED_MODES:04X}"
         if modes is None:
-            sentence = f"No cyclic synchronous torque mode: {place} is missing."
+            sentence = f"No cyclic synchronous torque mode: {address} is missing."
             return Finding(what, "absent", wanted, Grade.REFUSED, sentence)
         if modes.default:
             shown = f"0x{modes.default:X}"
             if modes.default & objects.SUPPORTS_CYCLIC_TORQUE:
                 return Finding(what, shown, wanted, Grade.FITS)
             sentence = (
-                f"No cyclic synchronous torque mode: {place} = {shown} lacks bit 9; this drive or "
-                "its firmware cannot be used."
+                f"No cyclic synchronous torque mode: {address} = {shown} lacks bit 9; this drive "
+                "or its firmware cannot be used."
             )
             return Finding(what, shown, wanted, Grade.REFUSED, sentence)
-        return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
+        return Finding(
+            what, "the file does not state it; the drive will be asked", wanted, Grade.ASK
+        )
 
     def _watchdog(self) -> Finding:
-        """Judge which watchdog takes the torque off when this computer falls silent."""
-        found = self._stands()
+        """Check which watchdog removes the torque when this computer falls silent."""
+        found = self._expected_watchdog()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:
             return Finding(what, found.value, wanted, Grade.FITS)
         if found is not Watchdog.NONE:
-            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.STANDS_IN)
+            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.SUBSTITUTED)
         return self._to_accept(requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
 
-    def _stands(self) -> Watchdog:
+    def _expected_watchdog(self) -> Watchdog:
         heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
         deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         return watchdog(
@@ -196,22 +198,22 @@ class _Judge:
         )
 
     def _absent(self, needed: Requirement) -> Finding:
-        what = f"{needed.place} {needed.name}"
+        what = f"{needed.address} {needed.name}"
         if needed.core:
             return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
-        if needed.index == objects.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
+        if needed.index == objects.ABORT_OPTION and self._expected_watchdog() in _NOT_SET_BY_RIGD:
             found = "absent; in its place: the manufacturer's own watchdog"
-            return Finding(what, found, "", Grade.STANDS_IN)
+            return Finding(what, found, "", Grade.SUBSTITUTED)
         if needed.accept:
             return self._to_accept(needed, what, "absent", "")
         if self._is_set_by_profile(needed):
-            sentence = f"it has no object {needed.place} ({needed.name}). {needed.sentence}"
+            sentence = f"it has no object {needed.address} ({needed.name}). {needed.sentence}"
             return Finding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
         stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
-        return Finding(what, f"absent{stand_in}", "", Grade.STANDS_IN)
+        return Finding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
     def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
-        """Judge what is missing unless the profile accepts that by name."""
+        """Return the finding on a missing object that the profile may accept by name."""
         stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
         if self._settings is not None and needed.accept in self._settings.accept_without:
             found = f"{found}, accepted by the profile"
@@ -234,26 +236,26 @@ class _Judge:
         }.get((needed.index, needed.sub), False)
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
-        what = f"{needed.place} {needed.name}"
+        what = f"{needed.address} {needed.name}"
         wanted = self._wanted.get((needed.index, needed.sub))
-        asked = "" if wanted is None else _shown(needed, wanted)
-        told = "" if entry.default is None else f", {_shown(needed, entry.default)}"
-        found = f"{entry.access}{told}"
+        wanted_text = "" if wanted is None else _shown(needed, wanted)
+        default = "" if entry.default is None else f", {_shown(needed, entry.default)}"
+        found = f"{entry.access}{default}"
 
         def objection(text: str, *, doubt: bool = False) -> Finding:
-            sentence = _sentence(f"its object {needed.place} ({needed.name}) {text}")
+            sentence = _sentence(f"its object {needed.address} ({needed.name}) {text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
-            return Finding(what, found, asked, grade, sentence)
+            return Finding(what, found, wanted_text, grade, sentence)
 
-        if needed.access & (Access.SENT | Access.RECEIVED):
+        if needed.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
             trouble = self._unmappable(entry)
             if trouble and needed.accept:
-                return self._to_accept(needed, what, f"{found}, {trouble}", asked)
+                return self._to_accept(needed, what, f"{found}, {trouble}", wanted_text)
             if trouble:
                 return objection(f"{trouble}. {needed.sentence}")
-        if Access.WRITE in needed.access and not entry.writable:
+        if ObjectAccess.WRITE in needed.access and not entry.writable:
             return self._read_only(needed, entry, found, wanted)
-        if Access.READ in needed.access and entry.access == "wo":
+        if ObjectAccess.READ in needed.access and entry.access == "wo":
             return objection(
                 f"is write-only: what it holds cannot be checked. {needed.sentence}".rstrip(),
                 doubt=needed.index in MAY_BE_WRITE_ONLY,
@@ -261,19 +263,19 @@ class _Judge:
         if wanted is not None and not _takes(entry, wanted):
             limits = f"{_limit(needed, entry.low)} to {_limit(needed, entry.high)}"
             return objection(
-                f"takes {limits}, not {asked}. {needed.sentence}", doubt=not needed.core
+                f"takes {limits}, not {wanted_text}. {needed.sentence}", doubt=not needed.core
             )
-        return Finding(what, found, asked, Grade.FITS)
+        return Finding(what, found, wanted_text, Grade.FITS)
 
     def _read_only(
         self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
     ) -> Finding:
-        """Judge an object that would be written and cannot be: what it holds may do."""
-        what = f"{needed.place} {needed.name}"
-        if needed.fit is Fit.AT_LEAST:
-            asked = f"at least {wanted or 'motor.peak_torque_nm'}"
+        """Return the finding on a read-only object: its value may be acceptable."""
+        what = f"{needed.address} {needed.name}"
+        if needed.fit is AllowedValue.AT_LEAST:
+            wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
-            asked = "" if wanted is None else _shown(needed, wanted)
+            wanted_text = "" if wanted is None else _shown(needed, wanted)
         if needed.index in _PDO_ENTRIES:
             held = self._mapped(needed.index)
             does = None if None in held else held == _PDO_ENTRIES[needed.index]
@@ -285,24 +287,24 @@ class _Judge:
             mapping = needed.index + 0x200
             if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
                 sentence = (
-                    f"its object {needed.place} ({needed.name}) is read-only, so that the PDO "
+                    f"its object {needed.address} ({needed.name}) is read-only, so that the PDO "
                     f"cannot be switched off to be remapped. {needed.sentence}"
                 )
-                return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+                return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
         else:
             does = needed.fit.allows(entry.default, wanted)
         if does:
-            return Finding(what, f"{found}: it does", asked, Grade.FITS)
+            return Finding(what, f"{found}: it does", wanted_text, Grade.FITS)
         if does is None and needed.index != objects.CONTROLWORD:
-            return Finding(what, f"{found}: the drive will be asked", asked, Grade.ASK)
+            return Finding(what, f"{found}: the drive will be asked", wanted_text, Grade.ASK)
         sentence = (
-            f"its object {needed.place} ({needed.name}) is read-only and does not hold what is "
-            f"needed{f' ({asked})' if asked else ''}. {needed.sentence}"
+            f"its object {needed.address} ({needed.name}) is read-only and does not hold what is "
+            f"needed{f' ({wanted_text})' if wanted_text else ''}. {needed.sentence}"
         )
-        return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+        return Finding(what, found, wanted_text, Grade.REFUSED, _sentence(sentence))
 
     def _unmappable(self, entry: EdsEntry) -> str:
-        """Say why an object cannot be in its PDO; empty if it can."""
+        """Describe why an object cannot be mapped into its PDO; empty if it can."""
         bits = _LENGTHS[entry.index]
         if entry.bits not in (None, bits):
             return f"has {entry.bits} bits, not {bits}"

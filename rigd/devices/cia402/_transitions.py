@@ -22,10 +22,10 @@ from rigd.devices.cia402._protocol import (
 from rigd.devices.cia402.objects import CONTROLWORD, CYCLIC_TORQUE
 from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
-_FOREIGN_COMMAND: Final = (
+_OTHER_COMMANDER: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"
 )
-_LOOK_AT_THE_BUS: Final = "check the bus cable, its termination, and what else is connected to it"
+_CHECK_THE_BUS: Final = "check the bus cable, its termination, and what else is connected to it"
 
 
 # Why a drive has left operation
@@ -52,15 +52,15 @@ def left_operation(name: str, statusword: int) -> DeviceError:
         hint = ", and its bit 4 says that the supply is there, which indicates such a command"
         dropped = wired_stop_dropped(
             name,
-            f", or the motor's supply failed, or {_FOREIGN_COMMAND}: {left}"
+            f", or the motor's supply failed, or {_OTHER_COMMANDER}: {left}"
             f"{hint if supplied else ''}",
         )
-        return DeviceError(f"{dropped} If nobody pressed it, {_LOOK_AT_THE_BUS}.")
+        return DeviceError(f"{dropped} If nobody pressed it, {_CHECK_THE_BUS}.")
     if state in (DriveState.READY, DriveState.SWITCHED_ON):
-        return DeviceError(f"{name}: {left}: {_FOREIGN_COMMAND}; {_LOOK_AT_THE_BUS}.")
+        return DeviceError(f"{name}: {left}: {_OTHER_COMMANDER}; {_CHECK_THE_BUS}.")
     return DeviceError(
-        f"{name}: {left}, by itself or because {_FOREIGN_COMMAND}; check STO, supply and its "
-        f"own diagnosis. If these tell nothing, {_LOOK_AT_THE_BUS}."
+        f"{name}: {left}, by itself or because {_OTHER_COMMANDER}; check STO, supply and its "
+        f"own diagnosis. If these show nothing, {_CHECK_THE_BUS}."
     )
 
 
@@ -82,14 +82,14 @@ class TorqueFollowing:
     tolerance_percent
         Tolerance in percent of the rated torque; 0 disables the comparison.
     response_s
-        Time constant of that lag; 0 for a drive that tells what it was told.
+        Time constant of that lag; 0 for a drive that reports the commanded torque.
     period_s
         Time between two commands.
 
     Attributes
     ----------
     compares : bool
-        The drive tells its torque at all.
+        Whether the drive reports its torque.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class TorqueFollowing:
     ) -> None:
         self._name = name
         self._tolerance = 10.0 * tolerance_percent
-        # Share of a step that a command reaches after one period.
-        self._share = 1.0 - exp(-period_s / response_s) if response_s else 1.0
+        # Fraction of a step that a command reaches after one period.
+        self._step_fraction = 1.0 - exp(-period_s / response_s) if response_s else 1.0
         self.compares = True
         self.start()
 
     def start(self) -> None:
-        """Begin with a drive that has been told to exert nothing."""
+        """Start with a drive whose commanded torque is zero."""
         self._commanded = 0
         self._last = 0.0
         self._before = 0.0
@@ -113,7 +113,7 @@ class TorqueFollowing:
         """Note the torque that is commanded."""
         self._commanded = per_mille
         before = self._before = self._last
-        self._last = before + self._share * (per_mille - before)
+        self._last = before + self._step_fraction * (per_mille - before)
 
     def compare(self, actual_per_mille: int) -> None:
         """Compare the drive's torque with the last commands.
@@ -156,8 +156,8 @@ _SILENT_TURNS_IN_LOCK_STEP = 3
 _SWITCH_OFF_NS = 50_000_000
 
 
-class StopAskedError(Exception):
-    """The operator wants no enabled drive any more."""
+class StopRequestedError(Exception):
+    """The operator requested a stop while the drive was being enabled."""
 
 
 def step_up(node: Node, stop: Callable[[], bool]) -> None:
@@ -168,12 +168,12 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
     node
         The drive's node.
     stop
-        Asked once a period whether to give up.
+        Called once a period; True aborts the transition.
 
     Raises
     ------
-    StopAskedError
-        If it said so. The drive may be enabled then.
+    StopRequestedError
+        If `stop` returned True. The drive may be enabled then.
     DeviceError
         If a step takes longer than ``cia402.enable_timeout_s``, the drive then ignores the torque,
         or is in another mode. It may be enabled then.
@@ -237,10 +237,10 @@ def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
 
     def in_cyclic_torque() -> bool:
         nonlocal mode
-        told = read_mode(inbox.reply)
-        if told is None:
+        mode_read = read_mode(inbox.reply)
+        if mode_read is None:
             return False
-        mode, inbox.reply = told, b""
+        mode, inbox.reply = mode_read, b""
         if mode != CYCLIC_TORQUE:
             send(frames.ask_mode)
         return mode == CYCLIC_TORQUE
@@ -275,7 +275,7 @@ def _turn_until(
     silent = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
         if stop():
-            raise StopAskedError
+            raise StopRequestedError
         node.exchange.send(frame)
         node.await_grid(grid_ns)
         node.now_ns += node.period_ns

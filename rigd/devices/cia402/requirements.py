@@ -1,8 +1,8 @@
 """Requirements on a drive's object dictionary: one table for set-up, EDS files and docs.
 
-An object is *core* where no session is possible without it, and *optional* where something else
-stands in. An optional object that is read-only is fine as long as it holds what is needed
-(:class:`Fit`). Where nothing stands in by itself, the profile has to accept that by name
+An object is *core* if no session is possible without it, and *optional* if something else replaces
+it. An optional object may be read-only if it holds an allowed value (:class:`AllowedValue`). If
+nothing replaces it by itself, the profile has to accept its absence by name
 (``cia402.accept_without``), or the drive is refused.
 
 Imports nothing but the indices, so that a program which only reads an EDS file can use it.
@@ -28,7 +28,7 @@ ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
 """Names of what a profile may accept that its drive lacks."""
 
 
-class Access(Flag):
+class ObjectAccess(Flag):
     """Kind of access to an object."""
 
     READ = auto()
@@ -51,7 +51,7 @@ class Watchdog(Enum):
 
 
 def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
-    """Return which watchdog stands, the best first.
+    """Return the watchdog that is active, the best one first.
 
     Parameters
     ----------
@@ -67,29 +67,29 @@ def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
     return Watchdog.OWN if own else Watchdog.NONE
 
 
-class Fit(Enum):
-    """Which values an object may hold that cannot be written."""
+class AllowedValue(Enum):
+    """Rule for the value of an object that cannot be written."""
 
     EQUAL = "exactly"
-    """The one that is needed."""
+    """The required value."""
     AT_LEAST = "at least"
-    """A limit that does not cut what is needed."""
+    """A limit of at least the required value."""
     EQUAL_OR_UNUSED = "exactly, or 0"
-    """0 says that it is not used."""
+    """The required value, or 0: not used."""
     ANY = "any"
     """It is only read."""
 
     def allows(self, found: int, wanted: int) -> bool:
-        """Whether a value does where another one is wanted.
+        """Return whether a value is allowed where another one is required.
 
         Parameters
         ----------
         found, wanted
-            Value that the object holds, and the one that is needed.
+            Value that the object holds, and the required one.
         """
-        if self in (Fit.EQUAL, Fit.EQUAL_OR_UNUSED):
-            return found == wanted or (self is Fit.EQUAL_OR_UNUSED and found == 0)
-        return self is Fit.ANY or found >= wanted
+        if self in (AllowedValue.EQUAL, AllowedValue.EQUAL_OR_UNUSED):
+            return found == wanted or (self is AllowedValue.EQUAL_OR_UNUSED and found == 0)
+        return self is AllowedValue.ANY or found >= wanted
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class Requirement:
         Values that it may hold where it cannot be written.
     accept
         Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
-        not have to. (For 1016:1 only where no other :class:`Watchdog` stands.)
+        not have to. (For 1016:1 only if no other :class:`Watchdog` is active.)
     zero
         Has to read 0 where it is there: something that a drive may hold from before.
     """
@@ -123,15 +123,15 @@ class Requirement:
     sub: int
     name: str
     core: bool
-    access: Access
+    access: ObjectAccess
     stand_in: str = ""
     sentence: str = ""
-    fit: Fit = Fit.EQUAL
+    fit: AllowedValue = AllowedValue.EQUAL
     accept: str = ""
     zero: bool = False
 
     @property
-    def place(self) -> str:
+    def address(self) -> str:
         """Index and sub-index as messages show them: ``6072`` or ``1016:1``."""
         return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
 
@@ -148,10 +148,10 @@ class Requirement:
         remedy = (
             f' To run without it: cia402.accept_without = ["{self.accept}"].' if self.accept else ""
         )
-        return f"it has no object {self.place} ({self.name}). {self.sentence}{remedy}"
+        return f"it has no object {self.address} ({self.name}). {self.sentence}{remedy}"
 
 
-_R, _W = Access.READ, Access.WRITE
+_R, _W = ObjectAccess.READ, ObjectAccess.WRITE
 _NOT_USABLE: Final = "Without it the drive cannot be used: check whether its firmware offers it."
 _DYNAMIC: Final = (
     "Its PDOs must be mappable as rigd needs them, or be mapped so already: RPDO1 with "
@@ -161,9 +161,16 @@ _FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
 
 CORE: Final = (
     Requirement(
-        objects.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
+        objects.CONTROLWORD,
+        0,
+        "Controlword",
+        True,
+        _W | ObjectAccess.RECEIVED,
+        sentence=_NOT_USABLE,
     ),
-    Requirement(objects.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
+    Requirement(
+        objects.STATUSWORD, 0, "Statusword", True, _R | ObjectAccess.SENT, sentence=_NOT_USABLE
+    ),
     Requirement(
         objects.MODE,
         0,
@@ -180,7 +187,7 @@ CORE: Final = (
         0,
         "Position actual value",
         True,
-        _R | Access.SENT,
+        _R | ObjectAccess.SENT,
         sentence="The loop runs on it.",
     ),
     Requirement(
@@ -188,7 +195,7 @@ CORE: Final = (
         0,
         "Target torque",
         True,
-        Access.RECEIVED,
+        ObjectAccess.RECEIVED,
         sentence="Without it the drive has no torque mode that rigd could use.",
     ),
     Requirement(
@@ -223,9 +230,15 @@ CORE: Final = (
 """No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
 
 OPTIONAL: Final = (
-    # Identity and texts: told in reports, compared only where the profile names them.
+    # Identity and texts: reported, and compared only if the profile states them.
     Requirement(
-        objects.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
+        objects.IDENTITY,
+        1,
+        "Vendor-ID",
+        False,
+        _R,
+        "nothing: cia402.vendor_id = 0",
+        fit=AllowedValue.ANY,
     ),
     Requirement(
         objects.IDENTITY,
@@ -234,11 +247,17 @@ OPTIONAL: Final = (
         False,
         _R,
         "nothing: cia402.product_code = 0",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
     ),
-    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
+    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=AllowedValue.ANY),
     Requirement(
-        objects.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
+        objects.ERROR_CODE,
+        0,
+        "Error code",
+        False,
+        _R,
+        "the emergency message",
+        fit=AllowedValue.ANY,
     ),
     # SYNC.
     Requirement(
@@ -257,7 +276,7 @@ OPTIONAL: Final = (
         _R | _W,
         "transmission type 1: the drive goes by the SYNCs that come",
         "It must be the period of rig.rate_hz in microseconds, or 0.",
-        Fit.EQUAL_OR_UNUSED,
+        AllowedValue.EQUAL_OR_UNUSED,
     ),
     Requirement(
         objects.SYNC_WINDOW_US,
@@ -354,7 +373,7 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "0x080 + node id, the default of CiA 301",
-        "Its emergency messages would not be heard.",
+        "Its emergency messages would not be received.",
     ),
     # Torque and speed.
     Requirement(
@@ -379,7 +398,7 @@ OPTIONAL: Final = (
             "Max torque (6072)",
             "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
             "motor.peak_torque_nm.",
-            Fit.AT_LEAST,
+            AllowedValue.AT_LEAST,
         )
         for index, name in zip(
             objects.TORQUE_LIMITS,
@@ -406,7 +425,7 @@ OPTIONAL: Final = (
         "motor.rated_torque_nm alone: cia402.rated_torque_unit_nm = 0",
         "What 1000 thousandths of torque are cannot be compared with the profile: set "
         "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
     ),
     *(
         Requirement(
@@ -416,7 +435,7 @@ OPTIONAL: Final = (
             False,
             _R,
             "the probing move before the first session (docs/safety.md)",
-            fit=Fit.ANY,
+            fit=AllowedValue.ANY,
         )
         for index, sub, name in (
             (objects.ENCODER_RESOLUTION, 1, "Encoder increments"),
@@ -432,10 +451,10 @@ OPTIONAL: Final = (
         0,
         "Torque actual value",
         False,
-        _R | Access.SENT,
+        _R | ObjectAccess.SENT,
         "",
         "Torque commands that are lost, or cut by the drive, would not be noticed.",
-        fit=Fit.ANY,
+        fit=AllowedValue.ANY,
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
@@ -471,13 +490,19 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
+        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=AllowedValue.ANY
     ),
     Requirement(
-        objects.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
+        objects.FAULT_REACTION_OPTION,
+        0,
+        "Fault reaction option code",
+        False,
+        _R,
+        "–",
+        fit=AllowedValue.ANY,
     ),
 )
-"""Objects that something else stands in for."""
+"""Objects that something else can replace."""
 
 REQUIREMENTS: Final = CORE + OPTIONAL
 
@@ -491,9 +516,9 @@ MAY_BE_WRITE_ONLY: Final = (
     objects.MAX_SPEED_RPM,
 )
 """Objects that are set whatever they held before, so that one that cannot be read is written and
-taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
+not verified. (6060 is write-only in the first editions of CiA 402; 6061 shows the mode.)"""
 
-_BY_PLACE: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
+_BY_ADDRESS: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 
 
 def requirement(index: int, sub: int = 0) -> Requirement:
@@ -509,7 +534,7 @@ def requirement(index: int, sub: int = 0) -> Requirement:
     KeyError
         If rigd asks nothing of it.
     """
-    return _BY_PLACE[index, sub]
+    return _BY_ADDRESS[index, sub]
 
 
 _ROUNDING = 1e-9
@@ -548,7 +573,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     Raises
     ------
     DeviceError
-        If the period cannot be told to a drive.
+        If a drive cannot represent the period.
     """
     settings = rig.cia402
     assert settings is not None
@@ -610,7 +635,7 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
     from rigd.devices.contracts import DeviceError
 
     raise DeviceError(
-        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
+        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be set in a CANopen drive (object 60C2: "
         "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."
     )
 

@@ -1,7 +1,7 @@
 """The simulated ATI sensor behind a NETCANOEM box: it answers requests, and sends nothing else.
 
-Requests and replies share one range of sixteen identifiers, base · 16 + opcode; everything on the
-wire is big-endian. Where no document tells what the box does, it is stated here:
+Requests and replies use one range of sixteen identifiers, base · 16 + opcode; everything on the
+wire is big-endian. Behaviour that is not documented for the box is defined here:
 
 * a request with an unknown opcode, of another length, or with an index that cannot be (axis or
   diagnostic channel above 5, calibration above 15, base above 0x7F) gets no reply;
@@ -10,7 +10,7 @@ wire is big-endian. Where no document tells what the box does, it is stated here
 * a calibration that is not in the box is selected and echoed all the same, but from then on bit 6
   of the status is set and the matrix reads as not-a-number, as erased memory does; serial number,
   units and counts do not depend on the calibration;
-* counts per unit and units are told from firmware 3.7 on, the diagnostic channels from 3.8 on;
+* counts per unit and units are reported from firmware 3.7 on, the diagnostic channels from 3.8 on;
   older firmware does not answer these requests;
 * a new base is acknowledged under the old one and holds from the next power-up on; a new bit rate
   is acknowledged and changes nothing here, where there is none.
@@ -62,7 +62,7 @@ class AtiCanNode:
     log
         Called ``log("sensor", what, **values)`` when the box is set or reset.
     firmware
-        Major, minor, build; before 3.7 the box tells neither counts per unit nor units.
+        Major, minor, build; before 3.7 the box reports neither counts per unit nor units.
     calibrations
         Indices that hold a calibration; the profile's alone if not given.
     counts_per_unit
@@ -73,7 +73,7 @@ class AtiCanNode:
     gauges : AtiGauges
         The calibration that is served.
     frozen : bool
-        Answers nothing, takes nothing in.
+        Whether the box neither answers nor receives.
     saturate : int or None
         This gauge reads ±32767.
     status_bits : int
@@ -103,8 +103,8 @@ class AtiCanNode:
                 "The profile has no section [ati_can], which the simulated sensor on CAN needs; "
                 "copy it from a profile that has one."
             )
-        tells_counts = firmware[:2] >= _FIRST_WITH_COUNTS
-        self.gauges = AtiGauges(rig.sensor, counts_per_unit if tells_counts else COUNTS_PER_UNIT)
+        reports_counts = firmware[:2] >= _FIRST_WITH_COUNTS
+        self.gauges = AtiGauges(rig.sensor, counts_per_unit if reports_counts else COUNTS_PER_UNIT)
         self.frozen = False
         self.saturate: int | None = None
         self.status_bits = 0
@@ -130,14 +130,14 @@ class AtiCanNode:
             0xE: (1, self._set_baud),
             0xF: (0, self._read_firmware),
         }
-        if tells_counts:
+        if reports_counts:
             self._requests[0x7] = (0, self._read_counts_per_unit)
             self._requests[0x8] = (0, self._read_units)
         if firmware[:2] >= _FIRST_WITH_DIAGNOSTICS:
             self._requests[0x9] = (1, self._read_diagnostic)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Take a frame that somebody else sent."""
+        """Receive a frame."""
         if can_id >> 4 != self._base or self.frozen:
             return
         request = self._requests.get(can_id & 0xF)
@@ -154,7 +154,7 @@ class AtiCanNode:
         self._log("sensor", "reset")
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back."""
+        """Simulate a power cycle."""
         self._active = 0
         self._was_reset = False
         self._base = self._next_base

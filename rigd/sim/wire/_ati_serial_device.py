@@ -1,18 +1,18 @@
 """The simulated ATI Digital F/T sensor on a serial line: Modbus RTU for set-up, then a stream.
 
-Where no document tells what the sensor does, it is stated here:
+Behaviour that is not documented for the sensor is defined here:
 
 * frames for another address, with a wrong checksum, or of other bytes get no answer;
 * a request is whole as soon as its length is reached and its checksum holds; one that is still
   incomplete after 50 ms of silence is forgotten (a real line forgets after 3.5 characters, which
   no pseudo-terminal can be held to);
-* starting the stream, or the lock, with another parameter than the documented ones is answered
-  with 0 in place of 1;
+* starting the stream, or the lock, with another parameter than the documented ones is answered with
+  0 instead of 1;
 * polled gauges (input registers 0 to 5) come in their natural order;
 * gains and offsets are zero after power-up; writing them while locked is an illegal address.
 
 While it streams the sensor answers nothing; bytes sent to it are only counted, and 14 of them end
-the stream. A gauge whose gain or offset is not the one of its calibration stands at the end of its
+the stream. A gauge whose gain or offset is not the one of its calibration reads the end of its
 range, -32768, whatever the load.
 """
 
@@ -91,7 +91,7 @@ class AtiSerialDevice:
     streaming : bool
         Whether `emit` writes records.
     frozen : bool
-        Writes nothing, takes nothing in.
+        Whether the sensor neither writes nor receives.
     saturate : int or None
         This gauge reads ±32767.
     status_bits : int
@@ -131,15 +131,15 @@ class AtiSerialDevice:
         self._unset = list(range(6))
         """Gauges whose gain or offset is not the calibration's."""
         self._partial = b""
-        self._heard = False
+        self._received = False
         self._silent_since_s = math.inf
         self._jam = 0
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line, cut anywhere; answers go out at once."""
+        """Receive bytes from the line, in chunks of any length; answer at once."""
         if self.frozen:
             return
-        self._heard = True
+        self._received = True
         received = self._partial + data
         while received and not self.streaming:
             request, rest = _next_request(received)
@@ -166,19 +166,19 @@ class AtiSerialDevice:
         self._log("sensor", "restart")
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which makes no difference here."""
+        """Simulate a power cycle, which equals a reset here."""
         self.reset()
 
     def tick(self, now_s: float) -> None:
         """Forget an incomplete request when the line has been silent for long."""
-        if self._heard:
-            self._heard = False
+        if self._received:
+            self._received = False
             self._silent_since_s = now_s
         elif now_s - self._silent_since_s > _SILENCE_S:
             self._partial = b""
 
     def emit(self) -> None:
-        """Write the records of the period that has just passed, in one piece."""
+        """Write the records of the past period in one block."""
         if not self.streaming or self.frozen:
             return
         wrenches = self._newest()
@@ -309,7 +309,7 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
     """Find the first whole request in what came in.
 
     Every byte that could be the address is tried, so that noise before a request, even one that
-    looks like the start of another, costs nothing but itself.
+    resembles the start of another, is skipped without loss.
 
     Returns
     -------

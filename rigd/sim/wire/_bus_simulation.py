@@ -1,7 +1,7 @@
 """Bus simulation: the rig between its lines, with nodes, clock and faults, but no input or output.
 
-Whatever comes in is handed over with the time it came; what the nodes say goes out through two
-callables. So the same `BusSimulation` runs behind sockets and in a test.
+Input is passed in with its time of arrival; output of the nodes goes through two callables. So the
+same `BusSimulation` runs behind sockets and in a test.
 """
 
 import heapq
@@ -17,14 +17,14 @@ from rigd.devices.obstacles import Obstacle, ObstacleError
 from rigd.devices.parameters import RigParameters
 from rigd.sim import SimulatedRig, Stuck
 from rigd.sim.wire._faults import (
-    ENCOUNTERS,
+    DISTURBANCES,
     LINE_KINDS,
     SERIAL,
     EventLog,
     Fault,
     FaultError,
-    Line,
-    encounter_of,
+    FaultyLine,
+    disturbance_of,
 )
 
 _MEMORY_SYNCS = 256
@@ -116,27 +116,27 @@ class LockStep:
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
         self._period_ns = period_ns
-        self._stands_until_ns = float(now_ns)
+        self._halted_until_ns = float(now_ns)
 
     @property
     def due_ns(self) -> int:
         """When a period passes without a SYNC."""
-        return round(self._stands_until_ns + self._period_ns)
+        return round(self._halted_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
         """Return how many periods pass with a SYNC: always one."""
-        self._stands_until_ns = now_ns + _PATIENCE_NS
+        self._halted_until_ns = now_ns + _PATIENCE_NS
         return 1
 
     def elapse(self, now_ns: int) -> int:
         """Return how many periods pass by the wall clock."""
-        passed = max(0, int((now_ns - self._stands_until_ns) / self._period_ns))
-        self._stands_until_ns += passed * self._period_ns
+        passed = max(0, int((now_ns - self._halted_until_ns) / self._period_ns))
+        self._halted_until_ns += passed * self._period_ns
         return passed
 
     def left_alone(self, now_ns: int) -> None:
         """End the waiting: no client is connected any more."""
-        self._stands_until_ns = min(self._stands_until_ns, now_ns)
+        self._halted_until_ns = min(self._halted_until_ns, now_ns)
 
 
 # Nodes and frames
@@ -156,7 +156,7 @@ _TRAITS = {
 """Traits that a fault may give the drive, and the attribute of each."""
 
 
-class Node(Protocol):
+class SimulatedNode(Protocol):
     """A device on the simulated CAN bus."""
 
     frozen: bool
@@ -168,7 +168,7 @@ class Node(Protocol):
         """Start as when its power comes back."""
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Take a frame that somebody else sent."""
+        """Receive a frame."""
 
     def tick(self, now_s: float) -> None:
         """Let simulated time pass."""
@@ -186,7 +186,7 @@ class SerialDevice(Protocol):
         """Start as when its power comes back."""
 
     def receive(self, data: bytes) -> None:
-        """Take bytes that the host sent."""
+        """Receive bytes from the host."""
 
     def emit(self) -> None:
         """Send what a period brings by itself."""
@@ -197,7 +197,7 @@ class SerialDevice(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Standing:
-    """A fault that holds an attribute of a device."""
+    """A fault that overrides an attribute of a device."""
 
     fault: Fault
     device: Any
@@ -234,9 +234,9 @@ class BusSimulation:
     moved : int
         Periods by which the rig itself moved.
     syncs : int
-        SYNCs heard.
+        SYNCs received.
     bus_off : bool
-        The host's controller is off the bus: neither side hears the other.
+        Whether the host's controller is off the bus: no frames pass in either direction.
     """
 
     def __init__(
@@ -263,13 +263,13 @@ class BusSimulation:
         self._cut = cut
         self._mend = mend
         self._log = log
-        self._nodes: dict[str, Node] = {}
+        self._nodes: dict[str, SimulatedNode] = {}
         self._serial: SerialDevice | None = None
         self._owed = False
         self._lines = {
-            "host": Line("host", self._from_host, self._postpone, log),
-            "drive": Line("drive", partial(self._from_node, "drive"), self._postpone, log),
-            "sensor": Line("sensor", partial(self._from_node, "sensor"), self._postpone, log),
+            "host": FaultyLine("host", self._from_host, self._postpone, log),
+            "drive": FaultyLine("drive", partial(self._from_node, "drive"), self._postpone, log),
+            "sensor": FaultyLine("sensor", partial(self._from_node, "sensor"), self._postpone, log),
         }
         self._unheard: deque[tuple[str, int, bytes]] = deque()
         self._emitting = False
@@ -311,23 +311,23 @@ class BusSimulation:
         """Return what a sensor on a serial line writes with."""
         return self._write_serial
 
-    def join(self, name: str, node: Node) -> None:
+    def join(self, name: str, node: SimulatedNode) -> None:
         """Put a node on the bus."""
         self._nodes[name] = node
 
     def join_serial(self, device: SerialDevice) -> None:
         """Put the sensor on the serial line."""
         self._serial = device
-        self._lines["sensor"] = Line("sensor", self._to_serial, self._postpone, self._log)
+        self._lines["sensor"] = FaultyLine("sensor", self._to_serial, self._postpone, self._log)
 
     def step(self) -> None:
-        """Move the rig on to the tick that a SYNC marks; the drive calls it when it hears one."""
+        """Advance the rig to the tick of a SYNC; the drive calls it at each one received."""
         if self._owed:
             self._owed = False
             self._move()
 
     def hear(self, frames: list[bytes], origin: object, now_ns: int) -> None:
-        """Take frames of a host, in order, that were read at this time.
+        """Process frames of a host, in order, that were read at this time.
 
         Frames that were read together were not sent together: after a pause of this process there
         may be several SYNCs, which were sent a period apart.
@@ -346,12 +346,12 @@ class BusSimulation:
                 self._lines["host"].send(can_id, data, origin)
 
     def hear_serial(self, data: bytes) -> None:
-        """Take bytes of the host on the serial line."""
+        """Process bytes of the host on the serial line."""
         if self._serial is not None:
             self._serial.receive(data)
 
     def elapse(self, now_ns: int) -> None:
-        """Let the time pass for which no SYNC came; what came before has to be heard before."""
+        """Advance the time without a SYNC; frames received before must be processed first."""
         self._now_ns = now_ns
         for _ in range(self.clock.elapse(now_ns)):
             self._pass_period()
@@ -359,12 +359,12 @@ class BusSimulation:
             self._run_due(self._postponed, now_ns)
 
     def left_alone(self, now_ns: int) -> None:
-        """Take note that no host is connected any more."""
+        """Note that no host is connected any more."""
         if isinstance(self.clock, LockStep):
             self.clock.left_alone(now_ns)
 
     def inject(self, fault: Fault) -> None:
-        """Let a fault happen, now or when its time comes.
+        """Inject a fault, now or at its time.
 
         Raises
         ------
@@ -411,7 +411,7 @@ class BusSimulation:
             self._emitting = False
 
     def _let_nodes_act(self) -> None:
-        """Let the nodes do what is due, and the faults whose time has come."""
+        """Run the due actions of the nodes, and begin the due faults."""
         if self._serial is not None:
             self._serial.tick(self.now_s)
         for node in self._nodes.values():
@@ -442,7 +442,7 @@ class BusSimulation:
         self._unheard.append((sender, can_id, data))
 
     def _let_hear(self) -> None:
-        """Let the nodes hear each other, once they are done with what they were at."""
+        """Deliver the nodes' frames to each other after their present actions."""
         while self._unheard:
             sender, can_id, data = self._unheard.popleft()
             for name, node in self._nodes.items():
@@ -487,9 +487,9 @@ class BusSimulation:
                 f"the bytes 0 to {_CAN_BYTES - 1}."
             )
 
-        if fault.kind in ENCOUNTERS:
+        if fault.kind in DISTURBANCES:
             try:
-                self._simulated.check(encounter_of(fault, 0.0))
+                self._simulated.check(disturbance_of(fault, 0.0))
             except (ObstacleError, RealisationError) as error:
                 raise FaultError(f"Fault '{fault}': {error}") from None
 
@@ -526,12 +526,12 @@ class BusSimulation:
             self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
         elif fault.kind in _TRAITS:
             self._stand(fault, drive, _TRAITS[fault.kind], True)
-        elif fault.kind in ENCOUNTERS:
+        elif fault.kind in DISTURBANCES:
             now_s = self._simulated.plant.elapsed_s + (0.0 if self._lock_step else _READY_IN_S)
-            encounter = encounter_of(fault, now_s)
-            self._simulated.meet(encounter, wait=self._lock_step)
-            if isinstance(encounter, Obstacle):
-                self._obstacles.append((fault, encounter))
+            disturbance = disturbance_of(fault, now_s)
+            self._simulated.meet(disturbance, wait=self._lock_step)
+            if isinstance(disturbance, Obstacle):
+                self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
             self._end(values.get("fault"))
         else:
@@ -540,7 +540,7 @@ class BusSimulation:
         self._let_hear()
 
     def _get_stuck(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
-        """Let encoder, sensor or one gauge repeat its readings."""
+        """Make encoder, sensor or one gauge repeat its readings."""
         stuck = Stuck(int(fault.values.get("every", 0)))
         what = fault.values["what"]
         if what == "encoder":
@@ -551,7 +551,7 @@ class BusSimulation:
             self._stand(fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck))
 
     def _stand(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
-        """Let a fault hold an attribute of a device, until it ends."""
+        """Let a fault override an attribute of a device until it ends."""
         others = [s for s in self._standing if (s.device, s.attribute) == (device, attribute)]
         normal = others[0].normal if others else getattr(device, attribute)
         standing = _Standing(fault, device, attribute, value, normal)
@@ -562,7 +562,7 @@ class BusSimulation:
             self._plan(end_s, partial(self._end_one, standing))
 
     def _end_one(self, standing: "_Standing") -> None:
-        """Let the attribute be what the latest of the others that hold it wants, or normal."""
+        """Reset the attribute to the value of the latest remaining fault, or to normal."""
         if standing not in self._standing:  # it was ended before its time
             return
         self._standing.remove(standing)

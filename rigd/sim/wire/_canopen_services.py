@@ -35,7 +35,7 @@ class Emergencies:
     Attributes
     ----------
     active : dict
-        Error codes that stand, and their bits in the error register.
+        Active error codes, and their bits in the error register.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Emergencies:
         self._history.clear()
 
     def report(self, code: int, register: int, vendor: bytes = b"") -> bool:
-        """Note an error and send its message, unless it stands already.
+        """Register an error and send its message, unless it is active already.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Emergencies:
         return True
 
     def clear(self, *codes: int) -> None:
-        """Note that errors are gone, and say so if any of them stood."""
+        """Clear errors, and send a message if any of them was active."""
         gone = [code for code in codes if self.active.pop(code, None) is not None]
         if gone:
             self._transmit(0, b"")
@@ -121,7 +121,7 @@ _TOLERANCE_S = 1e-9
 
 
 class HeartbeatProducer:
-    """Says when the node's own heartbeat is due, by object 1017."""
+    """Determines when the node's own heartbeat is due, by object 1017."""
 
     def __init__(self, objects: ObjectDictionary) -> None:
         self._period_ms = objects.add(0x1017, Entry("H", wrote=self.restart))
@@ -304,7 +304,7 @@ class Pdo:
         self.forget()
 
     def compile(self) -> None:
-        """Get ready to carry what the dictionary says now."""
+        """Rebuild the mapping from the dictionary."""
         slots = self._slots[: self._count.value]
         try:
             self.entries = [self._mapped(slot.value) for slot in slots]
@@ -317,7 +317,7 @@ class Pdo:
         self.forget()
 
     def forget(self) -> None:
-        """Start afresh: nothing has come or gone yet."""
+        """Reset: nothing has been received or sent yet."""
         raise NotImplementedError
 
     @property
@@ -384,7 +384,7 @@ class ReceivePdo(Pdo):
     direction = "r"
 
     def forget(self) -> None:
-        """Drop what has been received."""
+        """Discard the received data."""
         self.pending: bytes | None = None
         self.received_s: float | None = None
         self.applied = False
@@ -411,7 +411,7 @@ class TransmitPdo(Pdo):
     direction = "t"
 
     def compile(self) -> None:
-        """Get ready to carry what the dictionary says now."""
+        """Rebuild the mapping from the dictionary."""
         super().compile()
         self._readers: list[Callable[[], int]] = [entry.live or entry.get for entry in self.entries]
 

@@ -27,8 +27,8 @@ from rigd.sim.wire._canopen_services import (
 from rigd.sim.wire._drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
     NO_MODE,
-    State,
-    StateMachine,
+    PdsState,
+    PdsStateMachine,
     add_drive_objects,
     follow_file,
     peak_per_mille,
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 Log = Callable[..., None]
 
 SYNC_TIMEOUT_PERIODS = 30
-"""After how many periods without a SYNC a drive in operation faults, unless told otherwise: more
-than a host may miss by its profile, and sooner than its heartbeat is given up. Real drives differ
-from 2 upwards."""
+"""Default number of periods without a SYNC after which a drive in operation faults: more than a
+host may miss by its profile, and less than its heartbeat timeout. Real drives differ from 2
+upwards."""
 
 # Error codes of CiA 301 and 402.
 _CONNECTION_ENDED = 0x8100
@@ -100,8 +100,8 @@ class DriveNode:
         After how long without a SYNC a drive in operation faults; by default
         `SYNC_TIMEOUT_PERIODS` of its SYNC period.
     file
-        Device file of the drive it stands for: it has the objects of that one, with types, access
-        rights, limits and values at power-on, and no others.
+        Device file of the drive that it simulates: it has the objects of that one, with types,
+        access rights, limits and values at power-on, and no others.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class DriveNode:
     angle_offset_counts : int
         Added to the position: an encoder that jumped.
     sto_dropped : bool
-        The wired stop is pressed: it takes the torque away at once, and keeps the drive off for as
+        The wired stop is pressed: it removes the torque at once, and the drive stays off for as
         long as it lasts. The drive goes to fault with the profile's ``sto_error_code``, or where
         there is none to switch on disabled.
 
@@ -134,11 +134,11 @@ class DriveNode:
     -----
     A SYNC in NMT operational first lets a waiting RPDO take effect, then calls `advance`, then
     sends the TPDOs. Since the plant's own delay covers the whole way of a torque, a torque that
-    comes in after SYNC k and takes effect at SYNC k + 1 is handed over while the plant still
-    stands at k.
+    comes in after SYNC k and takes effect at SYNC k + 1 is handed over while the plant is still at
+    tick k.
 
-    Before it calls `tick` the owner has to hand over the frames that came before that time, else
-    a pause of the owner looks like a silent host.
+    Before it calls `tick` the owner has to hand over the frames that came before that time, else a
+    pause of the owner appears as a silent host.
     """
 
     def __init__(
@@ -222,7 +222,7 @@ class DriveNode:
             own.negative_limit,
         ):
             entry.wrote = self._refresh_torque
-        self._machine = StateMachine(
+        self._machine = PdsStateMachine(
             own.quick_stop_option,
             own.fault_option,
             entered=self._entered,
@@ -235,7 +235,7 @@ class DriveNode:
         self._compile()
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Take a frame that somebody else sent."""
+        """Receive a frame."""
         if self._nmt is Nmt.INITIALISING:
             self._boot()
         if can_id == self._sync_id:
@@ -270,7 +270,7 @@ class DriveNode:
                     self._transmit(pdo.can_id, data)
 
     def emergency(self, code: int, register: int, vendor: bytes) -> None:
-        """Have the drive fail with an error code, bits of the error register, vendor's bytes."""
+        """Put the drive in fault with an error code, error register bits, and vendor's bytes."""
         self._fail(code, register, vendor)
 
     def reset(self) -> None:
@@ -278,11 +278,11 @@ class DriveNode:
         self._boot()
 
     def power_cycle(self) -> None:
-        """Take its power away and give it back, which makes no difference here."""
+        """Simulate a power cycle, which equals a reset here."""
         self.reset()
 
     def state_object(self, index: int, sub: int, value: int | None) -> None:
-        """Have an object hold another value, or be absent."""
+        """Set an object to another value, or make it absent."""
         self._objects.override(index, sub, value)
 
     @property
@@ -349,7 +349,7 @@ class DriveNode:
 
     def _end_connection(self) -> None:
         """Leave operation before the NMT state changes: no target can come any more."""
-        if self._machine.state is not State.OPERATION_ENABLED:
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         option = self._own.abort_option.value
         if option == 1:
@@ -398,7 +398,7 @@ class DriveNode:
             return
         if len(data) < pdo.size:
             vendor = bytes([len(data), pdo.size])
-            if self._machine.state is State.OPERATION_ENABLED:
+            if self._machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
             else:
                 self._report(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
@@ -440,7 +440,7 @@ class DriveNode:
         self._arm()
 
     def _arm(self) -> None:
-        """Look up which identifier is for whom, and which PDOs go with the SYNC."""
+        """Build the table of identifiers, and the list of synchronous PDOs."""
         self._sync_id = self._own.sync_cob_id.value
         self._sync_length = 1 if self._own.sync_overflow.value else 0
         active = [pdo for pdo in self._receive_pdos if pdo.can_id >= 0]
@@ -465,7 +465,7 @@ class DriveNode:
             if not watch.check(now_s):
                 continue
             option, state = self._own.abort_option.value, self._machine.state
-            if option == 1 and state not in (State.READY, State.SWITCH_ON_DISABLED):
+            if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
                 self._machine.fail()
             elif option == 3:
                 self._machine.quick_stop()
@@ -487,12 +487,12 @@ class DriveNode:
         timeout_s = self._sync_timeout_s or SYNC_TIMEOUT_PERIODS * self._own.sync_period_s
         if now_s - self._last_sync_s > timeout_s + _TOLERANCE_S:
             self._sync_alive = False
-            if self._machine.state is State.OPERATION_ENABLED:
+            if self._machine.state is PdsState.OPERATION_ENABLED:
                 self._fail(_SYNC_LOST, _COMMUNICATION)
                 self._log("sync lost", timeout_s=timeout_s)
 
     def _watch_rpdos(self, now_s: float) -> None:
-        if self._machine.state is not State.OPERATION_ENABLED:
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         for number, pdo in enumerate(self._receive_pdos, 1):
             deadline_s = pdo.deadline_s
@@ -527,8 +527,8 @@ class DriveNode:
             self._own.error_code.value = code
 
     def _clear(self, *codes: int) -> None:
-        """Take errors back whose cause is gone; those of a fault stay until its reset."""
-        if self._machine.state not in (State.FAULT, State.FAULT_REACTION):
+        """Clear errors whose cause is gone; those of a fault stay until its reset."""
+        if self._machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
@@ -548,7 +548,7 @@ class DriveNode:
     def _on_controlword(self) -> None:
         word = self._own.controlword.value
         mask, operate = _OPERATE
-        if self._machine.state is not State.OPERATION_ENABLED or word & mask != operate:
+        if self._machine.state is not PdsState.OPERATION_ENABLED or word & mask != operate:
             self._machine.control(word)
         self._refresh_torque()
 
@@ -558,26 +558,26 @@ class DriveNode:
             self._log("mode", mode=self._mode)
             self._refresh_torque()
 
-    def _entered(self, left: State) -> None:
+    def _entered(self, left: PdsState) -> None:
         state = self._machine.state
-        if left is State.OPERATION_ENABLED:
+        if left is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
             self._limited = self._following = False
             self._log("torque", torque_nm=0.0, enabled=False)
         self._log("state", state=state.label)
-        if state is State.OPERATION_ENABLED:
+        if state is PdsState.OPERATION_ENABLED:
             self._plant.enable()
             self._log("torque", torque_nm=0.0, enabled=True)
             self._refresh_torque()
-        elif left is State.FAULT:
+        elif left is PdsState.FAULT:
             self._own.error_code.value = 0
             standing = {_HEARTBEAT_LOST} if any(watch.lost for watch in self._watches) else set()
             self._emergencies.clear(*(self._emergencies.active.keys() - standing))
 
     def _refresh_torque(self) -> None:
-        """Hand the torque that follows from the dictionary to the plant, if it is another one."""
-        if self._machine.state is not State.OPERATION_ENABLED:
+        """Pass the torque that follows from the dictionary to the plant, if it has changed."""
+        if self._machine.state is not PdsState.OPERATION_ENABLED:
             return
         own = self._own
         self._following = (
@@ -603,20 +603,20 @@ class DriveNode:
     def _statusword(self) -> int:
         state = self._machine.state
         word = state.bits | (_REMOTE if self._sto_dropped else _VOLTAGE_AND_REMOTE)
-        if state is State.OPERATION_ENABLED:
+        if state is PdsState.OPERATION_ENABLED:
             if self._following:
                 word |= 0 if self.never_follows else _FOLLOWS
-            elif self._own.controlword.value & _HALT and self._stands():
+            elif self._own.controlword.value & _HALT and self._is_at_rest():
                 word |= _STANDING
             if self._limited:
                 word |= _INTERNAL_LIMIT
-        elif state is State.QUICK_STOP and self._stands():
+        elif state is PdsState.QUICK_STOP and self._is_at_rest():
             word |= _STANDING
-        if self._emergencies.active and state not in (State.FAULT, State.FAULT_REACTION):
+        if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             word |= _WARNING
         return word
 
-    def _stands(self) -> bool:
+    def _is_at_rest(self) -> bool:
         """Whether the shaft turns by less than a count a second."""
         return abs(self._plant.velocity_rad_s) < self._resolution_rad
 
@@ -627,8 +627,8 @@ class DriveNode:
 
     def _measure_torque(self) -> None:
         elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
-        share = -math.expm1(-elapsed_s / self.torque_lag_s)
-        self._measured_per_mille += share * (self._per_mille - self._measured_per_mille)
+        fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
+        self._measured_per_mille += fraction * (self._per_mille - self._measured_per_mille)
 
     def _actual_torque(self) -> int:
         return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille

@@ -32,8 +32,8 @@ _STAY_IN_QUICK_STOP = 5
 """Values of 605A from this one on keep the drive in quick stop."""
 
 
-class State(Enum):
-    """State of the drive: its name, and bits 0 to 3, 5 and 6 of the statusword."""
+class PdsState(Enum):
+    """State of the power drive system (PDS): name, and bits 0 to 3, 5 and 6 of the statusword."""
 
     NOT_READY = ("not ready to switch on", 0x00)
     SWITCH_ON_DISABLED = ("switch on disabled", 0x40)
@@ -49,11 +49,16 @@ class State(Enum):
         self.bits = bits
 
 
-_POWERED = (State.READY, State.SWITCHED_ON, State.OPERATION_ENABLED, State.QUICK_STOP)
+_POWERED = (
+    PdsState.READY,
+    PdsState.SWITCHED_ON,
+    PdsState.OPERATION_ENABLED,
+    PdsState.QUICK_STOP,
+)
 
 
-class StateMachine:
-    """States and what leads from one to another.
+class PdsStateMachine:
+    """States and transitions of the power drive system.
 
     Parameters
     ----------
@@ -62,15 +67,15 @@ class StateMachine:
     entered
         Called with the state left after each change; `state` is then the new one.
     may_switch_on
-        Asked before the first step up from switch on disabled.
+        Called before the first step up from switch on disabled.
     may_enable
-        Asked before operation is enabled.
+        Called before operation is enabled.
     may_reset
-        Asked at a fault reset, whether no cause of the fault stands.
+        Called at a fault reset; True if no cause of the fault persists.
 
     Attributes
     ----------
-    state : State
+    state : PdsState
         The present one.
     """
 
@@ -78,12 +83,12 @@ class StateMachine:
         self,
         quick_stop_option: Entry,
         fault_option: Entry,
-        entered: Callable[[State], None],
+        entered: Callable[[PdsState], None],
         may_switch_on: Callable[[], bool],
         may_enable: Callable[[], bool],
         may_reset: Callable[[], bool],
     ) -> None:
-        self.state = State.NOT_READY
+        self.state = PdsState.NOT_READY
         self._quick_stop_option = quick_stop_option
         self._fault_option = fault_option
         self._entered = entered
@@ -96,16 +101,16 @@ class StateMachine:
     def start(self) -> None:
         """Go through the self-test after power-on or a reset."""
         self._reset_bit = 0
-        self._enter(State.NOT_READY)
-        self._enter(State.SWITCH_ON_DISABLED)
+        self._enter(PdsState.NOT_READY)
+        self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def control(self, word: int) -> None:
-        """Take a controlword."""
+        """Process a controlword."""
         reset_bit = word & _FAULT_RESET
         rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
-        if self.state is State.FAULT:
+        if self.state is PdsState.FAULT:
             if rising and self._may_reset():
-                self._enter(State.SWITCH_ON_DISABLED)
+                self._enter(PdsState.SWITCH_ON_DISABLED)
         elif not word & _ENABLE_VOLTAGE:
             self.disable_voltage()
         elif not word & _NO_QUICK_STOP:
@@ -118,59 +123,60 @@ class StateMachine:
     def disable_voltage(self) -> None:
         """Switch the power off, whatever is going on; a fault stays one."""
         if self.state in _POWERED:
-            self._enter(State.SWITCH_ON_DISABLED)
+            self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def quick_stop(self) -> None:
         """Stop out of operation; out of the states below it, switch the power off."""
-        if self.state is State.OPERATION_ENABLED and self._quick_stop_option.value:
-            self._enter(State.QUICK_STOP)
-        elif self.state is not State.QUICK_STOP:
+        if self.state is PdsState.OPERATION_ENABLED and self._quick_stop_option.value:
+            self._enter(PdsState.QUICK_STOP)
+        elif self.state is not PdsState.QUICK_STOP:
             self.disable_voltage()
 
     def fail(self) -> None:
         """Go to fault, by the fault reaction."""
-        if self.state in (State.FAULT, State.FAULT_REACTION):
+        if self.state in (PdsState.FAULT, PdsState.FAULT_REACTION):
             return
-        self._enter(State.FAULT_REACTION)
+        self._enter(PdsState.FAULT_REACTION)
         if not self._fault_option.value:
-            self._enter(State.FAULT)
+            self._enter(PdsState.FAULT)
 
     def tick(self, now_s: float) -> None:
         """Complete transitions that take time."""
-        if self.state not in (State.QUICK_STOP, State.FAULT_REACTION):
+        if self.state not in (PdsState.QUICK_STOP, PdsState.FAULT_REACTION):
             return
         if self._ramp_since_s is None:
             self._ramp_since_s = now_s
         if now_s - self._ramp_since_s < RAMP_S:
             return
-        if self.state is State.FAULT_REACTION:
-            self._enter(State.FAULT)
+        if self.state is PdsState.FAULT_REACTION:
+            self._enter(PdsState.FAULT)
         elif self._quick_stop_option.value < _STAY_IN_QUICK_STOP:
-            self._enter(State.SWITCH_ON_DISABLED)
+            self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def _shut_down(self, reset_bit: int) -> None:
-        if self.state is State.SWITCH_ON_DISABLED:
+        if self.state is PdsState.SWITCH_ON_DISABLED:
             if not reset_bit and self._may_switch_on():
-                self._enter(State.READY)
-        elif self.state in (State.SWITCHED_ON, State.OPERATION_ENABLED):
-            self._enter(State.READY)
+                self._enter(PdsState.READY)
+        elif self.state in (PdsState.SWITCHED_ON, PdsState.OPERATION_ENABLED):
+            self._enter(PdsState.READY)
 
     def _switch_on(self, word: int, reset_bit: int) -> None:
         """Switch on, enable operation or disable it; upwards only while bit 7 is 0."""
         enable = word & _ENABLE_OPERATION
-        if self.state is State.OPERATION_ENABLED and not enable:
-            self._enter(State.SWITCHED_ON)
+        if self.state is PdsState.OPERATION_ENABLED and not enable:
+            self._enter(PdsState.SWITCHED_ON)
         if reset_bit:
             return
-        if self.state is State.READY:
-            self._enter(State.SWITCHED_ON)
+        if self.state is PdsState.READY:
+            self._enter(PdsState.SWITCHED_ON)
         stopped = (
-            self.state is State.QUICK_STOP and self._quick_stop_option.value >= _STAY_IN_QUICK_STOP
+            self.state is PdsState.QUICK_STOP
+            and self._quick_stop_option.value >= _STAY_IN_QUICK_STOP
         )
-        if enable and (self.state is State.SWITCHED_ON or stopped) and self._may_enable():
-            self._enter(State.OPERATION_ENABLED)
+        if enable and (self.state is PdsState.SWITCHED_ON or stopped) and self._may_enable():
+            self._enter(PdsState.OPERATION_ENABLED)
 
-    def _enter(self, state: State) -> None:
+    def _enter(self, state: PdsState) -> None:
         left, self.state = self.state, state
         self._ramp_since_s = None
         if left is not state:
@@ -191,7 +197,7 @@ _SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
 _IDENTITY = 0x1018
 _IN_SERVICE = (0x6076, 0x608F, 0x6091)
 """Set when a drive is commissioned for its motor: no file contains it."""
-_NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
+_ZERO_MEANS_UNKNOWN = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 
 _ENCODER_TURNS, _MOST_TURNS = 1000, 1000
@@ -345,11 +351,11 @@ def add_drive_objects(
 
 
 def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
-    """Have the objects that a drive's file has, and their values at power-on.
+    """Use the objects of a drive's file, and their values at power-on.
 
-    What the file does not tell, or cannot, is as without one: rated torque, limits of zero, and
-    identity. A file that does not tell the modes is taken to mean cyclic synchronous torque where
-    it has a target torque.
+    Values that the file does not state are as without one: rated torque, limits of zero, and
+    identity. A file that does not state the modes is taken to mean cyclic synchronous torque if it
+    has a target torque.
 
     Raises
     ------
@@ -360,8 +366,8 @@ def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
     own = set(_IN_SERVICE)
     own |= {
         index
-        for index in (*_NOT_TOLD_BY_ZERO, _SUPPORTED_INDEX)
-        if (said := file.entries.get((index, 0))) is not None and not said.default
+        for index in (*_ZERO_MEANS_UNKNOWN, _SUPPORTED_INDEX)
+        if (described := file.entries.get((index, 0))) is not None and not described.default
     }
     if not any(file.entries[key].default for key in file.entries if key[0] == _IDENTITY and key[1]):
         own.add(_IDENTITY)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rigd.devices.contracts import DeviceError
-from rigd.devices.obstacles import Encounter, ObstacleError, parse_obstacle
+from rigd.devices.obstacles import Disturbance, ObstacleError, parse_obstacle
 from rigd.errors import UserError
 
 
@@ -30,15 +30,15 @@ Deliver = Callable[[int, bytes, object], None]
 """Takes identifier, data and origin of what gets through."""
 
 SERIAL = -1
-"""Stands for the identifier of what a serial line carries."""
+"""Pseudo-identifier of the data on a serial line."""
 
 
 class FaultError(WrongUseError):
-    """A fault is not written as it should be, or this rig cannot have it; the message says why."""
+    """A fault has a syntax error, or is not possible on this rig; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Key:
+class _FaultKey:
     """Values that a key may have, and its default."""
 
     read: Callable[[str], Value]
@@ -47,33 +47,33 @@ class _Key:
     needed: bool = False
 
 
-def _whole(low: int, high: int, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _whole(low: int, high: int, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> int:
         number = int(text, 0)
         if not low <= number <= high:
             raise ValueError(text)
         return number
 
-    return _Key(read, f"a whole number from {low} to {high}", **how)
+    return _FaultKey(read, f"a whole number from {low} to {high}", **how)
 
 
-def _positive(**how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _positive(**how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> float:
         number = float(text)
         if not 0 < number <= _LONGEST_S:
             raise ValueError(text)
         return number
 
-    return _Key(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
+    return _FaultKey(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
 
 
-def _one_of(*choices: str, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+def _one_of(*choices: str, **how: Any) -> _FaultKey:  # noqa: ANN401 - passed on
     def read(text: str) -> str:
         if text not in choices:
             raise ValueError(text)
         return text
 
-    return _Key(read, " or ".join(choices), **how)
+    return _FaultKey(read, " or ".join(choices), **how)
 
 
 _LONGEST_S = 1e6
@@ -86,11 +86,11 @@ _SENDER = {
 _DEVICE = _one_of("drive", "sensor", needed=True)
 _FOR = _positive()
 
-_TEXT = _Key(str, "a value")
-_FOUND = _Key(str, "a value", needed=True)
+_TEXT = _FaultKey(str, "a value")
+_FOUND = _FaultKey(str, "a value", needed=True)
 
 LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
-KINDS: dict[str, dict[str, _Key]] = {
+KINDS: dict[str, dict[str, _FaultKey]] = {
     "drop": _SENDER | {"bytes": _whole(1, _MOST)},
     "delay": _SENDER | {"ms": _positive(needed=True)},
     "corrupt": _SENDER | {"byte": _whole(0, 255, default=0)},
@@ -123,8 +123,8 @@ KINDS: dict[str, dict[str, _Key]] = {
 _MOMENTARY = ("emcy", "jump", "restart", "power_cycle", "object", "knock")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """Kinds that last until they end by themselves or are ended."""
-ENCOUNTERS = ("obstacle", "knock")
-"""Kinds that the beam meets; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
+DISTURBANCES = ("obstacle", "knock")
+"""Kinds that disturb the beam; their keys are those of `rigd.devices.obstacles.parse_obstacle`."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
@@ -139,7 +139,7 @@ class Fault:
     """Time after the drive was first enabled; None: at once."""
 
     @property
-    def stands(self) -> bool:
+    def is_persistent(self) -> bool:
         """Whether it lasts until it is ended, neither by a time nor by a number of frames."""
         return self.kind in LASTING and self.kind not in LINE_KINDS and "for" not in self.values
 
@@ -156,7 +156,7 @@ def parse_fault(spec: str) -> Fault:
     Raises
     ------
     FaultError
-        Naming the word that is wrong and what may stand in its place.
+        If a word is wrong; the message states what is allowed.
 
     Examples
     --------
@@ -175,7 +175,7 @@ def parse_fault(spec: str) -> Fault:
         if key not in keys:
             raise FaultError(_complaint(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}"))
         if key in values:
-            raise FaultError(_complaint(spec, f"'{key}' stands twice"))
+            raise FaultError(_complaint(spec, f"'{key}' is given twice"))
         try:
             values[key] = keys[key].read(text)
         except ValueError:
@@ -188,21 +188,21 @@ def parse_fault(spec: str) -> Fault:
         if key_of.default is not None and not (name == "frames" and "bytes" in values):
             values.setdefault(name, key_of.default)
     fault = Fault(kind, values, _time(spec, time) if at else None)
-    if kind in ENCOUNTERS:
+    if kind in DISTURBANCES:
         try:
-            encounter_of(fault, 0.0)
+            disturbance_of(fault, 0.0)
         except ObstacleError as error:
             raise FaultError(_complaint(spec, str(error).partition(": ")[2].rstrip("."))) from None
     return fault
 
 
-def encounter_of(fault: Fault, now_s: float) -> Encounter:
+def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     """Return the obstacle or knock that a fault puts in the beam's way from now on.
 
     Parameters
     ----------
     fault
-        One of the `ENCOUNTERS`.
+        One of the `DISTURBANCES`.
     now_s
         Time since the drive was first enabled.
     """
@@ -258,19 +258,19 @@ class _Active:
         return self.kind != "corrupt" or self.byte < len(data)
 
 
-class Line:
-    """The way of one sender's frames to everybody else, with the faults on it.
+class FaultyLine:
+    """Line from one sender to all others, with the faults on it.
 
     Parameters
     ----------
     sender
         Sender of the frames, for the log.
     deliver
-        Takes what gets through.
+        Receives the frames that pass.
     postpone
         Calls something after so many seconds.
     log
-        Told of each frame that a fault hits.
+        Called for each frame that a fault hits.
     """
 
     def __init__(
@@ -297,13 +297,13 @@ class Line:
         self._active.append(_Active(fault))
 
     def end(self, kind: str | None) -> list[str]:
-        """Let the faults of a kind, or all, act no more; return the kinds of those that did."""
+        """End the faults of a kind, or all; return the kinds of those that were active."""
         over = [fault for fault in self._active if kind in (None, fault.kind)]
         self._active = [fault for fault in self._active if fault not in over]
         return [fault.kind for fault in over]
 
     def send(self, can_id: int, data: bytes, origin: object = None) -> None:
-        """Let a frame, or a record of a serial line, go the way of this line."""
+        """Send a frame, or a record of a serial line, over this line."""
         if not self._active and not self._held:
             self._deliver(can_id, data, origin)
             return
@@ -342,7 +342,7 @@ class Line:
 
 _FLUSH_S = 0.2
 _SILENT = ("torque", "sdo write", *LINE_KINDS)
-"""Events that happen too often to be told on the terminal."""
+"""Events too frequent to be shown on the terminal."""
 
 
 class EventLog:
@@ -353,7 +353,7 @@ class EventLog:
     path
         Path of the new file of JSON lines; None for none.
     quiet
-        Tell nothing on the terminal.
+        Whether nothing is shown on the terminal.
 
     Attributes
     ----------
@@ -384,10 +384,10 @@ class EventLog:
             # States and faults must be in the file even if the process is killed.
             self._write_out()
             details = "  ".join(f"{key} {value}" for key, value in values.items())
-            self.tell(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
+            self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
 
-    def tell(self, line: str) -> None:
-        """Tell the operator; a terminal that has gone is none of our business."""
+    def print_line(self, line: str) -> None:
+        """Print a line for the operator; ignore a closed terminal."""
         if not self._quiet:
             with suppress(OSError, ValueError):
                 sys.stdout.write(f"{line}\n")
@@ -423,7 +423,7 @@ class EventLog:
             action(self._file)
         except OSError as error:
             self.close()
-            self.tell(f"The log cannot be written any more ({error.strerror}).")
+            self.print_line(f"The log cannot be written any more ({error.strerror}).")
 
 
 def _new_file(path: Path) -> TextIO:

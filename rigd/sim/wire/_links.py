@@ -71,8 +71,8 @@ _LINK_HEADER = struct.Struct("=BxHiII")
 _VIRTUAL_KINDS = ("vcan", "vxcan")
 
 
-class _Client:
-    """One connection: what has come of an unfinished frame, and what has not gone of one."""
+class _LinkConnection:
+    """One connection, with its incomplete received frame and its unsent bytes."""
 
     def __init__(self, link: socket.socket, number: int) -> None:
         self.link = link
@@ -89,11 +89,11 @@ class VirtualBus:
     path
         Path of the socket.
     handlers
-        Handlers of the event loop, by file descriptor; kept up to date.
+        Handlers of the event loop, by file descriptor; updated here.
     on_frames
         Gets what a client sends.
     on_clients
-        Told when a client has come or gone, and how many there are.
+        Called when a client connects or disconnects, with their number.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class VirtualBus:
         self._handlers = handlers
         self._on_frames = on_frames
         self._on_clients = on_clients
-        self._clients: list[_Client] = []
+        self._clients: list[_LinkConnection] = []
         self._count = 0
         self.lost = 0
         self._path = path
@@ -148,12 +148,12 @@ class VirtualBus:
             link.setblocking(False)
             link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
             self._count += 1
-            client = _Client(link, self._count)
+            client = _LinkConnection(link, self._count)
             self._clients.append(client)
             self._handlers[link.fileno()] = lambda: self._receive(client)
             self._on_clients(f"client {client.number} connected", len(self._clients))
 
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: _LinkConnection) -> None:
         try:
             fresh = client.link.recv(_READ_BYTES)
         except BlockingIOError:
@@ -168,7 +168,7 @@ class VirtualBus:
         client.received = data[whole:]
         self._on_frames([data[i : i + FRAME_SIZE] for i in range(0, whole, FRAME_SIZE)], client)
 
-    def _send(self, client: _Client, frame: bytes) -> None:
+    def _send(self, client: _LinkConnection, frame: bytes) -> None:
         # The rest of a frame has to go before the next one, or all later ones are torn.
         if client.unsent:
             client.unsent = client.unsent[_offer(client.link, client.unsent) :]
@@ -181,7 +181,7 @@ class VirtualBus:
         elif sent < len(frame):
             client.unsent = frame[sent:]
 
-    def _drop(self, client: _Client) -> None:
+    def _drop(self, client: _LinkConnection) -> None:
         if client in self._clients:
             self._clients.remove(client)
             del self._handlers[client.link.fileno()]
@@ -264,7 +264,7 @@ class VirtualCan:
 
 
 def listen(path: Path) -> socket.socket:
-    """Return a listening Unix socket; what a dead process left in its place goes.
+    """Return a listening Unix socket; remove one that a dead process has left.
 
     Raises
     ------
@@ -301,16 +301,16 @@ def is_virtual(channel: str) -> bool:
         return True
     raise DeviceError(
         f"CAN bus {channel}: this is not a virtual bus here, and a simulated drive must not answer "
-        "beside real ones; simulate with a copy of the profile that has another name and another "
-        "can.channel."
+        "together with real ones; simulate with a copy of the profile that has another name and "
+        "another can.channel."
     )
 
 
 def interface_kind(name: str) -> str:
     """Return what the kernel calls the kind of a network interface; empty for hardware.
 
-    A serial CAN adapter stands among the virtual devices of ``/sys`` too, so only the kernel's own
-    word counts (``IFLA_INFO_KIND``).
+    A serial CAN adapter is also among the virtual devices of ``/sys``, so only the kernel's own
+    attribute counts (``IFLA_INFO_KIND``).
     """
     try:
         index = socket.if_nametoindex(name)
@@ -325,7 +325,7 @@ def interface_kind(name: str) -> str:
 
 
 def kind_in_reply(reply: bytes) -> str:
-    """Return the kind of interface that a message RTM_NEWLINK tells of."""
+    """Return the kind of interface in a message RTM_NEWLINK."""
     if len(reply) < 32 or struct.unpack_from("=H", reply, 4)[0] != _RTM_NEWLINK:
         return ""
     length = struct.unpack_from("=I", reply)[0]
@@ -364,17 +364,17 @@ _LINE_BYTES = 4096
 class PtyLine:
     """The sensor's end of a serial line.
 
-    While the other end is not open, what is sent is lost, as on a real line. A terminal with
-    a closed end is always "readable", so it is looked at from time to time instead.
+    While the other end is not open, what is sent is lost, as on a real line. A terminal with a
+    closed end is always "readable", so it is polled from time to time instead.
 
     Parameters
     ----------
     handlers
-        Handlers of the event loop, by file descriptor; kept up to date.
+        Handlers of the event loop, by file descriptor; updated here.
     on_bytes
         Gets what the host sends.
     on_open
-        Told when the host opens the port, and when it closes it.
+        Called when the host opens the port, and when it closes it.
 
     Attributes
     ----------
@@ -413,8 +413,8 @@ class PtyLine:
                 sent = os.write(self._ours, data)
             self.lost += len(data) - sent
 
-    def look(self) -> None:
-        """Find out whether the host has opened the port meanwhile."""
+    def poll(self) -> None:
+        """Check whether the host has opened or closed the port."""
         if not self._open and self._ours >= 0:
             self._receive()
 

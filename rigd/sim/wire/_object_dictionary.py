@@ -19,7 +19,7 @@ _LONGEST_TEXT = 1024
 
 
 class AbortCode(IntEnum):
-    """Why an SDO access failed, as the node tells its client."""
+    """SDO abort codes: why an access failed."""
 
     TOGGLE = 0x0503_0000
     COMMAND = 0x0504_0001
@@ -66,7 +66,7 @@ class Description:
     fixed: bool = False
 
     def entry(self) -> "Entry":
-        """Return an entry that keeps what is written to it, and has no other meaning."""
+        """Return an entry that stores what is written to it, and has no other function."""
         return Entry(
             self.kind,
             self.default or 0,
@@ -131,22 +131,22 @@ class Entry:
         self.default_text = self.text
         self._set_range(self.low, self.high)
 
-    def become(self, said: Description, default: int | None) -> None:
-        """Take type, access, mapping and limits that a file states; the meaning stays.
+    def become(self, described: Description, default: int | None) -> None:
+        """Adopt type, access, mapping and limits of a file; the function stays.
 
         Parameters
         ----------
-        said
+        described
             Entry of the file, a number as this one is.
         default
             Value at power-on from now on; None leaves it as it is.
         """
-        if self.live is not None and said.kind != self.kind:
-            self.live = partial(_within, self.live, *_range_of(said.kind))
-        self.kind, self.access, self.mapping = said.kind, said.access, said.mapping
+        if self.live is not None and described.kind != self.kind:
+            self.live = partial(_within, self.live, *_range_of(described.kind))
+        self.kind, self.access, self.mapping = described.kind, described.access, described.mapping
         # What the drive here can do bounds it as well.
-        low = max((x for x in (self.low, said.low) if x is not None), default=None)
-        high = min((x for x in (self.high, said.high) if x is not None), default=None)
+        low = max((x for x in (self.low, described.low) if x is not None), default=None)
+        high = min((x for x in (self.high, described.high) if x is not None), default=None)
         self._set_range(low, high)
         if default is not None:
             self.default = default
@@ -191,7 +191,7 @@ class Entry:
         self.value = value
 
     def reset(self) -> None:
-        """Go back to what stands here at power-on."""
+        """Restore the value at power-on."""
         self.value = self.default
         self.text = self.default_text
 
@@ -252,7 +252,7 @@ class ObjectDictionary:
             self.add(index, entry, sub)
 
     def follow(self, file: Mapping[tuple[int, int], Description], own: Container[int]) -> None:
-        """Have what a device's file has, and nothing else.
+        """Adopt the entries of a device's file, and no others.
 
         Entries keep their meaning where the file has them as numbers of any type; the others of
         the file are storage.
@@ -266,16 +266,16 @@ class ObjectDictionary:
         """
         before, self._entries = self._entries, {}
         self._indices.clear()
-        for (index, sub), said in file.items():
+        for (index, sub), described in file.items():
             entry = before.get((index, sub))
-            if entry is None or "s" in (entry.kind, said.kind):
-                entry = said.entry()
+            if entry is None or "s" in (entry.kind, described.kind):
+                entry = described.entry()
             else:
-                entry.become(said, None if index in own else said.default)
+                entry.become(described, None if index in own else described.default)
             self.add(index, entry, sub)
 
     def override(self, index: int, sub: int, value: int | None) -> None:
-        """Have an entry hold another value from now on, or be absent; one that is not is added."""
+        """Override the value of an entry, or make it absent; add it if it is missing."""
         if value is None:
             self._entries.pop((index, sub), None)
             return
@@ -298,7 +298,7 @@ class ObjectDictionary:
         raise Abort(AbortCode.NO_SUB_INDEX if index in self._indices else AbortCode.NO_OBJECT)
 
     def read(self, index: int, sub: int) -> bytes:
-        """Return what a client reads.
+        """Return the value that a client reads.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class ObjectDictionary:
         return entry
 
     def write(self, index: int, sub: int, data: bytes) -> int | str:
-        """Take what a client writes, and return it as a number or, bytes, in hexadecimal.
+        """Write a client's value, and return it as a number or, if bytes, in hexadecimal.
 
         Raises
         ------
@@ -393,7 +393,7 @@ class SdoServer:
         self._toggle = 0
 
     def receive(self, data: bytes) -> None:
-        """Take a request; what does not have eight bytes is none."""
+        """Process a request; ignore one that does not have eight bytes."""
         if len(data) != 8:
             return
         specifier = data[0] >> 5
@@ -442,7 +442,7 @@ class SdoServer:
         self._reply(_HEAD.pack(0x41, self._index, self._sub) + size.to_bytes(4, "little"))
 
     def _go_on(self, specifier: int, data: bytes) -> None:
-        """Take or give the next segment."""
+        """Receive or send the next segment."""
         command = data[0]
         if specifier != self._awaited:
             raise Abort(AbortCode.COMMAND)
@@ -479,7 +479,7 @@ _WATCHED, _ONE_NODE = 0x1016, 0x1_0000
 
 _BOOLEAN: Final = 0x01
 _KINDS: Final = {
-    0x00: "I",  # where no type is told
+    0x00: "I",  # if no type is stated
     _BOOLEAN: "B",
     0x02: "b",
     0x03: "h",
@@ -490,7 +490,7 @@ _KINDS: Final = {
     0x15: "q",
     0x1B: "Q",
 }
-"""Letters of :mod:`struct` for the numbers of CiA 301; the rest is kept as bytes."""
+"""Letters of :mod:`struct` for the numbers of CiA 301; the rest is stored as bytes."""
 _TIMES: Final = {0x0C: 6, 0x0D: 6}
 """Bytes of time of day and of time difference."""
 _SDO_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
@@ -535,21 +535,21 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
         key: _described(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
     }
     for sub, number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
-        said = entries.get((_IDENTITY, sub))
-        if said is not None and not said.default:
-            entries[_IDENTITY, sub] = replace(said, default=number)
+        described = entries.get((_IDENTITY, sub))
+        if described is not None and not described.default:
+            entries[_IDENTITY, sub] = replace(described, default=number)
     highest: dict[int, int] = {}
     for index, sub in entries:
         highest[index] = max(sub, highest.get(index, 0))
     for index, last in highest.items():
-        said = entries.get((index, 0))
-        if last and said is not None and said.default is None and said.kind == "B":
-            entries[index, 0] = replace(said, default=last)
+        described = entries.get((index, 0))
+        if last and described is not None and described.default is None and described.kind == "B":
+            entries[index, 0] = replace(described, default=last)
     return DeviceFile(path.name, entries)
 
 
 def _described(entry: EdsEntry) -> Description:
-    """Return what the file says of an object, in the terms of a simulated node."""
+    """Return the file's description of an object, in the terms of a simulated node."""
     access = _SDO_ACCESS.get(entry.access, entry.access)
     kind = _KINDS.get(entry.data_type)
     if kind is None:
@@ -576,7 +576,7 @@ def _fitted(value: int, kind: str) -> int:
 
 
 def _bytes(entry: EdsEntry, size: int) -> bytes:
-    """Return the default of what is kept as bytes, of a given size or, for 0, of its own."""
+    """Return the default of an entry stored as bytes, of a given size or, for 0, of its own."""
     data = entry.content
     if entry.default is not None and size:
         data = (entry.default & (1 << 8 * size) - 1).to_bytes(size, "little")

@@ -67,7 +67,7 @@ _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def only_one(rig_name: str) -> Iterator[None]:
-    """Refuse to start beside another simulated rig of the same name."""
+    """Raise if another simulated rig of the same name runs."""
     folder = runtime_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -105,7 +105,7 @@ def socket_folder(rig_name: str) -> Iterator[Path]:
 
 @contextmanager
 def stop_requested() -> Iterator[Callable[[], bool]]:
-    """Say whether one of the signals that end the process has come; one ignored before stays so."""
+    """Yield whether a signal to end the process has arrived; ignored ones stay ignored."""
     requested: list[int] = []
     before = {number: signal.getsignal(number) for number in _STOPPING}
     caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
@@ -134,7 +134,7 @@ class ControlSocket:
     path
         Path of the Unix socket.
     handlers
-        Handlers of the event loop, by file descriptor; kept up to date.
+        Handlers of the event loop, by file descriptor; updated here.
     answer
         Takes a request, returns the reply.
     """
@@ -148,7 +148,7 @@ class ControlSocket:
         handlers[self._listener.fileno()] = self._accept
 
     def close(self) -> None:
-        """Answer no more."""
+        """Close the socket."""
         for link in list(self._links):
             self._drop(link)
         del self._handlers[self._listener.fileno()]
@@ -210,13 +210,13 @@ class SimulatorOptions:
     faults: tuple[Fault, ...] = ()
     """Faults to inject."""
     quiet: bool = False
-    """Tell nothing on the terminal."""
+    """Whether nothing is shown on the terminal."""
     eds: Path | None = None
     """The manufacturer's file of the drive that is simulated; by default the profile's, if any."""
 
 
 def check_on_wire(rig: RigParameters) -> None:
-    """Refuse a rig of which there is nothing to put on the wire.
+    """Raise if a rig has nothing that can be simulated on the wire.
 
     Raises
     ------
@@ -232,14 +232,14 @@ def check_on_wire(rig: RigParameters) -> None:
 
 
 def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
-    """Run the simulated rig that stands in for a profile's, until a signal ends it.
+    """Run the simulated rig that replaces a profile's hardware, until a signal ends it.
 
     Parameters
     ----------
     rig
         Parameters of the rig.
     options
-        How it is simulated, and what it tells.
+        Options of the simulation and of its output.
 
     Returns
     -------
@@ -286,15 +286,14 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     Returns
     -------
     list of str
-        The faults as it understood them, and how to end one that lasts; without any, lines on how
-        it stands.
+        The faults as parsed, and how to end one that lasts; without any, lines on its state.
 
     Raises
     ------
     DeviceError
         If no simulated rig of that name runs, or it refuses.
     WrongUseError
-        If a fault is not written as it should be; then none is injected.
+        If a fault has a syntax error; then none is injected.
     """
     address = find_simulator(rig_name)
     if address is None:
@@ -311,7 +310,7 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     for fault, spec in zip(faults, specs, strict=True):
         injected = str(ask_simulator(address, {"inject": spec})["injected"])
         end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
-        lines.append(f"{injected}; it lasts until: {end}" if fault.stands else injected)
+        lines.append(f"{injected}; it lasts until: {end}" if fault.is_persistent else injected)
     return lines
 
 
@@ -365,7 +364,7 @@ class _Process:
         )
 
     def start(self) -> None:
-        """Let the faults in that are there from the start, and say where the rig is."""
+        """Inject the initial faults, and print the addresses of the rig."""
         for fault in self._options.faults:
             self._world.inject(fault)
         started = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
@@ -378,10 +377,10 @@ class _Process:
             **started,
         )
         for line in self._invitation():
-            self._log.tell(line)
+            self._log.print_line(line)
         announce(self._rig.name, self._address)
         self._stack.callback(forget, self._rig.name)
-        # Set-up leaves objects that never go: no need to look through them again and again.
+        # Set-up leaves objects that are never freed: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -393,10 +392,10 @@ class _Process:
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Serve until a stop is asked for."""
+        """Serve until a stop is requested."""
         handlers, world, line, log = self._handlers, self._world, self._line, self._log
         now_ns = time.monotonic_ns
-        look_ns = 0
+        poll_ns = 0
         while not stop():
             ready, _, _ = select.select(handlers, (), (), world.wait_s(now_ns(), _IDLE_S))
             for descriptor in ready:
@@ -405,11 +404,11 @@ class _Process:
                     handler()
             now = now_ns()
             world.elapse(now)
-            if now > look_ns:
-                look_ns = now + round(_IDLE_S * 1e9)
+            if now > poll_ns:
+                poll_ns = now + round(_IDLE_S * 1e9)
                 log.flush()
                 if line is not None:
-                    line.look()
+                    line.poll()
         self._log("simulator", "ended")
 
     def _make_world(self) -> BusSimulation:
@@ -458,8 +457,8 @@ class _Process:
         if drive.own_watchdog_s:
             return drive.own_watchdog_s
         if self._file is not None and (0x1006, 0) not in self._file.entries:
-            return math.inf  # it is not told when to expect one
-        # How long others bear it is not known: as long as its heartbeat may stay away.
+            return math.inf  # no period is configured
+        # The tolerance of others is not known: use the heartbeat timeout.
         return drive.heartbeat_timeout_s
 
     def _invitation(self) -> Iterator[str]:
@@ -548,4 +547,4 @@ class _Process:
 
 
 def _nowhere(data: bytes) -> None:
-    """Take what a rig without a serial line never writes."""
+    """Discard output; a rig without a serial line writes none."""

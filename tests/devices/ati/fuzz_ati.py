@@ -237,7 +237,7 @@ def fuzz_modbus(n, seed):
             del reply[rng.randrange(len(reply) + 1) :]
         try:
             content = protocol.content_of(request, bytes(reply))
-        except (protocol.BadReply, protocol.Refused):
+        except (protocol.BadReply, protocol.ExceptionResponse):
             content = None
         if content is not None:
             taken += 1

@@ -70,14 +70,14 @@ def reply_to_status(fakes, body):
     ("code", "words"), [(1, "function"), (2, "no such register"), (4, "failed"), (99, "code 99")]
 )
 def test_a_refusal_is_told_in_words(fakes, code, words):
-    with pytest.raises(protocol.Refused, match=words):
+    with pytest.raises(protocol.ExceptionResponse, match=words):
         reply_to_status(fakes, bytes((0x0A, 0x83, code)))
 
 
 def test_a_declined_start_and_lock_are_refusals(fakes):
     for request in (protocol.START_STREAMING, protocol.UNLOCK):
         body = request[:2] + b"\x00"
-        with pytest.raises(protocol.Refused, match="code 0"):
+        with pytest.raises(protocol.ExceptionResponse, match="code 0"):
             protocol.content_of(request, body + fakes.crc_bitwise(body))
 
 

@@ -510,7 +510,7 @@ def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, monkeypa
         return really_select(*descriptors)
 
     monkeypatch.setattr(select, "select", babble)
-    assert "goes on sending" in refusal(open_sensor())
+    assert "continues to send" in refusal(open_sensor())
     monkeypatch.undo()
     digital_ft.deaf_to_jam = False
 

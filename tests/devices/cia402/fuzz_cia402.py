@@ -106,7 +106,7 @@ def fuzz(rig, frames, seed=1):
             assert not drive._enabled
             # As after the operator's reset.
             drive._inbox.clear()
-            drive._inbox.watching = drive._inbox.heard = True
+            drive._inbox.watching = drive._inbox.received = True
             drive._may_be_on = False
     drive.disable()
     return ends

@@ -142,7 +142,7 @@ def connect(make_drive, rig):
     def connect(rig=rig):
         drive = make_drive(rig)
         drive.connect()
-        return drive.outfit()
+        return drive.capabilities()
 
     return connect
 
@@ -200,9 +200,9 @@ def test_limits_that_are_read_only_as_elmos(node, connect, rig):
         entry = node.object_dictionary[index]
         node.sdo[index].raw = 50_000
         entry.access_type = "ro"
-    outfit = connect()
-    assert outfit.has(0x60E0)
-    assert outfit.accepted == ()
+    capabilities = connect()
+    assert capabilities.has(0x60E0)
+    assert capabilities.accepted == ()
 
 
 def test_a_limit_that_is_read_only_and_too_low(node, connect, rig):
@@ -223,10 +223,10 @@ def test_objects_that_are_missing_as_maxons(node, connect, rig):
     settings = replace(
         rig.cia402, accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",)
     )
-    outfit = connect(replace(rig, cia402=settings))
+    capabilities = connect(replace(rig, cia402=settings))
     assert node.get_data(0x3001, 2).hex(" ") == "c4 09 00 00"
-    assert {row.place for row in outfit.lacks} >= {"6072", "1006"}
-    assert outfit.accepted == ("torque_limit",)
+    assert {row.address for row in capabilities.lacks} >= {"6072", "1006"}
+    assert capabilities.accepted == ("torque_limit",)
     assert node.get_data(0x1A00, 0) == b"\x03"
 
 

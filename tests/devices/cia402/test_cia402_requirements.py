@@ -10,8 +10,8 @@ from rigd.devices.cia402.requirements import (
     CORE,
     OPTIONAL,
     REQUIREMENTS,
-    Access,
-    Fit,
+    AllowedValue,
+    ObjectAccess,
     requirement,
 )
 
@@ -24,14 +24,14 @@ def test_each_object_stands_there_once():
 def test_what_is_core_is_refused_and_says_why():
     for each in CORE:
         assert each.core
-        assert each.place in each.missing(ACCEPTABLE)
+        assert each.address in each.missing(ACCEPTABLE)
         assert each.sentence.endswith(".")
 
 
 def test_what_is_optional_has_a_stand_in_or_has_to_be_accepted_by_name():
     for each in OPTIONAL:
         assert not each.core
-        assert each.stand_in or each.accept, each.place
+        assert each.stand_in or each.accept, each.address
         assert each.accept in ("", *ACCEPTABLE)
         assert each.missing(ACCEPTABLE) == ""
         assert bool(each.missing()) == bool(each.accept)
@@ -50,10 +50,10 @@ def test_a_refusal_names_the_way_to_accept_it(name):
 
 
 def test_what_an_object_may_hold_that_cannot_be_written():
-    assert Fit.AT_LEAST.allows(50_000, 1800)
-    assert not Fit.AT_LEAST.allows(1799, 1800)
-    assert not Fit.EQUAL.allows(50_000, 1800)
-    assert Fit.ANY.allows(0, 1)
+    assert AllowedValue.AT_LEAST.allows(50_000, 1800)
+    assert not AllowedValue.AT_LEAST.allows(1799, 1800)
+    assert not AllowedValue.EQUAL.allows(50_000, 1800)
+    assert AllowedValue.ANY.allows(0, 1)
 
 
 def test_the_table_loads_no_library():
@@ -68,8 +68,8 @@ def test_the_table_loads_no_library():
 def test_what_is_mapped_is_what_the_pdos_carry():
     from rigd.devices.cia402 import objects
 
-    sent = {each.index for each in REQUIREMENTS if Access.SENT in each.access}
-    received = {each.index for each in REQUIREMENTS if Access.RECEIVED in each.access}
+    sent = {each.index for each in REQUIREMENTS if ObjectAccess.SENT in each.access}
+    received = {each.index for each in REQUIREMENTS if ObjectAccess.RECEIVED in each.access}
     assert sent == {entry >> 16 for entry in objects.TPDO_ENTRIES}
     assert received == {entry >> 16 for entry in objects.RPDO_ENTRIES}
     assert requirement(0x6072).accept == "torque_limit"

@@ -463,7 +463,9 @@ def test_a_drive_with_its_sto_open_is_not_said_to_be_ready(drive, scripted):
 def test_a_fault_that_comes_back_when_it_is_told_to_get_ready(drive, scripted):
     scripted.on_ready = "fault"
     scripted.objects[0x603F, 0] = 0x3220
-    with pytest.raises(DeviceError, match=r"told to get ready it went to fault: under-voltage"):
+    with pytest.raises(
+        DeviceError, match=r"commanded to get ready it went to fault: under-voltage"
+    ):
         drive.reset_fault()
 
 
@@ -498,7 +500,7 @@ def test_no_drive_on_the_bus(drive, scripted):
 
 def test_others_on_the_bus_are_named(make_drive, rig, settings, scripted):
     drive = make_drive(replace(rig, cia402=replace(settings, node_id=6)))
-    with pytest.raises(DeviceError, match=r"node 6.*heard of node 5"):
+    with pytest.raises(DeviceError, match=r"node 6.*frames came from node 5"):
         threading.Timer(0.2, scripted.heartbeat).start()
         drive.connect()
 

@@ -54,7 +54,7 @@ def test_a_complete_drive_fits(judged, rig):
     for judgement in (judged(COMPLETE), judged(COMPLETE, rig())):
         assert judgement.refusals == ()
         grades = {f.what: f.grade for f in judgement.findings}
-        assert set(grades.values()) == {Grade.FITS, Grade.STANDS_IN}
+        assert set(grades.values()) == {Grade.FITS, Grade.SUBSTITUTED}
         # Every object of the table is told of, but for the identity and what is told in words.
         assert len(grades) == len(CORE) + len(OPTIONAL) - 4 + 5
 
@@ -92,16 +92,16 @@ def test_what_the_two_real_drives_lack(rig):
     assert 'cia402.accept_without = ["torque_limit"]' in refusal
     accepted = by_place(judge(epos, rig(accept_without=("torque_limit",))))
     assert accepted["6072"].grade is Grade.ACCEPTED
-    assert accepted["1006"].grade is Grade.STANDS_IN
+    assert accepted["1006"].grade is Grade.SUBSTITUTED
     assert not [f for f in accepted.values() if f.grade is Grade.REFUSED]
 
 
-@pytest.mark.parametrize("needed", CORE, ids=lambda needed: needed.place)
+@pytest.mark.parametrize("needed", CORE, ids=lambda needed: needed.address)
 def test_what_is_core_and_missing_is_refused_by_its_name(judged, needed):
     place = f"{needed.index:04X}:{needed.sub}"
-    found = judged(without(place if f"{place} " in COMPLETE else needed.place))
+    found = judged(without(place if f"{place} " in COMPLETE else needed.address))
     (refusal,) = found.refusals
-    assert needed.place in refusal
+    assert needed.address in refusal
     if needed.index == 0x6502:
         assert refusal == "No cyclic synchronous torque mode: object 6502 is missing."
     else:
@@ -208,7 +208,7 @@ def test_no_watchdog_goes_missing_silently(judged, rig):
         (bare, {"own_watchdog_s": 0.1}, "own watchdog"),
     ):
         stands = by_place(judged(table, rig(**values)))["watchdog"]
-        assert stands.grade is Grade.STANDS_IN
+        assert stands.grade is Grade.SUBSTITUTED
         assert words in stands.found
     # What the drive does on a lost connection is then its maker's choice anyway.
     for values in ({"own_watchdog_s": 0.1}, {"accept_without": ("watchdog",)}):
@@ -273,7 +273,7 @@ def test_each_sentence_names_its_object_and_ends(judged):
         assert finding.sentence == "" or finding.sentence.endswith(".")
         assert bool(finding.sentence) or finding.grade in (
             Grade.FITS,
-            Grade.STANDS_IN,
+            Grade.SUBSTITUTED,
             Grade.ASK,
         )
     assert requirement(0x6071).name in " ".join(judgement.refusals)

@@ -124,7 +124,7 @@ def test_anything_else_is_refused_with_a_sentence(text):
         ("drop,from=drive,colour=red", "drop has no 'colour'; choose from, id, frames, bytes"),
         ("drop,from=drive,frames=0", "frames=0: give a whole number from 1"),
         ("drop,from=drive,id=0x800", "id=0x800: give a whole number from 0 to 2047"),
-        ("drop,from=drive,from=host", "'from' stands twice"),
+        ("drop,from=drive,from=host", "'from' is given twice"),
         ("drop,from=sensor,frames=2,bytes=3", "give frames or bytes, not both"),
         ("delay,from=drive", "delay needs ms: a number above 0"),
         ("delay,from=drive,ms=nan", "ms=nan: give a number above 0"),

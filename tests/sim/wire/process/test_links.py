@@ -223,7 +223,7 @@ def test_a_channel_that_is_not_there_is_no_virtual_bus():
 
 
 def test_an_interface_that_is_not_a_virtual_bus_is_refused():
-    with pytest.raises(DeviceError, match="must not answer beside real ones"):
+    with pytest.raises(DeviceError, match="must not answer together with real ones"):
         links.is_virtual("lo")
     assert links.interface_kind("lo") == ""
 
@@ -261,7 +261,7 @@ class Line:
 
     def open(self):
         self.port = os.open(self.pty.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        self.pty.look()
+        self.pty.poll()
 
     def turn(self):
         for descriptor in select.select(self.handlers, (), (), 30.0 if self.handlers else 0)[0]:
@@ -296,7 +296,7 @@ def test_bytes_go_both_ways_unchanged(line):
 
 
 def test_an_open_line_with_nothing_on_it_keeps_nobody_busy(line):
-    line.pty.look()
+    line.pty.poll()
     assert line.handlers == {}
     line.open()
     assert select.select(line.handlers, (), (), 0)[0] == []
@@ -335,7 +335,7 @@ def test_a_cut_line_is_dead(line):
     line.open()
     line.pty.close()
     line.pty.write(b"lost")
-    line.pty.look()
+    line.pty.poll()
     assert line.handlers == {}
     assert os.read(line.port, 10) == b""
 

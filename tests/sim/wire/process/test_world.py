@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from rigd.devices.obstacles import Knock, Obstacle
+from rigd.devices.obstacles import ImpactSpecification, Obstacle
 from rigd.sim.wire import WrongUseError, parse_fault
 
 PERIOD_NS = 1_000_000
@@ -391,7 +391,7 @@ def test_in_real_time_the_rig_goes_on_while_an_obstacle_is_made(make_world):
             break
         time.sleep(0.001)
         assert time.monotonic() < deadline_s
-    assert [type(body) for body in contact.bodies] == [Knock, Obstacle]
+    assert [type(body) for body in contact.bodies] == [ImpactSpecification, Obstacle]
 
 
 def test_what_the_beam_cannot_meet_is_refused(make_world):

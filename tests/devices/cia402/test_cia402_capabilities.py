@@ -11,8 +11,8 @@ READ_ONLY, ABSENT, GENERAL = 0x06010002, 0x06020000, 0x08000000
 
 
 def without(scripted, *places):
-    for place in places:
-        scripted.objects.pop(place, None)
+    for address in places:
+        scripted.objects.pop(address, None)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ class TestTheTwoRealDrives:
         scripted.read_only |= {(0x60E0, 0), (0x60E1, 0)}
         drive = make()
         drive.connect()
-        assert drive.outfit().accepted == ()
+        assert drive.capabilities().accepted == ()
         drive.enable()
         assert scripted.state == "enabled"
 
@@ -45,7 +45,7 @@ class TestTheTwoRealDrives:
         drive = make(accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",))
         drive.connect()
         assert scripted.objects[0x3001, 2] == 2500
-        assert [row.place for row in drive.outfit().lacks] == ["6072", "1006"]
+        assert [row.address for row in drive.capabilities().lacks] == ["6072", "1006"]
         told = drive.statement()
         assert told["drive_without"] == "torque_limit"
         assert told["drive_objects_set"] == "3001:2 u32 2500"
@@ -88,7 +88,7 @@ def test_a_limit_that_is_too_high_may_be_accepted_by_name(make, scripted):
     scripted.read_only.add((0x6072, 0))
     drive = make(accept_without=("torque_limit",))
     drive.connect()
-    assert drive.outfit().accepted == ("torque_limit",)
+    assert drive.capabilities().accepted == ("torque_limit",)
 
 
 def test_a_mode_that_is_write_only_is_written_and_told_by_6061(make, scripted):
@@ -119,7 +119,7 @@ def test_the_ways_of_makers_to_say_that_an_object_is_absent(make, scripted, code
     scripted.refuse |= dict.fromkeys([(0x1006, 0), (0x60C2, 1), (0x60C2, 2)], code)
     drive = make()
     drive.connect()
-    assert {row.place for row in drive.outfit().lacks} == {"1006", "60C2:1", "60C2:2"}
+    assert {row.address for row in drive.capabilities().lacks} == {"1006", "60C2:1", "60C2:2"}
 
 
 class TestTheWatchdog:
@@ -148,7 +148,7 @@ class TestTheWatchdog:
         drive = make()
         drive.connect()
         assert scripted.objects[0x1400, 5] == 50
-        assert drive.outfit().watchdog is Watchdog.RPDO_DEADLINE
+        assert drive.capabilities().watchdog is Watchdog.RPDO_DEADLINE
         # It times them from the first on, so that they go on while nobody commands a torque.
         scripted.seen.clear()
         for k in range(5):
@@ -169,7 +169,7 @@ class TestTheWatchdog:
         drive.connect()
         assert drive.statement()["drive_watchdog_s"] == "inf"
         assert drive.statement()["drive_without"] == "watchdog"
-        assert drive.outfit().watchdog is Watchdog.NONE
+        assert drive.capabilities().watchdog is Watchdog.NONE
 
     def test_a_watchdog_of_which_nobody_knows_what_it_does(self, make, scripted):
         without(scripted, (0x6007, 0))
@@ -180,7 +180,7 @@ class TestTheWatchdog:
         without(scripted, (0x6007, 0))
         drive = make(accept_without=("abort_option",))
         drive.connect()
-        assert drive.outfit().accepted == ("abort_option",)
+        assert drive.capabilities().accepted == ("abort_option",)
 
     def test_one_node_twice_is_refused_so_the_old_entry_goes_first(self, make, scripted):
         scripted.objects |= {(0x1016, 0): 3, (0x1016, 2): 100 << 16 | 70, (0x1016, 3): 9 << 16 | 5}
@@ -204,18 +204,18 @@ class TestTheWatchdog:
 
 class TestWhatADriveHoldsFromBefore:
     @pytest.mark.parametrize(
-        ("place", "value"), [((0x1007, 0), 100), ((0x1019, 0), 10), ((0x1800, 3), 10)]
+        ("address", "value"), [((0x1007, 0), 100), ((0x1019, 0), 10), ((0x1800, 3), 10)]
     )
-    def test_it_is_cleared(self, make, scripted, place, value):
-        scripted.objects[place] = value
+    def test_it_is_cleared(self, make, scripted, address, value):
+        scripted.objects[address] = value
         make().connect()
-        assert scripted.objects[place] == 0
+        assert scripted.objects[address] == 0
 
-    @pytest.mark.parametrize("place", [(0x1007, 0), (0x1019, 0), (0x1800, 3), (0x60B2, 0)])
-    def test_what_cannot_be_cleared_is_refused_by_name(self, make, scripted, place):
-        scripted.objects[place] = 10
-        scripted.read_only.add(place)
-        index, sub = place
+    @pytest.mark.parametrize("address", [(0x1007, 0), (0x1019, 0), (0x1800, 3), (0x60B2, 0)])
+    def test_what_cannot_be_cleared_is_refused_by_name(self, make, scripted, address):
+        scripted.objects[address] = 10
+        scripted.read_only.add(address)
+        index, sub = address
         with pytest.raises(DeviceError, match=f"{index:04X}{f':{sub}' if sub else ''} .*is 10"):
             make().connect()
 
@@ -266,7 +266,9 @@ def test_pdos_that_are_mapped_as_wanted_may_be_read_only(make, scripted):
         (0x1A00, 0): 3, (0x1A00, 1): 0x60410010, (0x1A00, 2): 0x60640020, (0x1A00, 3): 0x60770010,
         (0x1600, 0): 2, (0x1600, 1): 0x60400010, (0x1600, 2): 0x60710010,
     }  # fmt: skip
-    mapping = {place for place in scripted.objects if place[0] in (0x1400, 0x1800, 0x1600, 0x1A00)}
+    mapping = {
+        address for address in scripted.objects if address[0] in (0x1400, 0x1800, 0x1600, 0x1A00)
+    }
     scripted.read_only |= mapping
     drive = make()
     drive.connect()
@@ -309,7 +311,7 @@ def test_without_a_heartbeat_of_its_own_its_tpdos_tell_that_it_is_there(make, sc
     for k in range(100):
         drive.latch(k * 1_000_000)
         drive.read_angle()
-    assert drive.outfit().watchdog is Watchdog.HEARTBEAT
+    assert drive.capabilities().watchdog is Watchdog.HEARTBEAT
 
 
 def test_no_torque_mode_is_refused_within_a_second(make, scripted):
