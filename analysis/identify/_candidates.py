@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
     from analysis.models import Structure
@@ -81,7 +81,7 @@ class CandidateSet:
     """
 
     comparison: Comparison
-    noise: Noise
+    noise: NoiseSpectrum
     free: tuple[Setting, ...]
     candidates: tuple[Candidate, ...]
     columns: NDArray[np.complex128]
@@ -276,7 +276,7 @@ class CandidateSet:
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 
-    def under(self, noise: Noise) -> CandidateSet:
+    def under(self, noise: NoiseSpectrum) -> CandidateSet:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
         return other.ranked(self._brought_to(other, c, FEW) for c in self.candidates)
@@ -406,7 +406,7 @@ class CandidateSet:
         best = replace(self, columns=every).refit(self.best)
         return self.with_columns(every, best.noise_here())
 
-    def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
+    def with_columns(self, columns: NDArray[np.complex128], noise: NoiseSpectrum) -> CandidateSet:
         """Fit all again, with what is not linear in addition to the beam."""
         other = replace(self, columns=columns, noise=noise)
         return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
     from analysis.identify._modal_model import ModalModel
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
 
 _FEWEST_BINS: Final = 50
@@ -337,7 +337,7 @@ class Comparison:
         told = replace(self, rest_nm=rest_nm, rest_at_unknown_nm=at_unknown_nm)
         return told._without(rest_nm - self.rest_nm, at_unknown_nm - self.rest_at_unknown_nm)
 
-    def renewed(self, plant: Plant | ModalModel, noise: Noise) -> Comparison:
+    def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
         """Tell anew what followed the reference, with a plant better than the one before.
 
         Parameters

@@ -56,7 +56,7 @@ class MeasurementError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
+class RecordedImpact:
     """A knock on the beam: any torque for as long as it lasts, and from its beginning free decays.
 
     Attributes
@@ -197,7 +197,7 @@ class Measurement:
     reference_rad: NDArray[np.float64] | None = None
     filter_time_constant_s: float = 0.0
     second_order_filter_time_constant_s: float = 0.0
-    knocks: tuple[Knock, ...] = ()
+    knocks: tuple[RecordedImpact, ...] = ()
     uniformity: float = 1e-3
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
     from analysis.models import Structure
 
@@ -184,7 +184,7 @@ def _with_drag(field: CandidateSet) -> CandidateSet:
     if settled is None:
         return field
     # Thence to the freest damping; without drag its fit may be that of no beam at all.
-    known, point = settled.objective.comparison, _Point.of(settled)
+    known, point = settled.objective.comparison, _DragPoint.of(settled)
     for name in (_FREEST, _LEAD):
         settled = _settled(field, point, STRUCTURES[name], known=known)
         if settled is not None:
@@ -197,17 +197,17 @@ def _with_drag(field: CandidateSet) -> CandidateSet:
 
 
 @dataclass(frozen=True, slots=True)
-class _Point:
+class _DragPoint:
     """Where a search with drag stands."""
 
     plant: Plant
     structure: Structure
     law: DragLaw
-    noise: Noise
+    noise: NoiseSpectrum
     two: bool = False
 
     @classmethod
-    def of(cls, refit: Refit) -> _Point:
+    def of(cls, refit: Refit) -> _DragPoint:
         structure = refit.objective.unknowns.structure
         two = len(refit.columns) > 1
         return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
@@ -246,17 +246,17 @@ def _first_amplitude(refit: Refit) -> tuple[float, float]:
     return -along / square, along**2 / square
 
 
-def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
+def _start(field: CandidateSet, lead: Candidate) -> _DragPoint | None:
     """Fit with the first order of the drag; None if the air would have to push."""
     column = small_drag(field.comparison, lead.fit.plant)
     refit = replace(field, columns=column).refit(lead, _FEW)
     size = float(refit.amplitudes()[0][0])
-    return _Point(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
+    return _DragPoint(refit.plant, lead.structure, DragLaw(size), field.noise) if size > 0 else None
 
 
 def _settled(
     field: CandidateSet,
-    point: _Point,
+    point: _DragPoint,
     structure: Structure,
     *,
     tolerance: float = _SETTLED,

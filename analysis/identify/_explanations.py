@@ -151,7 +151,7 @@ def _explained(
     freedom = problem.compared - count - len(cause.lower)
     if freedom <= 0:
         return None
-    begun = [(*_Search(problem, cause, x).begun(), x) for x in bases]
+    begun = [(*_CauseSearch(problem, cause, x).begun(), x) for x in bases]
     for _, start, x in sorted(begun, key=lambda each: each[0]):
         cost, y = _fitted(problem, cause, x, start, freedom)
         p_value = float(chi_square_p_value(cost, freedom))
@@ -187,13 +187,13 @@ def _fitted(
     """Descend from y, first with a tolerance; chi-square and unknowns."""
     cost = math.inf
     for tolerance in _TOLERANCES:
-        cost, y = _Search(problem, cause, x, tolerance).descended(y)
+        cost, y = _CauseSearch(problem, cause, x, tolerance).descended(y)
         if cost > _HOPELESS * freedom:
             break
     return cost, y
 
 
-class _Search:
+class _CauseSearch:
     """Search for beam and cause, with one tolerance.
 
     Parameters

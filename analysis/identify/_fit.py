@@ -15,7 +15,7 @@ from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._result import RecordAnalysis, RecordFit
-from analysis.identify._search import CoarseResponse, Descent, Search
+from analysis.identify._search import CoarseResponse, Descent, StructureSearch
 from analysis.identify._uncertainty import (
     covariance_of_unknowns,
     interval_from_zero,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._problem import Projected
     from analysis.models import Structure
@@ -97,7 +97,7 @@ def fit_record(
     nominal = measurement.nominal
     coarse = CoarseResponse(comparison)
     searches = [
-        Search.of(Objective(comparison, unknowns), coarse)
+        StructureSearch.of(Objective(comparison, unknowns), coarse)
         for unknowns in (Unknowns.of(structure, nominal, free) for structure in structures)
     ]
     closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
@@ -113,7 +113,8 @@ def fit_record(
         comparison = reference.objective.comparison
         coarse = CoarseResponse(comparison)
         searches = [
-            Search.of(Objective(comparison, search.unknowns), coarse) for search in searches
+            StructureSearch.of(Objective(comparison, search.unknowns), coarse)
+            for search in searches
         ]
     # What was apart from the reference may hide the beam, or stand for noise. The closest structure
     # shows that before all others are fitted, and the closest of all once they are.
@@ -177,8 +178,8 @@ def refit_record(
 
 
 def _under_its_noise(
-    searches: list[Search], closest: int, reference: Descent, before: list[Descent]
-) -> tuple[Noise, list[Descent]]:
+    searches: list[StructureSearch], closest: int, reference: Descent, before: list[Descent]
+) -> tuple[NoiseSpectrum, list[Descent]]:
     """Descend with all structures under the noise that the closest one leaves.
 
     Parameters
@@ -211,7 +212,7 @@ def _under_its_noise(
     return noise, descents
 
 
-def _explains(closest: Descent, noise: Noise) -> bool:
+def _explains(closest: Descent, noise: NoiseSpectrum) -> bool:
     """Whether chance may have shaped what a structure leaves."""
     objective, counts = closest.objective, noise.counts
     residual = objective.project(objective.linearise(closest.x), noise.weight).residual
@@ -219,7 +220,7 @@ def _explains(closest: Descent, noise: Noise) -> bool:
     return whiteness(residual[counts], hz[counts]).all_but_white
 
 
-def _still_behind(before: Descent, noise: Noise, most: float) -> Descent | None:
+def _still_behind(before: Descent, noise: NoiseSpectrum, most: float) -> Descent | None:
     """Look whether a structure stays above a cost from where it was; None if it does not."""
     if before.cost(noise) <= most:
         return None
@@ -241,7 +242,7 @@ def _followed_again(clean: Descent, whole: Comparison) -> Descent:
 # Result at a minimum
 
 
-def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
+def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
     """Parameters, uncertainty, modes and residual at a minimum.
 
     Parameters
@@ -301,7 +302,7 @@ def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
     projected: Projected,
-    noise: Noise,
+    noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
     """Jacobian of the torques that are known, shape (k, K)."""
     comparison, unknowns = objective.comparison, objective.unknowns

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._free_decay import Pole
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
 
 _RESONANCE: Final = 3.0
@@ -96,7 +96,7 @@ def hum_beside_modes(
     comparison: Comparison,
     plant: Plant,
     poles: tuple[Pole, ...],
-    noise: Noise,
+    noise: NoiseSpectrum,
     decaying_nm: NDArray[np.float64],
 ) -> tuple[Hum, ...]:
     """Search for hum near each mode, including what has been taken out already.

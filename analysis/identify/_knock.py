@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import Knock, MeasurementError
+from analysis.identify._data import MeasurementError, RecordedImpact
 from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
 from analysis.identify._parametrization import Unknowns
@@ -75,7 +75,7 @@ _LOUDER: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class FoundKnock:
+class DetectedImpact:
     """A knock, and how much of a record it explains.
 
     Attributes
@@ -87,7 +87,7 @@ class FoundKnock:
         Power of what is left in the two seconds before it, relative to the noise's.
     """
 
-    knock: Knock
+    knock: RecordedImpact
     share: float
     before: float
 
@@ -102,7 +102,7 @@ class FoundKnock:
         return self.share > _ALL and self.before < _LOUDER
 
 
-def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[FoundKnock]:
+def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
     """Search for one more knock; each found may be the one, the likeliest first.
 
     A knock may be louder than all that the motor does, and a fit to the whole record then nonsense.
@@ -131,13 +131,13 @@ def knocks_in(field: CandidateSet, *, obvious: bool = False) -> Iterator[FoundKn
         yield first
 
 
-def knock_in(field: CandidateSet) -> FoundKnock | None:
+def knock_in(field: CandidateSet) -> DetectedImpact | None:
     """Search for a knock in what the likeliest candidate leaves."""
     likeliest = min(field.candidates, key=lambda each: each.fit.cost)
     return _knock_in(field.refit(likeliest, 1))
 
 
-def _knock_in(refit: Refit) -> FoundKnock | None:
+def _knock_in(refit: Refit) -> DetectedImpact | None:
     """Search in what is left at one point."""
     place = _scan(refit)
     if place is None:
@@ -196,12 +196,12 @@ def _from_halves(field: CandidateSet) -> Iterator[Refit]:
         yield there(noise=every)
 
 
-def with_knock(measurement: Measurement, found: FoundKnock) -> Measurement:
+def with_knock(measurement: Measurement, found: DetectedImpact) -> Measurement:
     """Take a knock for known."""
     return replace(measurement, knocks=(*measurement.knocks, found.knock))
 
 
-def of_knocks(knocks: tuple[Knock, ...], *, explained: bool) -> Iterator[Finding]:
+def of_knocks(knocks: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
     """Name the knocks of a record.
 
     Parameters
@@ -284,12 +284,12 @@ def _cleaned(refit: Refit, first: int, last: int) -> Refit:
     )
 
 
-def _knock(refit: Refit, first: int, last: int) -> Knock:
+def _knock(refit: Refit, first: int, last: int) -> RecordedImpact:
     """Knock between two samples with the poles found, of no size."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
-    return Knock(
+    return RecordedImpact(
         first_s=comparison.first_s + first / rate_hz,
         last_s=comparison.first_s + last / rate_hz,
         # A touch that begins softly is seen when it has grown.
@@ -298,7 +298,7 @@ def _knock(refit: Refit, first: int, last: int) -> Knock:
     )
 
 
-def _in_time(comparison: Comparison, knock: Knock) -> NDArray[np.float64]:
+def _in_time(comparison: Comparison, knock: RecordedImpact) -> NDArray[np.float64]:
     """Columns of a knock at the samples compared, shape (c, samples)."""
     return knock.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
@@ -357,7 +357,7 @@ def _extent(refit: Refit, first: int, last: int) -> tuple[int, int] | None:
     return (begins, ends) if sure and rings > _RINGS * float(alone.sum()) else None
 
 
-def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
+def _judged(refit: Refit, first: int, last: int) -> DetectedImpact:
     """Give a knock its size, and say how much it explains."""
     comparison = refit.objective.comparison
     knock = _knock(refit, first, last)
@@ -377,7 +377,7 @@ def _judged(refit: Refit, first: int, last: int) -> FoundKnock:
     after = slice(first, first + math.ceil(comparison.decimation.rate_hz))
     before = comparison.in_time(left)
     quiet = before[max(first - math.ceil(_QUIET_S * comparison.decimation.rate_hz), 0) : first]
-    return FoundKnock(
+    return DetectedImpact(
         knock=replace(
             knock,
             sizes=tuple(sizes.tolist()),

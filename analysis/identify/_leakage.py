@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import Noise, noise_of, smooth_power
+from analysis.identify._noise import NoiseSpectrum, noise_of, smooth_power
 
 if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
@@ -26,7 +26,7 @@ _LEAKS: Final = 0.3
 """Leaked power over that of the noise that does no harm."""
 
 
-def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noise:
+def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
     """Leave out the bins into which a line beyond the band leaks, and name the line.
 
     Parameters
@@ -61,7 +61,7 @@ def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noi
     clean = (fit.residual * np.sqrt(noise.power / 2))[counts]
     bins = np.arange(counts.size)
     power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / share)))
-    return Noise(power, counts, tuple(lines))
+    return NoiseSpectrum(power, counts, tuple(lines))
 
 
 def repeats_after_s(comparison: Comparison) -> float:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._plant import Plant
     from analysis.identify._residual_tests import InputRelation, Whiteness
 
@@ -95,7 +95,7 @@ class ModalFit(ModalEstimate):
 
     evidence: tuple[float, ...]
     residual: NDArray[np.complex128]
-    noise: Noise
+    noise: NoiseSpectrum
     whiteness: Whiteness
     input_relation: InputRelation
     ringing: Ringing
@@ -149,7 +149,7 @@ class ModalFit(ModalEstimate):
 
 def fit_modes(
     comparison: Comparison,
-    noise: Noise,
+    noise: NoiseSpectrum,
     starts: Sequence[tuple[int, float, float]],
     columns: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
@@ -177,7 +177,7 @@ def fit_modes(
     further = further if columns is None else columns
     lowest_hz = _LOWEST * min(hz for _, hz, _ in inside)
     counts = noise.counts & (comparison.frequency_hz >= lowest_hz)
-    search = _Search(
+    search = _ModalSearch(
         comparison,
         replace(noise, counts=counts),
         further,
@@ -188,20 +188,20 @@ def fit_modes(
 
 
 @dataclass(frozen=True, slots=True)
-class _Search:
+class _ModalSearch:
     """Modes at one point of the search, under one estimate of the noise."""
 
     comparison: Comparison
-    noise: Noise
+    noise: NoiseSpectrum
     further: NDArray[np.complex128]
     numbers: tuple[int, ...]
     x: NDArray[np.float64]
 
-    def problem(self) -> _Problem:
+    def problem(self) -> _ModalProblem:
         """Residual of these modes under this noise."""
-        return _Problem(self.comparison, self.noise.weight, self.further, self.numbers)
+        return _ModalProblem(self.comparison, self.noise.weight, self.further, self.numbers)
 
-    def descended(self) -> _Search:
+    def descended(self) -> _ModalSearch:
         """Descend under this noise."""
         low = np.column_stack([self.x[::2] - _NEAR, np.full(len(self.numbers), _NARROWEST)])
         high = np.column_stack([self.x[::2] + _NEAR, np.full(len(self.numbers), _WIDEST)])
@@ -214,7 +214,7 @@ class _Search:
         )
         return replace(self, x=found.x)
 
-    def settled(self) -> _Search:
+    def settled(self) -> _ModalSearch:
         """Descend, and estimate the noise and what is unknown of the record, in turns."""
         search = self
         for _ in range(_NOISE_PASSES):
@@ -249,7 +249,7 @@ class _Search:
         residual = self.problem().at(self.x).residual
         return float(residual @ residual)
 
-    def with_further_resonances(self) -> _Search:
+    def with_further_resonances(self) -> _ModalSearch:
         """Add a resonance where the residual still follows the angle, if that explains it."""
         search = self
         for _ in range(_MOST_FURTHER):
@@ -273,7 +273,7 @@ class _Search:
         reach = _HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
         return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < reach))
 
-    def without_unexcited_modes(self) -> _Search:
+    def without_unexcited_modes(self) -> _ModalSearch:
         """Leave out modes that save nothing at first and then follow a line of the noise."""
         saved = self.evidence()
         if saved.min() >= _EVIDENCE:
@@ -284,7 +284,7 @@ class _Search:
             search = search._without(place)
         return search
 
-    def _without(self, place: int) -> _Search:
+    def _without(self, place: int) -> _ModalSearch:
         numbers = self.numbers[:place] + self.numbers[place + 1 :]
         return replace(self, numbers=numbers, x=np.delete(self.x, [2 * place, 2 * place + 1]))
 
@@ -293,7 +293,7 @@ class _Search:
         own = self.cost()
         return np.array([self._without(i).cost() - own for i in range(len(self.numbers))])
 
-    def relation(self, point: _Point) -> InputRelation:
+    def relation(self, point: _ModalPoint) -> InputRelation:
         """Relation of the residual at this point to the angle."""
         residual = point.residual.view(np.complex128)
         angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.kept])
@@ -357,7 +357,7 @@ def _orthonormal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 @dataclass(frozen=True, slots=True)
-class _Point:
+class _ModalPoint:
     """Whitened residual of the best linear parameters at one point, and its derivatives."""
 
     residual: NDArray[np.float64]
@@ -378,7 +378,7 @@ def _unit_pole_slope(eta: float) -> complex:
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
-class _Problem:
+class _ModalProblem:
     """Whitened residual of a number of modes over their frequencies and damping."""
 
     def __init__(
@@ -388,7 +388,7 @@ class _Problem:
         further: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent: Recent[_Point] = Recent()
+        self._recent: Recent[_ModalPoint] = Recent()
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -436,14 +436,14 @@ class _Problem:
                 total[1:] += np.outer(pole.derivative.imag, by_imaginary)
         return total
 
-    def at(self, x: NDArray[np.float64]) -> _Point:
+    def at(self, x: NDArray[np.float64]) -> _ModalPoint:
         """Eliminate the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
         The last two points cost nothing again.
         """
         return self._recent.at(x, self._at)
 
-    def _at(self, x: NDArray[np.float64]) -> _Point:
+    def _at(self, x: NDArray[np.float64]) -> _ModalPoint:
         modes = x.reshape(-1, 2)
         rows: list[NDArray[np.complex128]] = []
         slopes: list[NDArray[np.complex128]] = []
@@ -478,7 +478,7 @@ class _Problem:
             jacobian[2 * k] += a * four[0] + b * four[2]
             jacobian[2 * k + 1] += a * four[1] + b * four[3]
         projected = jacobian - (jacobian @ span.T) @ span
-        return _Point(residual, linear, columns, span, jacobian, projected)
+        return _ModalPoint(residual, linear, columns, span, jacobian, projected)
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
         """Modal model at a point."""
@@ -508,13 +508,13 @@ class _Problem:
         drag: NDArray[np.complex128] = self._drag(here)[0]
         return drag + bare + amplitudes @ self._nuisance(here)
 
-    def covariance(self, point: _Point) -> NDArray[np.float64]:
+    def covariance(self, point: _ModalPoint) -> NDArray[np.float64]:
         """Covariance of the unknowns and the linear parameters."""
         _, gram, scale = _gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(scale, scale)
         return covariance
 
-    def ringing(self, point: _Point, covariance: NDArray[np.float64]) -> Ringing:
+    def ringing(self, point: _ModalPoint, covariance: NDArray[np.float64]) -> Ringing:
         """Free decay at the beginning, two amplitudes a mode, and its chi-square."""
         count = len(self._numbers)
         first = 2 * count + BACKGROUND
@@ -527,7 +527,7 @@ class _Problem:
         )
 
     def constants(
-        self, point: _Point, x: NDArray[np.float64], covariance: NDArray[np.float64]
+        self, point: _ModalPoint, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """`CONSTANTS` of all modes, and their covariance with that of the background."""
         count = x.size // 2

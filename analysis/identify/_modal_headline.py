@@ -23,7 +23,7 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from analysis.identify._headline import Size, StructureStatus
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
     from analysis.identify._uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
@@ -228,7 +228,7 @@ def tolerant_sizes(test: UniformBeamTest, estimate: TolerantEstimate) -> tuple[S
 def tolerant_order(
     order: Order,
     estimate: TolerantEstimate,
-    profile: Profile,
+    profile: LikelihoodProfile,
     doubt: str | None,
     *,
     refused: bool,

@@ -48,7 +48,7 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class NoiseSpectrum:
     """Noise in the torque, as found from a residual.
 
     Attributes
@@ -77,7 +77,7 @@ def noise_of(
     samples: int,
     share: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
-) -> Noise:
+) -> NoiseSpectrum:
     """Separate noise and hum in a residual.
 
     Parameters
@@ -97,7 +97,7 @@ def noise_of(
     counts = np.ones(power.size, dtype=bool)
     lines: list[Line] = []
     if near_mode is None:
-        return Noise(power, counts, ())
+        return NoiseSpectrum(power, counts, ())
     for part in _standing_out(residual, power):
         own = np.abs(residual[part]) ** 2
         if near_mode[part][np.argmax(own)] or not _steady(residual, part):
@@ -109,7 +109,7 @@ def noise_of(
                 amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * share)),
             )
         )
-    return Noise(power, counts, tuple(lines))
+    return NoiseSpectrum(power, counts, tuple(lines))
 
 
 def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:

@@ -145,7 +145,7 @@ class Objective:
         ----------
         at : Linearisation
         weight : ndarray, shape (K,), or float
-            That of `Noise`, or 1 not to whiten.
+            That of `NoiseSpectrum`, or 1 not to whiten.
         """
         residual, jacobian = at.residual * weight, at.jacobian * weight
         columns = _parts(at.columns * weight)
@@ -195,7 +195,7 @@ class Objective:
         ----------
         start : ndarray, shape (k,)
         weight : ndarray, shape (K,)
-            That of `Noise`.
+            That of `NoiseSpectrum`.
         region, relative_tolerance, max_evaluations, hopeless
             As `descend` takes them.
 

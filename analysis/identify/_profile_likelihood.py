@@ -38,7 +38,7 @@ WIDEST_SHARE: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Profile:
+class LikelihoodProfile:
     """Deviance of an order's values, everything else refitted at each.
 
     Attributes
@@ -77,7 +77,7 @@ class Profile:
     gain: float
 
     @classmethod
-    def unwalked(cls, candidate: Candidate, order: Order) -> Profile:
+    def unwalked(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
         """Stand for an order that nothing could tell: one value, and no limit to either side.
 
         Parameters
@@ -125,7 +125,7 @@ class Profiled:
         The lowest sum of squares.
     """
 
-    profile: Profile
+    profile: LikelihoodProfile
     structure: Structure
     plants: tuple[Plant, ...]
     cost: float
@@ -159,7 +159,7 @@ def profile(
     interval, open_below, open_above = admitted(values, deviance)
     lowest = min(walk.costs.values())
     return Profiled(
-        profile=Profile(
+        profile=LikelihoodProfile(
             order=order,
             structure=candidate.name,
             values=tuple(values.tolist()),
@@ -185,7 +185,7 @@ _ROUNDS: Final = 3
 
 def profiled(
     field: CandidateSet, settled: Collection[Order] = (), *, walk: bool = True
-) -> tuple[CandidateSet, Profile, Profile]:
+) -> tuple[CandidateSet, LikelihoodProfile, LikelihoodProfile]:
     """Profile alpha and lambda in the freest structure.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
@@ -223,7 +223,7 @@ def profiled(
         if [candidate.fit.cost for candidate in field.candidates] == before:
             break
     of_alpha, of_lambda = (
-        walks[order].profile if order in walks else Profile.unwalked(freest, order)
+        walks[order].profile if order in walks else LikelihoodProfile.unwalked(freest, order)
         for order in _ORDERS
     )
     return field, of_alpha, of_lambda

@@ -13,7 +13,7 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
-from analysis.identify._noise import Noise, smooth_power
+from analysis.identify._noise import NoiseSpectrum, smooth_power
 from analysis.identify._parametrization import NEXT_TO_NOTHING, Steps
 from analysis.identify._problem import Objective
 
@@ -58,7 +58,7 @@ class Refit:
     objective: Objective
     x: NDArray[np.float64]
     equations: NormalEquations
-    noise: Noise
+    noise: NoiseSpectrum
 
     @classmethod
     def descend(
@@ -66,7 +66,7 @@ class Refit:
         comparison: Comparison,
         unknowns: Unknowns,
         start: NDArray[np.float64],
-        noise: Noise,
+        noise: NoiseSpectrum,
         columns: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
@@ -253,7 +253,7 @@ class Refit:
         of = self.objective.unknowns
         return Candidate(of.structure, self.fit(), len(self.columns))
 
-    def noise_here(self) -> Noise:
+    def noise_here(self) -> NoiseSpectrum:
         """Take for noise what remains here and no column explains; lines stay left out."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         share = self.objective.comparison.measurement.torque_share

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._noise import Noise
+from analysis.identify._noise import NoiseSpectrum
 from analysis.statistics import chi_square_p_value, nrmse_percent
 
 if TYPE_CHECKING:
@@ -183,7 +183,9 @@ class RecordAnalysis:
     comparison: Comparison
 
     @classmethod
-    def of(cls, fits: Iterable[RecordFit], noise: Noise, comparison: Comparison) -> RecordAnalysis:
+    def of(
+        cls, fits: Iterable[RecordFit], noise: NoiseSpectrum, comparison: Comparison
+    ) -> RecordAnalysis:
         """Put together fits to one comparison under one noise.
 
         Parameters
@@ -205,10 +207,10 @@ class RecordAnalysis:
         )
 
     @property
-    def noise(self) -> Noise:
+    def noise(self) -> NoiseSpectrum:
         """The noise as the fits had it: the power of each bin."""
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
-        return Noise(self.noise_nm2_per_hz * scale, self.compared, self.lines)
+        return NoiseSpectrum(self.noise_nm2_per_hz * scale, self.compared, self.lines)
 
     def fit_percent(self, fit: RecordFit | ModalFit) -> float:
         """Fit of one of the models to the measured torque in the band (`nrmse_percent`).

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.identify._free_decay import decay_columns
 from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
-from analysis.identify._noise import Noise, noise_of
+from analysis.identify._noise import NoiseSpectrum, noise_of
 from analysis.identify._parametrization import Steps
 from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
@@ -102,7 +102,7 @@ class CoarseResponse:
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._costs: dict[Plant, float] = {}
 
-    def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
+    def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
         """Take the same points with the weights that they have under a noise.
 
         Parameters
@@ -227,7 +227,7 @@ class Descent:
         return self.objective.unknowns.plant(self.x)
 
     def to_minimum(
-        self, noise: Noise, tolerance: float, hopeless: tuple[int, float] | None = None
+        self, noise: NoiseSpectrum, tolerance: float, hopeless: tuple[int, float] | None = None
     ) -> Descent:
         """Descend to the minimum under a noise spectrum.
 
@@ -245,11 +245,11 @@ class Descent:
         )
         return Descent(objective, minimum.x)
 
-    def cost(self, noise: Noise) -> float:
+    def cost(self, noise: NoiseSpectrum) -> float:
         """Sum of squares here under a noise spectrum."""
         return self.objective.normal_equations(self.x, noise.weight).cost
 
-    def renewed(self, noise: Noise, tolerance: float) -> Descent:
+    def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
         """Tell anew what followed the reference, until that is settled; `self` if it is."""
         here = self
         for _ in range(RENEWALS):
@@ -284,7 +284,7 @@ class Descent:
             here = here.to_minimum(here.noise(), tolerance)
         return here
 
-    def noise(self, *, with_lines: bool = False) -> Noise:
+    def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
         """Take for noise what remains here and is not a free decay."""
         objective, comparison = self.objective, self.objective.comparison
         at = objective.linearise(self.x)
@@ -305,7 +305,7 @@ class Descent:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class StructureSearch:
     """One structure on one record: where its minima may lie.
 
     Attributes
@@ -324,7 +324,7 @@ class Search:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse: CoarseResponse) -> Search:
+    def of(cls, objective: Objective, coarse: CoarseResponse) -> StructureSearch:
         """Look over the whole range of the unknowns."""
         starts = initial_guesses(coarse, objective.unknowns)
         return cls(objective, coarse, starts[0], coarse_minima(coarse, objective.unknowns, starts))
@@ -334,7 +334,7 @@ class Search:
         """What is searched for."""
         return self.objective.unknowns
 
-    def on(self, comparison: Comparison) -> Search:
+    def on(self, comparison: Comparison) -> StructureSearch:
         """Compare with something else, from the same starts."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
@@ -342,7 +342,7 @@ class Search:
         """Where the coarse response is lowest."""
         return Descent(self.objective, self.minima[0].x)
 
-    def under(self, noise: Noise, near: Descent | None = None) -> Descent:
+    def under(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
         """Go next to the lowest minimum of the whole record.
 
         Under another noise another minimum may be the lowest: all are looked at again on the coarse

@@ -46,7 +46,7 @@ from analysis.identify._uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify._verdict import (
     EVEN,
     NOT_DETERMINED,
-    Row,
+    CandidateRow,
     Verdict,
     order_verdict,
     rivals,
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from analysis.identify._profile_likelihood import Order
     from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
-    from analysis.identify._time_varying import Change
+    from analysis.identify._time_varying import TemporalChange
     from analysis.identify._uniform_beam import UniformBeamTest
 
 
@@ -214,7 +214,7 @@ def _selected(
     modal = _modal(linear)
     field, small = linear, None
     forces: tuple[NonlinearForce, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[TemporalChange, ...] = ()
     plain = modal is not None and _linear_and_constant(linear, modal, band_hz)
     if not (plain or measurement.knocks):
         for knock in knocks_in(linear, obvious=True):
@@ -415,7 +415,7 @@ def _linear_and_constant(
 
 def _with_effects(
     linear: CandidateSet, *, again: bool
-) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[Change, ...]]:
+) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
     """Look for what no linear constant antenna does.
 
     Returns
@@ -542,7 +542,7 @@ def _wrong(kinds: Collection[str], *, explained: bool) -> str | None:
     return UNEXPLAINED if "harmonics" in kinds or not explained else None
 
 
-def _doubt(changes: tuple[Change, ...], *, one_sweep: bool) -> str | None:
+def _doubt(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
     """Say why no parameter is to be believed though all of the record is explained, or None.
 
     The modes are what each was when it was passed.
@@ -616,10 +616,10 @@ def _tests(
     )
 
 
-def _table(field: CandidateSet) -> tuple[Row, ...]:
+def _table(field: CandidateSet) -> tuple[CandidateRow, ...]:
     best, least_aic = field.best, min(c.aic for c in field.candidates)
     return tuple(
-        Row(
+        CandidateRow(
             structure=c.structure.name,
             parameters=c.parameters,
             cost=c.fit.cost,

@@ -73,7 +73,7 @@ _SETTLED: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class TemporalChange:
     """One thing that changes along the record, or the backlash.
 
     Attributes
@@ -104,7 +104,7 @@ class Change:
 
 def along_time(
     field: CandidateSet, rival_bic: float = math.inf
-) -> tuple[CandidateSet, tuple[Change, ...]]:
+) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
     """Find what changes along the record; refit all with it if nothing else explains it as well.
 
     Parameters
@@ -136,7 +136,9 @@ def along_time(
     for what, (bic, refit) in tried.items():
         sizes, std = refit.amplitudes()
         unit = _UNITS.get(what, 1.0)
-        change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
+        change = TemporalChange(
+            what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic
+        )
         if change.behind < STRONG and _possible(change):
             found.append((change, refit))
     found.sort(key=lambda pair: pair[0].behind)
@@ -149,7 +151,7 @@ def along_time(
     return field.with_columns(refit.columns, refit.noise_here()), changes
 
 
-def _possible(change: Change) -> bool:
+def _possible(change: TemporalChange) -> bool:
     """Whether a size is one: backlash is positive, and nothing changes by more than itself."""
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
@@ -387,7 +389,7 @@ _KINDS: Final[dict[What, Kind]] = {
 }
 
 
-def established(changes: tuple[Change, ...], *, one_sweep: bool) -> bool:
+def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool:
     """Whether one change, and nothing else, explains the record.
 
     What changes with time never is from one sweep: it may change with frequency. Backlash may be.
@@ -403,7 +405,7 @@ def established(changes: tuple[Change, ...], *, one_sweep: bool) -> bool:
     return changes[0].what == "play" or not one_sweep
 
 
-def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Finding]:
+def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterator[Finding]:
     """Put in words what changes along the record.
 
     Parameters
@@ -429,7 +431,7 @@ def changing(changes: tuple[Change, ...], *, one_sweep: bool) -> Iterator[Findin
             )
 
 
-def _size(change: Change) -> str:
+def _size(change: TemporalChange) -> str:
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
     if change.what == "clock":
@@ -446,7 +448,7 @@ _THERE_AND_BACK: Final = (
 )
 
 
-def _finding(change: Change) -> Finding:
+def _finding(change: TemporalChange) -> Finding:
     half = NORMAL_95 * change.std
     of_play = change.what == "play"
     remedy = f"S{_THERE_AND_BACK}"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._drag import DampingAt
     from analysis.identify._finding import Finding
-    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._profile_likelihood import LikelihoodProfile, Order
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.models import Structure
 
@@ -75,11 +75,11 @@ class OrderVerdict:
     value: float | None
     interval: tuple[float, float] | None
     reason: str | None
-    profile: Profile
+    profile: LikelihoodProfile
 
 
 def order_verdict(
-    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+    field: CandidateSet, profile: LikelihoodProfile, visible: tuple[int, ...], *, doubt: str | None
 ) -> OrderVerdict:
     """Judge one order.
 
@@ -136,7 +136,7 @@ def too_few_modes(structure: Structure, modes: int) -> str | None:
     return None
 
 
-def deviance_of_one(profile: Profile) -> float:
+def deviance_of_one(profile: LikelihoodProfile) -> float:
     """Deviance of order 1 above the lowest; infinite where the walk along the order ended before.
 
     Parameters
@@ -147,7 +147,7 @@ def deviance_of_one(profile: Profile) -> float:
 
 
 def _judged(
-    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+    field: CandidateSet, profile: LikelihoodProfile, visible: tuple[int, ...], *, doubt: str | None
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     untold = untold_reason(field, visible)
@@ -170,7 +170,7 @@ def _judged(
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class CandidateRow:
     """One line of the table of candidates.
 
     Attributes
@@ -234,7 +234,7 @@ class Verdict:
     lambda_: OrderVerdict
     visible_modes: tuple[int, ...]
     findings: tuple[Finding, ...]
-    table: tuple[Row, ...]
+    table: tuple[CandidateRow, ...]
     whiteness: Whiteness
     input_relation: InputRelation
     harmonics: tuple[Harmonic, ...]

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._noise import Noise
+    from analysis.identify._noise import NoiseSpectrum
     from analysis.identify._result import RecordFit
 
 _EVIDENCE: Final = 400.0
@@ -38,7 +38,7 @@ _DRIVEN: Final = 0.2
 as driven: a sweep has 1 there at all modes it passes, a step 1/6 at mode 2."""
 
 
-def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple[int, ...]:
+def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) -> tuple[int, ...]:
     """Modes without whose resonance the record cannot be explained.
 
     Near each mode, the torque is compared with the best response to the angle that is smooth

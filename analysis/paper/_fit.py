@@ -206,7 +206,7 @@ class _Grid:
     weights: NDArray[np.float64]
 
 
-class _Problem:
+class _FrfProblem:
     """Eq. (26) for one structure on one grid, as a function of the unknowns."""
 
     def __init__(self, unknowns: DampingUnknowns, grid: _Grid) -> None:
@@ -242,7 +242,7 @@ class _Problem:
 def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
     unknowns = DampingUnknowns.of(structure, whole.model.beam)
     bounds = Box(*unknowns.bounds)
-    thin, full = _Problem(unknowns, few), _Problem(unknowns, whole)
+    thin, full = _FrfProblem(unknowns, few), _FrfProblem(unknowns, whole)
     found = [
         descend(thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE)
         for x in starts(structure, thin.cost)
@@ -267,7 +267,7 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
     )
 
 
-def _polished(problem: _Problem, rough: Minimum, bounds: Box) -> Minimum:
+def _polished(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
     """Descend to the bottom from where a rougher descent ended."""
     return descend(
         problem.normal_equations,
@@ -287,7 +287,7 @@ def _different(found: list[Minimum]) -> list[Minimum]:
     return kept
 
 
-def _standard_deviations(problem: _Problem, x: NDArray[np.float64]) -> dict[str, float] | None:
+def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[str, float] | None:
     deviation, jacobian = problem.deviation_and_jacobian(x)
     covariance = sandwich_covariance(deviation, jacobian, problem.grid.weights)
     if covariance is None:

@@ -5,7 +5,7 @@ import pytest
 
 from analysis.identify._profile_likelihood import (
     CHI_SQUARE_95,
-    Profile,
+    LikelihoodProfile,
     admitted,
     crossing,
     dips,
@@ -25,7 +25,7 @@ def double(depth):
 def profile_of(values, deviance):
     bottoms = valleys(values, deviance)
     interval, below, above = admitted(values, deviance)
-    return Profile(
+    return LikelihoodProfile(
         "lambda", "VII", tuple(values), tuple(deviance), bottoms[0], bottoms, interval, below,
         above, 0.0,
     )  # fmt: skip
